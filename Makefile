@@ -1,0 +1,48 @@
+# A fresh machine needs CPython (3.11 or later) and make; each target makes .venv and installs what it lacks.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
+PINS := pyproject.toml constraints.txt
+
+.DELETE_ON_ERROR:
+.PHONY: demo test lint types bench-quick pictures clean
+
+# The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
+# torch comes first, by its exact pin, so that nothing else draws in another build of it.
+$(VENV)/.installed: $(PINS)
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) "$$(grep '^torch==' constraints.txt)"
+	$(PIP) hatchling editables
+	$(PIP) --no-build-isolation -e '.[cli]'
+	touch $@
+
+$(VENV)/.installed-test: $(VENV)/.installed
+	$(PIP) --no-build-isolation -e '.[cli,notebooks,bench,test]'
+	touch $@
+
+# A picture of every step, from a photograph that comes with scikit-image, in out/.
+demo: $(VENV)/.installed
+	$(BIN)/nlfilter-torch demo out
+
+# Everything that has to hold; pytest comes last, so that its count closes the output.
+test: lint types bench-quick
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed-test
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+
+types: $(VENV)/.installed-test
+	$(BIN)/mypy
+
+# Every benchmark once, on a size that takes seconds: that it runs, not how fast.
+bench-quick: $(VENV)/.installed-test
+	$(BIN)/python -m benchmarks --quick
+
+# The pictures of the README.
+pictures: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.detail_pictures docs
+
+clean:
+	rm -rf $(VENV) out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis
