@@ -1,0 +1,277 @@
+"""Image files in and out: PNG, JPEG, TIFF and WebP at their own depth, with alpha, EXIF and colour profile.
+
+Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil); nothing else in the package imports this module.
+"""
+
+import io
+import os
+import secrets
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import imagecodecs
+import numpy as np
+import psutil
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageFile, PngImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401
+from torch import Tensor
+
+from nlfilter_torch import exif as exif_tags
+from nlfilter_torch import tiff
+
+Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
+Pixels = NDArray[np.generic]
+
+WHITE = {"uint8": 255, "uint16": 65535}  # what integer channels hold for 1.0
+BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
+# What each type of file can hold. JPEG and WebP know 8 bits only, JPEG no alpha, PNG no floats.
+DEPTHS: dict[str, tuple[str, ...]] = {
+    "PNG": ("uint8", "uint16"),
+    "JPEG": ("uint8",),
+    "WebP": ("uint8",),
+    "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
+}
+ENCODING: dict[str, dict[str, object]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WebP": {"lossless": True}}
+SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".tif": "TIFF", ".tiff": "TIFF"}
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image file in memory: pixels to compute with, and what has to go back into the file.
+
+    Attributes:
+        pixels: (1, C, H, W), C = 1 or 3, upright. Integer files are scaled to [0, 1]; float files keep their own
+            values. float32, or float64 for a file of 64-bit floats.
+        depth: How a channel is stored in the file, as the name of a numpy dtype.
+        alpha: (1, 1, H, W) likewise, or None. Never edited, carried along.
+        icc: The colour profile, or None. Pixels are neither converted from nor to it.
+        exif: The EXIF block, whose orientation is 1 since the pixels are upright, or None.
+    """
+
+    pixels: Tensor
+    depth: Depth = "uint8"
+    alpha: Tensor | None = None
+    icc: bytes | None = None
+    exif: bytes | None = None
+
+    def with_pixels(self, pixels: Tensor) -> "Photograph":
+        """The same photograph with other pixels, (1, C, H, W) on any device."""
+        return replace(self, pixels=pixels.detach().to(self.pixels))
+
+
+def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0) -> Photograph:
+    """Read an image file.
+
+    Args:
+        path: A PNG, JPEG, TIFF or WebP file, told by its content: grey or RGB, with or without alpha, of 8 or 16 bits
+            or (TIFF) floats. Of a TIFF with several pages, and of a JPEG with several pictures, the first.
+        bytes_per_pixel: Memory that is going to be needed for each pixel, checked before anything is decoded.
+
+    Returns:
+        The photograph, turned upright.
+
+    Raises:
+        FileNotFoundError: No file is there.
+        ValueError: The file is empty, damaged, not an image, or an image of a kind that is not handled.
+        MemoryError: ``bytes_per_pixel`` for each pixel is more than the memory at hand.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; check the name and the folder")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, not an image file; name a file in it")
+    with path.open("rb") as stream:
+        head = stream.read(32)
+    if not head:
+        raise ValueError(f"{path} is empty; copy it again from where it came")
+    read = _read_tiff if tiff.is_tiff(head) else _read_by_pillow
+    channels, orientation, icc, exif = read(path, head, bytes_per_pixel)
+    channels = exif_tags.upright(channels, orientation)  # (H, W, S)
+
+    dtype = channels.dtype
+    if dtype.name not in BITS:
+        raise ValueError(
+            f"{path} stores its channels as {dtype.name}, which is not handled; convert it to 8 or 16 bits or floats"
+        )
+    values: NDArray[np.floating] = channels.astype(np.float64 if dtype == np.float64 else np.float32)
+    if dtype.name in WHITE:
+        values = values / np.float32(WHITE[dtype.name])
+    elif not np.isfinite(values).all():
+        raise ValueError(f"{path} holds NaN or infinite pixels; replace them first")
+    planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]  # (1, S, H, W)
+    colours = 3 if planes.shape[1] >= 3 else 1
+    alpha = planes[:, colours:] if planes.shape[1] > colours else None
+    return Photograph(planes[:, :colours], dtype.name, alpha, icc, exif)  # type: ignore[arg-type]
+
+
+def write_photograph(photograph: Photograph, path: str | Path) -> None:
+    """Write an image file of the type that the name ends on, at the photograph's depth.
+
+    Integer channels are clipped to what the file can hold and rounded. JPEG is written at quality 95 without colour
+    subsampling, WebP and TIFF without loss. The file appears complete or not at all.
+
+    Raises:
+        ValueError: See :func:`check_output`.
+        OSError: The system does not let the file be written.
+    """
+    path = Path(path)
+    kind = check_output(path, photograph)
+    planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
+    values = torch.cat(planes, dim=1)[0].permute(1, 2, 0).numpy(force=True)  # (H, W, S)
+    dtype = np.dtype(photograph.depth)
+    if photograph.depth in WHITE:
+        values = np.rint(values.clip(0, 1) * WHITE[photograph.depth])
+    channels = np.ascontiguousarray(values.astype(dtype))
+    if channels.shape[2] == 1:
+        channels = channels[..., 0]
+    with open_beside(path) as stream:
+        if kind == "TIFF":
+            tiff.write(stream, channels, photograph.alpha is not None, photograph.icc, photograph.exif)
+        elif photograph.depth == "uint16":
+            stream.write(_encode_deep_png(channels, photograph))
+        else:
+            options: dict[str, object] = dict(ENCODING.get(kind, {}))
+            metadata = {"icc_profile": photograph.icc, "exif": photograph.exif}
+            options |= {name: block for name, block in metadata.items() if block is not None}
+            Image.fromarray(channels).save(stream, format=kind, **options)
+
+
+def check_output(path: str | Path, photograph: Photograph) -> str:
+    """Raise ValueError unless ``photograph`` can be written to ``path``; return the type of file it would be.
+
+    Call it before long work, so that the sentence comes at once.
+    """
+    path = Path(path)
+    check_folder(path)
+    kind = SUFFIXES.get(path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"{path} must end in .png, .jpg, .webp or .tif, got {path.suffix!r}; choose one of these")
+    if photograph.depth not in DEPTHS[kind]:
+        others = " or ".join(name for name, depths in DEPTHS.items() if photograph.depth in depths)
+        raise ValueError(
+            f"{path} cannot hold this picture: {kind} has no {BITS[photograph.depth]} a channel; "
+            f"write a {others} file or choose a depth of {BITS[DEPTHS[kind][-1]]}"
+        )
+    if photograph.alpha is not None and kind == "JPEG":
+        raise ValueError(f"{path} cannot hold this picture: JPEG has no alpha channel; write a PNG, TIFF or WebP file")
+    return kind
+
+
+def check_folder(path: str | Path) -> None:
+    """Raise ValueError unless a file can be made at ``path``."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; add a file name to it")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path} cannot be written because the folder {path.parent} does not exist; make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path} cannot be written because the folder {path.parent} is read-only; choose another")
+
+
+@contextmanager
+def open_beside(path: str | Path) -> Iterator[BinaryIO]:
+    """A binary file that takes the name ``path`` when the block ends well, and vanishes when it does not.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with open_beside(folder / "note.txt") as stream:
+    ...     _ = stream.write(b"whole")
+    >>> [file.name for file in folder.iterdir()]
+    ['note.txt']
+    """
+    path = Path(path)
+    # Opened by hand, not by tempfile: the file must get the usual permissions, and live on the same file system.
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with beside.open("x+b") as stream:
+            yield stream
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
+    """Raise MemoryError if ``width * height * bytes_per_pixel`` is more than the memory that is free."""
+    needed, free = width * height * bytes_per_pixel, psutil.virtual_memory().available
+    if needed > free:
+        raise MemoryError(
+            f"{path} has {width}x{height} pixels and needs about {needed / 1e9:.1f} GB of memory, "
+            f"but {free / 1e9:.1f} GB is free; use fewer landmarks or a smaller picture"
+        )
+
+
+def _read_by_pillow(path: Path, head: bytes, bytes_per_pixel: int) -> tuple[Pixels, int, bytes | None, bytes | None]:
+    """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG or WebP file."""
+    try:
+        with warnings.catch_warnings():
+            # Pillow's own guard against huge pictures knows nothing of this machine's memory; check_memory does.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP"])
+    except Image.DecompressionBombError as error:
+        raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
+    except UnidentifiedImageError as error:
+        raise ValueError(f"{path} is not a PNG, JPEG, TIFF or WebP image; convert it to one of these") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        raise _damaged(path, error) from error
+    with image:
+        frames = getattr(image, "n_frames", 1)
+        if frames > 1 and image.format != "MPO":
+            raise ValueError(f"{path} is an animation of {frames} frames; save one of them as a picture")
+        check_memory(path, *image.size, bytes_per_pixel)
+        try:
+            orientation, exif = exif_tags.split(image.getexif())
+            if image.format == "PNG" and head[24] == 16:  # the bit depth in its header; Pillow would keep 8 of them
+                channels = imagecodecs.png_decode(path.read_bytes())
+            else:
+                channels = np.asarray(_to_plain_mode(image, path))
+        except (OSError, SyntaxError, RuntimeError) as error:
+            raise _damaged(path, error) from error
+        icc = image.info.get("icc_profile")
+    return channels.reshape(*channels.shape[:2], -1), orientation, icc, exif
+
+
+def _to_plain_mode(image: Image.Image, path: Path) -> Image.Image:
+    """The image in one of the modes L, LA, RGB, RGBA."""
+    transparent = "transparency" in image.info
+    modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
+    modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
+    if image.mode not in modes:
+        raise ValueError(f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB")
+    image.load()
+    return image.convert(modes[image.mode])
+
+
+def _read_tiff(path: Path, head: bytes, bytes_per_pixel: int) -> tuple[Pixels, int, bytes | None, bytes | None]:
+    """(H, W, S) channels, orientation, profile and EXIF of the first page of a TIFF file."""
+    try:
+        return tiff.read(path, lambda width, height: check_memory(path, width, height, bytes_per_pixel))
+    except tiff.UnhandledTiff as error:
+        raise ValueError(f"{path} {error}") from error
+    except MemoryError:
+        raise
+    except Exception as error:  # tifffile and the decoders behind it have no common class for damage
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    return ValueError(
+        f"{path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
+    )
+
+
+def _encode_deep_png(channels: Pixels, photograph: Photograph) -> bytes:
+    """A 16-bit PNG file; profile and EXIF go in right after its header, before the pixels as the format demands."""
+    encoded = imagecodecs.png_encode(channels)
+    start = 8 + 25  # signature, and the header chunk, whose length is fixed
+    chunks = io.BytesIO()
+    if photograph.icc is not None:
+        PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(photograph.icc))
+    if photograph.exif is not None:
+        PngImagePlugin.putchunk(chunks, b"eXIf", photograph.exif.removeprefix(exif_tags.PREFIX))
+    return bytes(encoded[:start]) + chunks.getvalue() + bytes(encoded[start:])

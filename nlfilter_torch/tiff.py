@@ -1,0 +1,135 @@
+"""TIFF files in and out, by tifffile: any depth, profile and EXIF carried."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, TiffImagePlugin
+
+from nlfilter_torch import exif as exif_tags
+
+# Tags that describe the photograph; the others describe how the file stores it, and are written anew.
+_DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
+_FOLDERS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # tags that point at a table of further tags
+_ORIENTATION = int(ExifTags.Base.Orientation)
+_ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
+
+
+class UnhandledTiff(Exception):
+    """A sound TIFF file of a kind that is not handled; the text goes on from the file's name."""
+
+
+def is_tiff(head: bytes) -> bool:
+    """Do these first bytes open a TIFF (or BigTIFF) file?"""
+    return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def read(path: Path, check_size: Callable[[int, int], None]) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
+    """(H, W, S) channels as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
+
+    ``check_size(width, height)`` is called before the pixels are decoded.
+    """
+    with tifffile.TiffFile(path) as file:
+        page = file.pages.first
+        kinds = tifffile.PHOTOMETRIC
+        by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
+        handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
+        if page.photometric not in handled:
+            name = getattr(page.photometric, "name", page.photometric)
+            raise UnhandledTiff(f"is stored in {name} colours, which are not handled; convert it to grey or RGB")
+        bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
+        if page.dtype is None or bits != 8 * page.dtype.itemsize:
+            raise UnhandledTiff(
+                f"has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats"
+            )
+        check_size(page.imagewidth, page.imagelength)
+        channels = np.asarray(page.asarray())
+        if page.axes == "SYX":
+            channels = np.moveaxis(channels, 0, -1)
+        elif page.axes == "YX":
+            channels = channels[..., None]
+        elif page.axes != "YXS":
+            raise UnhandledTiff(f"has the axes {page.axes}, which are not those of a picture; save a plain picture")
+        colours = channels.shape[2] - len(page.extrasamples)
+        if colours not in (1, 3) or len(page.extrasamples) > 1:
+            raise UnhandledTiff(f"has {channels.shape[2]} channels; convert it to grey or RGB, with or without alpha")
+        channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
+        if page.photometric == kinds.MINISWHITE:
+            channels[..., :1] = np.iinfo(channels.dtype).max - channels[..., :1]
+        if _ASSOCIATED in page.extrasamples:
+            channels = _unmultiplied(channels)
+        tag = page.tags.get(_ORIENTATION)
+        orientation = 1 if tag is None else int(tag.value)
+        profile = page.tags.get(34675)
+        icc = None if profile is None else bytes(profile.value)
+        exif = None if file.is_bigtiff else _read_exif(path)
+    return channels, orientation, icc, exif
+
+
+def write(stream: BinaryIO, channels: NDArray[Any], alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
+    """Write channels, (H, W) or (H, W, S), compressed without loss; ``alpha``: the last of them is one."""
+    tags = Image.Exif()
+    if exif is not None:
+        tags.load(exif)
+    text = [(code, "s", 0, str(tags[code]), True) for code in _DESCRIPTIVE if code in tags and code not in _FOLDERS]
+    folders = {code: folder for code in _FOLDERS if (folder := tags.get_ifd(code))}
+    # tifffile does not write tables of its own, so a tag of the number below keeps each one's place in the order.
+    places = [(code - 1, "I", 1, 0, True) for code in folders]
+    start = stream.tell()
+    tifffile.imwrite(
+        stream,
+        channels,
+        bigtiff=False,
+        photometric="rgb" if channels.ndim == 3 and channels.shape[2] >= 3 else "minisblack",
+        planarconfig="contig" if channels.ndim == 3 else None,
+        extrasamples=["unassalpha"] if alpha else None,
+        compression="zlib",
+        predictor=bool(np.issubdtype(channels.dtype, np.integer)),
+        iccprofile=icc,
+        extratags=[(_ORIENTATION, "H", 1, 1, True), *text, *places],
+        metadata=None,
+        software=False,
+    )
+    stream.seek(start)
+    with tifffile.TiffFile(stream) as file:
+        order = file.byteorder
+        positions = {code: file.pages.first.tags[code - 1].offset for code in folders}
+    for code, folder in folders.items():
+        _write_folder(stream, order, positions[code], code, folder)
+
+
+def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder: dict[int, Any]) -> None:
+    """Append a table of tags and make the tag at ``position`` the one that points at it."""
+    table = TiffImagePlugin.ImageFileDirectory_v2(ifh=(b"II*\0" if order == "<" else b"MM\0*") + bytes(4))
+    for key, value in folder.items():
+        table[key] = value
+    end = stream.seek(0, 2)
+    stream.write(bytes(end % 2))  # tables begin on even offsets
+    offset = end + end % 2
+    stream.write(table.tobytes(offset))
+    stream.seek(position)
+    stream.write(struct.pack(f"{order}HHLL", code, 4, 1, offset))  # 4: a 32-bit integer, 1: one of them
+
+
+def _read_exif(path: Path) -> bytes | None:
+    exif = Image.Exif()
+    with path.open("rb") as stream:
+        exif.load_from_fp(stream)
+        for code in list(exif):
+            if code not in _DESCRIPTIVE and code != _ORIENTATION:
+                del exif[code]
+        return exif_tags.split(exif)[1]
+
+
+def _unmultiplied(channels: NDArray[Any]) -> NDArray[Any]:
+    """Colours that were stored multiplied by their alpha, as themselves; black where alpha is 0."""
+    colour, alpha = channels[..., :-1].astype(np.float64), channels[..., -1:].astype(np.float64)
+    integer = np.issubdtype(channels.dtype, np.integer)
+    limit = np.iinfo(channels.dtype).max if integer else 1.0
+    plain = np.divide(colour * limit, alpha, out=np.zeros_like(colour), where=alpha > 0)
+    plain = np.rint(plain.clip(0, limit)) if integer else plain
+    return np.concatenate([plain.astype(channels.dtype), channels[..., -1:]], axis=-1)
