@@ -1,0 +1,111 @@
+"""Validation at the public boundary: one sentence, naming argument, requirement, value received and remedy.
+
+Functions inside the package trust what they are given; only public functions call these.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+
+
+def check_image(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
+    """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with at least one pixel."""
+    if not isinstance(image, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(image).__name__}; convert it with torch.as_tensor")
+    if image.dtype not in FLOATING:
+        raise TypeError(
+            f"{name} must be of a floating-point dtype with values in [0, 1], got {image.dtype}; "
+            "divide integer pixels by their largest value"
+        )
+    if image.ndim != 4:
+        raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
+    if image.numel() == 0:
+        raise ValueError(f"{name} must hold at least one pixel, got shape {tuple(image.shape)}; pass a non-empty image")
+    if channels is not None and image.shape[1] != channels:
+        raise ValueError(
+            f"{name} must have {channels} channel(s), got {image.shape[1]}; select or convert the channels"
+        )
+    if batch is not None and image.shape[0] not in (1, batch):
+        raise ValueError(f"{name} must have batch size 1 or {batch}, got {image.shape[0]}; pass one image per guide")
+    check_finite(image, name)
+
+
+def check_finite(tensor: Tensor, name: str) -> None:
+    """Raise if ``tensor`` holds NaN or infinity; skipped on accelerators (no synchronisation) and while compiling."""
+    if tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor):
+        return
+    if not bool(torch.isfinite(tensor.detach()).all()):
+        bad = int((~torch.isfinite(tensor.detach())).sum())
+        raise ValueError(f"{name} must be finite, got {bad} NaN or infinite value(s); replace them first")
+
+
+def is_transformed(tensor: Tensor) -> bool:
+    """True under ``torch.func`` transforms, where the values of a tensor cannot be looked at."""
+    return bool(torch._C._functorch.is_functorch_wrapped_tensor(tensor))
+
+
+def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str) -> None:
+    """Raise unless the last two dimensions of ``tensor`` are ``size``."""
+    if tuple(tensor.shape[-2:]) != tuple(size):
+        raise ValueError(
+            f"{name} must have the height and width of the {other}, {size[0]}x{size[1]}, "
+            f"got {tensor.shape[-2]}x{tensor.shape[-1]}; resize one of them"
+        )
+
+
+def check_patch_size(patch_size: int) -> None:
+    """Raise unless ``patch_size`` is an odd positive integer."""
+    if isinstance(patch_size, bool) or not isinstance(patch_size, int):
+        raise TypeError(f"patch_size must be an int, got {type(patch_size).__name__}; pass 1, 3, 5, ...")
+    if patch_size < 1 or patch_size % 2 == 0:
+        raise ValueError(f"patch_size must be odd and at least 1, got {patch_size}; try {abs(patch_size) // 2 * 2 + 1}")
+
+
+def check_choice(value: str, name: str, choices: Sequence[str]) -> None:
+    """Raise unless ``value`` is one of ``choices``."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}; choose one of these")
+
+
+def check_positive(value: float | Tensor, name: str) -> None:
+    """Raise unless ``value`` (a number, or a tensor on the CPU) is positive and finite everywhere."""
+    if isinstance(value, Tensor):
+        if value.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(value):
+            return
+        detached = value.detach()
+        if not bool(((detached > 0) & torch.isfinite(detached)).all()):
+            raise ValueError(f"{name} must be positive and finite, got {detached.tolist()}; clamp or reparametrise it")
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a positive number")
+    elif not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"{name} must be positive and finite, got {value}; pass a positive number")
+
+
+def check_count(value: int, name: str) -> None:
+    """Raise unless ``value`` is a positive integer."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name} must be an int, got {type(value).__name__}; pass a positive integer")
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value}; pass a positive integer")
+
+
+def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
+    """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, where allowed, (B, k+1, H, W)."""
+    if not isinstance(alpha, Tensor):
+        raise TypeError(f"alpha must be a torch.Tensor, got {type(alpha).__name__}; convert it with torch.tensor")
+    if alpha.dtype not in FLOATING:
+        raise TypeError(f"alpha must be of a floating-point dtype, got {alpha.dtype}; write 1.0 instead of 1")
+    if alpha.ndim not in dimensions:
+        shapes = {1: "(k+1,)", 2: "(B, k+1)", 4: "(B, k+1, H, W)"}
+        wanted = " or ".join(shapes[n] for n in dimensions)
+        raise ValueError(f"alpha must have shape {wanted}, got {tuple(alpha.shape)}; reshape it")
+    entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
+    if entries < 2:
+        raise ValueError(
+            f"alpha must have at least two entries, got {entries}; give one per layer, such as (1, 1, 1, 1)"
+        )
+    check_finite(alpha, "alpha")

@@ -1,0 +1,77 @@
+"""Guide image to features: weighted patches and coordinates, scaled by the bandwidths. Paper: eq. (1), (18)."""
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+GuideChannels = Literal["luminance", "all"]
+Bandwidth = float | Tensor | None
+
+
+def patch_window(patch_size: int) -> Tensor:
+    """Gaussian patch weights of unit sum, (patch_size, patch_size), sigma = patch_size / 4.
+
+    With unit sum the photometric bandwidth is in grey levels of the guide whatever the patch size.
+    """
+    profile = torch.signal.windows.gaussian(patch_size, std=patch_size / 4, dtype=torch.float64)
+    window = torch.outer(profile, profile)
+    return window / window.sum()
+
+
+def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
+    """(B, 3, H, W) to luminance (B, 1, H, W) unless ``guide_channels`` is ``"all"``; other guides are taken whole."""
+    if guide_channels == "luminance" and guide.shape[1] == 3:
+        from kornia.color import rgb_to_grayscale  # kornia takes half a second to import: only who needs it waits
+
+        return rgb_to_grayscale(guide)
+    return guide
+
+
+def extract_features(
+    guide: Tensor,
+    *,
+    patch_weights: Tensor,
+    photometric_bandwidth: float | Tensor,
+    spatial_bandwidth: Bandwidth = None,
+) -> Tensor:
+    """Features whose squared distance is the exponent of the kernel: ``K_ij = exp(-||x_i - x_j||^2)``.
+
+    Paper: eq. (1), with the mean over channels where the guide has several, and eq. (18).
+
+    Args:
+        guide: (B, C, H, W), already reduced to the channels that count.
+        patch_weights: (p, p), non-negative, of unit sum; differentiable.
+        photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
+        spatial_bandwidth: h_x in pixels, likewise; None leaves the coordinates out.
+
+    Returns:
+        (B, D, H*W) with D = C p^2, plus 2 with coordinates. Pixels come last: each feature is a plane.
+    """
+    batch, channels, height, width = guide.shape
+    size = patch_weights.shape[0]
+    planes = pad_border(guide, size // 2).unfold(2, size, 1).unfold(3, size, 1)  # (B, C, H, W, p, p), a view
+    scale = patch_weights.to(guide).div(channels).sqrt().view(1, 1, size, size, 1, 1)
+    scale = scale / _per_image(photometric_bandwidth, guide).view(-1, 1, 1, 1, 1, 1)
+    features = (planes.permute(0, 1, 4, 5, 2, 3) * scale).flatten(1, 3).flatten(2)  # (B, C*p*p, N)
+    if spatial_bandwidth is None:
+        return features
+    rows = torch.arange(height, dtype=guide.dtype, device=guide.device)
+    columns = torch.arange(width, dtype=guide.dtype, device=guide.device)
+    grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
+    coordinates = grid / _per_image(spatial_bandwidth, guide).view(-1, 1, 1)
+    return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
+
+
+def pad_border(image: Tensor, margin: int) -> Tensor:
+    """Pad by reflection; an axis that is too short to be reflected is replicated."""
+    height, width = image.shape[-2:]
+    for pad, length in (((margin, margin, 0, 0), width), ((0, 0, margin, margin), height)):
+        image = F.pad(image, pad, mode="reflect" if length > margin else "replicate")
+    return image
+
+
+def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
+    """A bandwidth as a tensor of shape (1,) or (B,) in the dtype and on the device of ``like``."""
+    return torch.as_tensor(value).to(like).reshape(-1)

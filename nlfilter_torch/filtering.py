@@ -1,0 +1,173 @@
+"""Operator, response and image to filtered image. Paper: Sec. III, eq. (10) to (14), Fig. 4; Appendix A, eq. (19)."""
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.checks import check_alpha, check_count, check_image, check_same_size
+from nlfilter_torch.operator import NonlocalOperator
+from nlfilter_torch.precision import full_precision
+from nlfilter_torch.products import fold_batch, unfold_batch
+from nlfilter_torch.spectrum import Response, Spectrum
+
+
+def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:
+    """Split an image into detail layers, fine to coarse, and the smooth layer that remains.
+
+    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Whoever keeps the layers moves sliders
+    without another look at the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, which is
+    :class:`PolynomialSliders`.
+
+    Args:
+        operator: W.
+        image: y, (B, C, H, W).
+        order: k, at least 1.
+
+    Returns:
+        (B, k+1, C, H, W) in the image's dtype; they sum to the image, to rounding. Differentiable in image and operator.
+
+    Raises:
+        TypeError, ValueError: if ``image`` does not fit the operator, or ``order`` is not a positive integer.
+
+    Example:
+        >>> from nlfilter_torch import nonlocal_operator
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> layers = detail_layers(nonlocal_operator(image, num_landmarks=20), image, order=2)
+        >>> layers.shape, bool((layers.sum(1) - image).abs().max() < 1e-5)
+        (torch.Size([1, 3, 3, 24, 24]), True)
+    """
+    return _layers(operator, image, order).to(image.dtype)
+
+
+def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
+    """The layers in the operator's dtype: differences of ``y, W y, ..., W^k y``."""
+    check_count(order, "order")
+    powers = operator.powers(image, order)  # (B, k, C, H, W)
+    first = image.to(powers).unsqueeze(1).expand(powers.shape[0], -1, -1, -1, -1)
+    smoothed = torch.cat([first, powers], dim=1)
+    return torch.cat([smoothed[:, :-1] - smoothed[:, 1:], smoothed[:, -1:]], dim=1)
+
+
+def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
+    """``sum_i alpha_i y_i`` over the layers (B, k+1, C, H, W). Paper: eq. (12).
+
+    Args:
+        alpha: (k+1,), (B, k+1) per image, or (B, k+1, H, W) per pixel; a batch of 1 on either side is broadcast.
+    """
+    check_alpha(alpha)
+    entries = alpha.shape[-1] if alpha.ndim <= 2 else alpha.shape[1]
+    if entries != layers.shape[1]:
+        raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; change one of them")
+    if alpha.ndim > 1 and alpha.shape[0] != layers.shape[0] and 1 not in (alpha.shape[0], layers.shape[0]):
+        raise ValueError(
+            f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; repeat it"
+        )
+    if alpha.ndim == 4:
+        check_same_size(alpha, (layers.shape[-2], layers.shape[-1]), "alpha", "image")
+        weights = alpha.unsqueeze(2)
+    else:
+        weights = alpha[..., None, None, None]
+    return (weights.to(layers) * layers).sum(-4)
+
+
+@full_precision
+def polynomial_filter(
+    operator: NonlocalOperator, image: Tensor, alpha: Tensor, *, residual: float | Tensor | None = None
+) -> Tensor:
+    """Filter an image with the sliders ``alpha``: detail, contrast and tone in one linear filter.
+
+    Paper: eq. (12), (13), by k products with W and no eigenvectors.
+
+    Args:
+        operator: W.
+        image: y, (B, C, H, W).
+        alpha: weights of the layers, fine to coarse, the last of the smooth layer: (k+1,), (B, k+1) per image, or
+            (B, k+1, H, W) per pixel. Ones leave the image as it is.
+        residual: weight of ``y - V V^T y``, what the eigenvectors do not explain. None is alpha_1, which is exactly eq. (12);
+            0.0 drops it, which is the paper's eq. (13) and Appendix B; 1.0 leaves it untouched, which sharpens less noise. A
+            number, or a tensor of shape () or (B,).
+
+    Returns:
+        (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in all of these and
+        in the operator.
+
+    Raises:
+        TypeError, ValueError: if ``image`` does not fit the operator, or ``alpha`` has fewer than two entries or another
+            shape.
+
+    Example:
+        >>> from nlfilter_torch import nonlocal_operator
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> operator = nonlocal_operator(image, num_landmarks=20)
+        >>> crisp = polynomial_filter(operator, image, torch.tensor([3.0, 3.0, 4.0, 1.05]))
+        >>> crisp.shape
+        torch.Size([1, 3, 24, 24])
+    """
+    check_alpha(alpha)
+    order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
+    filtered = weigh_layers(_layers(operator, image, order), alpha)
+    if residual is not None:
+        weights = torch.as_tensor(residual).to(filtered).reshape(-1, 1, 1, 1)
+        finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
+        finest = finest.to(filtered) if alpha.ndim == 4 else finest.to(filtered).reshape(-1, 1, 1, 1)
+        explained = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
+        filtered = filtered + (weights - finest) * (image.to(filtered) - explained)
+    return filtered.to(image.dtype)
+
+
+@full_precision
+def spectral_filter(spectrum: Spectrum, image: Tensor, response: Response, *, residual: float | Tensor = 0.0) -> Tensor:
+    """Filter an image with any response: ``V f(S) V^T y``, plus ``residual`` times what V does not explain.
+
+    Paper: eq. (10), (13), and Sec. V-D, where f is a fractional power.
+
+    Args:
+        spectrum: of the operator.
+        image: y, (B, C, H, W).
+        response: f, an elementwise function of the eigenvalues (B, R), differentiable in torch; it may hold parameters.
+        residual: weight of ``y - V V^T y``, a number or a tensor of shape () or the spectrum's (B,).
+
+    Returns:
+        (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of ``response``,
+        with a finite gradient where eigenvalues meet.
+
+    Raises:
+        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
+
+    Example:
+        >>> from nlfilter_torch import nonlocal_operator
+        >>> image = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> spectrum = nonlocal_operator(image, num_landmarks=20).spectrum()
+        >>> spectral_filter(spectrum, image, lambda eigenvalues: eigenvalues**0.1, residual=1.0).shape
+        torch.Size([1, 1, 24, 24])
+    """
+    check_image(image, "image")
+    check_same_size(image, spectrum.size, "image", "spectrum")
+    rho = torch.as_tensor(residual).to(spectrum.root).reshape(-1, 1)
+    image_in = image.to(spectrum.factor)
+    planes = fold_batch(image_in, spectrum.factor.shape[0])
+    # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still one pass down and one up.
+    spread = spectrum.apply(lambda eigenvalues: response(eigenvalues) - rho, planes)
+    filtered = unfold_batch(spread.unsqueeze(1), image.shape[0], spectrum.size)[:, 0]
+    return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image_in).to(image.dtype)
+
+
+@full_precision
+def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
+    """Share of the image's energy in the span of the eigenvectors: ``|V^T y|^2 / |y|^2``.
+
+    Paper: eq. (19); near 1 when bandwidth and landmarks suit the image.
+
+    Args:
+        spectrum: of the operator.
+        image: y, (B, C, H, W).
+
+    Returns:
+        beta, (B,), in [0, 1] to rounding; 1 for a black image. Differentiable in image and operator.
+
+    Raises:
+        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
+    """
+    explained = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
+    energy = image.to(spectrum.factor).square().sum((1, 2, 3))
+    inner = (explained * image.to(spectrum.factor)).sum((1, 2, 3))  # y^T V V^T y = |V^T y|^2
+    return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))

@@ -1,0 +1,94 @@
+"""Features to landmarks, the few points through which every affinity passes. Paper: Sec. II-C, set A."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Sampling = Literal["kmeans", "uniform", "random"]
+
+SUBSET = 16384  # features that k-means looks at; more of them move the centroids by less than their sampling error
+ITERATIONS = 10
+
+
+def choose_landmarks(
+    features: Tensor, size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator | None
+) -> Tensor:
+    """Choose or compute ``count`` landmarks.
+
+    Args:
+        features: (B, D, N) with N = H * W.
+        size: (H, W).
+        count: M, at most N. With M = N the landmarks are the pixels themselves.
+        sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
+            ``"random"``: distinct random pixels.
+        generator: source of randomness; None seeds a new one with 0, so that equal calls give equal landmarks.
+
+    Returns:
+        (B, D, M), differentiable in the features (k-means with the assignment held). All images of a batch draw the
+        same pixels, so that a batch gives what single calls give.
+    """
+    pixels = features.shape[-1]
+    if count == pixels:
+        return features
+    if sampling == "uniform":
+        return features[:, :, _grid(size, count).to(features.device)]
+    if generator is None:
+        generator = torch.Generator().manual_seed(0)
+    if sampling == "random":
+        chosen = torch.randperm(pixels, generator=generator, device=generator.device)[:count]
+        return features[:, :, chosen.to(features.device)]
+    subset = features[:, :, _stratified(pixels, max(count, _subset_size(pixels, count)), generator).to(features.device)]
+    return cluster_means(subset, _lloyd(subset.detach(), count), subset[:, :, :count])
+
+
+def _subset_size(pixels: int, count: int) -> int:
+    """Small images give k-means a part of their pixels only, so that a batch of them costs what one large one costs."""
+    return min(SUBSET, max(pixels // 8, min(pixels, 32 * count)))
+
+
+def _grid(size: tuple[int, int], count: int) -> Tensor:
+    """Indices of ``count`` pixels spread evenly over an image of ``size``, as rows of nearly equal length."""
+    height, width = size
+    rows = round((count * height / width) ** 0.5)
+    rows = min(max(rows, -(-count // width), 1), height, count)
+    lengths = [count // rows + (row < count % rows) for row in range(rows)]
+    lines = []
+    for row, length in enumerate(lengths):
+        y = (2 * row + 1) * height // (2 * rows)
+        x = (2 * torch.arange(length) + 1) * width // (2 * length)
+        lines.append(y * width + x)
+    return torch.cat(lines)
+
+
+def _stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
+    """``count`` distinct pixels, one from each of ``count`` equal stretches of the image, in random order."""
+    device = generator.device
+    offsets = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
+    indices = ((torch.arange(count, device=device) + offsets) * (pixels / count)).long().clamp_(max=pixels - 1)
+    return indices[torch.randperm(count, generator=generator, device=device)]
+
+
+def _lloyd(points: Tensor, count: int) -> Tensor:
+    """Assignment (B, S) of points (B, D, S) to ``count`` clusters after Lloyd's iterations from the first points."""
+    points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
+    start = points[:, :, :count]
+    assignment = assign(points, start)
+    for _ in range(ITERATIONS):
+        assignment = assign(points, cluster_means(points, assignment, start))
+    return assignment
+
+
+def assign(points: Tensor, centres: Tensor) -> Tensor:
+    """Index (B, S) of the centre (B, D, K) nearest to each of the points (B, D, S)."""
+    score = torch.baddbmm(-0.5 * centres.square().sum(1).unsqueeze(2), centres.mT, points)  # (B, K, S)
+    return score.argmax(dim=1)
+
+
+def cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
+    """Mean (B, D, K) of the points (B, D, S) of every cluster, or its column of ``fallback`` (B, D, K) where it is empty."""
+    members = points.new_zeros(points.shape[0], fallback.shape[2], points.shape[2])
+    members.scatter_(1, assignment.unsqueeze(1), 1.0)
+    sizes = members.sum(2).unsqueeze(1)  # (B, 1, K)
+    means = points @ members.mT / sizes.clamp(min=1.0)  # a product, not an index_add: deterministic on every device
+    return torch.where(sizes > 0, means, fallback)

@@ -1,0 +1,96 @@
+"""Functions of small symmetric matrices, with a gradient that stands repeated eigenvalues.
+
+``torch.linalg.eigh`` differentiates its eigenvectors, which divides by ``lambda_i - lambda_j`` and gives NaN where they
+meet: on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of Q, and its
+derivative is finite: ``Q (D * (Q^T dA Q)) Q^T`` with the divided differences ``D_ij = (f_i - f_j) / (lambda_i - lambda_j)``,
+or f' where the two meet (Daleckii and Krein, 1965).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+# Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of cancellation
+# are both near 1e-10 then. Below FLOOR the comparison is absolute, since zero eigenvalues are only zero to rounding.
+MEETING = 1e-5
+FLOOR = 1e-5
+
+
+@dataclass(frozen=True)
+class SymmetricMatrix:
+    """A batch of symmetric matrices with its eigen-decomposition.
+
+    Attributes:
+        matrix: (B, M, M), with its gradient.
+        eigenvalues: (B, M), descending, without gradient.
+        vectors: (B, M, M), columns, without gradient.
+    """
+
+    matrix: Tensor
+    eigenvalues: Tensor
+    vectors: Tensor
+
+    @staticmethod
+    def of(matrix: Tensor) -> "SymmetricMatrix":
+        """Decompose ``matrix`` (B, M, M), positive semi-definite up to rounding."""
+        eigenvalues, vectors = torch.linalg.eigh(matrix.detach())
+        return SymmetricMatrix(matrix, eigenvalues.flip(-1).clamp(min=0.0), vectors.flip(-1))
+
+    def apply(self, function: Callable[[Tensor], Tensor], support: Tensor) -> Tensor:
+        """f(A) restricted to the eigenvalues in ``support``.
+
+        Args:
+            function: elementwise and differentiable, (B, M) to (B, M); may hold parameters that need a gradient.
+            support: (B, M) bool; where False, f is taken as 0 and the eigenvalue does not reach ``function``.
+
+        Returns:
+            (B, M, M), differentiable once in the matrix and in the parameters of ``function``.
+        """
+        # A point where any sensible response and its derivative are finite stands in for what is outside the support.
+        points = torch.where(support, self.eigenvalues, torch.ones_like(self.eigenvalues))
+        values = torch.where(support, function(points), torch.zeros_like(points))
+        if not self.matrix.requires_grad:
+            return (self.vectors * values.unsqueeze(-2)) @ self.vectors.mT
+        result: Tensor = _SpectralFunction.apply(
+            self.matrix, values, self.vectors, self._differences(function, values, support)
+        )
+        return result
+
+    def _differences(self, function: Callable[[Tensor], Tensor], values: Tensor, support: Tensor) -> Tensor:
+        """Divided differences (B, M, M) of f over the eigenvalues."""
+        gap = self.eigenvalues.unsqueeze(-1) - self.eigenvalues.unsqueeze(-2)
+        middle = (self.eigenvalues.unsqueeze(-1) + self.eigenvalues.unsqueeze(-2)) / 2
+        both = support.unsqueeze(-1) & support.unsqueeze(-2)
+        meeting = both & (gap.abs() < MEETING * middle.clamp(min=FLOOR))
+        slope = self._slope(function, torch.where(meeting, middle, torch.ones_like(middle)))
+        values = values.detach()
+        secant = (values.unsqueeze(-1) - values.unsqueeze(-2)) / torch.where(gap == 0, torch.ones_like(gap), gap)
+        return torch.where(meeting, slope, secant)
+
+    @staticmethod
+    def _slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+        """F' at ``points`` (B, M, M), one column at a time because f may be different for every image of the batch."""
+        with torch.enable_grad():
+            points = points.detach().requires_grad_()
+            flat = points.flatten(1)
+            total = function(flat).sum()
+            return torch.autograd.grad(total, points)[0] if total.requires_grad else torch.zeros_like(points)
+
+
+class _SpectralFunction(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor, values: Tensor, vectors: Tensor, differences: Tensor) -> Tensor:
+        ctx.save_for_backward(vectors, differences)
+        return (vectors * values.unsqueeze(-2)) @ vectors.mT
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        vectors, differences = ctx.saved_tensors
+        inner = vectors.mT @ ((grad + grad.mT) / 2) @ vectors
+        grad_matrix = vectors @ (differences * inner) @ vectors.mT
+        return grad_matrix, inner.diagonal(dim1=-2, dim2=-1), None, None

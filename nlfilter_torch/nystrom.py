@@ -1,0 +1,111 @@
+"""Features and landmarks to a factor of the affinity matrix: ``K ~ factor^T factor + diag(diagonal)``.
+
+Paper: Sec. II-C. The paper takes square roots and pseudo-inverses of the sampled block; here it is whitened by its
+Cholesky factor, and what the landmarks miss is put back on the diagonal (``completion``), so that K keeps its unit
+diagonal and a pixel like no other keeps its value. The plain method gives such a pixel a row of about zero.
+"""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nlfilter_torch.blocks import pixel_blocks
+
+Completion = Literal["diagonal", "none"]
+
+JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, which float32 can bear
+SMALLEST_EXPONENT = -60.0  # exp(-60) is nothing beside 1; smaller ones become denormal floats, six times slower
+
+
+def whitener(landmarks: Tensor) -> Tensor:
+    """Inverse Cholesky factor (B, M, M) of the affinities between ``landmarks`` (B, D, M), worked out in float64."""
+    points = landmarks.double()
+    points = points - points.mean(dim=2, keepdim=True)
+    norms = points.square().sum(1)
+    squared = norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
+    identity = torch.eye(landmarks.shape[2], dtype=torch.float64, device=landmarks.device)
+    # The distance of a landmark to itself is zero by definition, whatever the rounding of the three terms.
+    affinity = torch.exp(-squared.clamp(min=0.0) * (1 - identity)) + JITTER * identity
+    lower = torch.linalg.cholesky(affinity)
+    return torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False).to(landmarks)
+
+
+def nystrom_factor(
+    features: Tensor, landmarks: Tensor, whitening: Tensor, completion: Completion
+) -> tuple[Tensor, Tensor]:
+    """Nystrom factor of the affinities of every pixel, and the diagonal that completes it.
+
+    Args:
+        features: (B, D, N).
+        landmarks: (B, D, M).
+        whitening: (B, M, M) of :func:`whitener`.
+        completion: ``"diagonal"`` or ``"none"``.
+
+    Returns:
+        factor (B, M, N) with columns of norm at most 1, and diagonal (B, N) in [0, 1] (zero without completion).
+        Differentiable once in the three tensors; the backward pass recomputes the affinities block by block.
+    """
+    factor, diagonal, _ = _NystromFactor.apply(features, landmarks, whitening, completion == "diagonal")
+    return factor, diagonal
+
+
+def _affinity(features: Tensor, landmarks: Tensor, centre: Tensor) -> Tensor:
+    """Affinities (B, M, n) of a block of features (B, D, n), both taken relative to ``centre`` (B, D, 1)."""
+    x, z = features - centre, landmarks - centre
+    exponent = torch.baddbmm(z.square().sum(1).unsqueeze(2), z.mT, x, beta=-1, alpha=2)
+    return exponent.sub_(x.square().sum(1).unsqueeze(1)).clamp_(SMALLEST_EXPONENT, 0.0).exp_()
+
+
+class _NystromFactor(torch.autograd.Function):
+    """u = A c(x, z), scaled to norm at most 1, and 1 - |u|^2; the third output is the scale, kept for the backward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        batch, _, pixels = features.shape
+        factor = features.new_empty(batch, landmarks.shape[2], pixels)
+        diagonal = features.new_zeros(batch, pixels)
+        scale = features.new_ones(batch, pixels)
+        centre = landmarks.mean(dim=2, keepdim=True)
+        for block in pixel_blocks(pixels, batch, features.device):
+            rows = factor[:, :, block]
+            torch.bmm(whitening, _affinity(features[:, :, block], landmarks, centre), out=rows)
+            if complete:
+                norm = rows.square().sum(1)  # (B, n)
+                scale[:, block] = norm.clamp(min=1.0).rsqrt_()
+                diagonal[:, block] = (1.0 - norm).clamp_(min=0.0)
+                rows.mul_(scale[:, None, block])
+        ctx.save_for_backward(features, landmarks, whitening, factor, scale)
+        ctx.complete = complete
+        ctx.mark_non_differentiable(scale)
+        return factor, diagonal, scale
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        features, landmarks, whitening, factor, scale = ctx.saved_tensors
+        batch, _, pixels = features.shape
+        centre = landmarks.mean(dim=2, keepdim=True)
+        grad_features = torch.empty_like(features)
+        grad_landmarks = torch.zeros_like(landmarks, dtype=torch.float64)
+        grad_whitening = torch.zeros_like(whitening, dtype=torch.float64)
+        for block in pixel_blocks(pixels, batch, features.device):
+            affinity = _affinity(features[:, :, block], landmarks, centre)
+            rows, grad = factor[:, :, block], grad_factor[:, :, block]
+            if ctx.complete:
+                # Scaled columns u / |u| lose the gradient along themselves; the others pass it on, and that of 1 - |u|^2.
+                shrink = scale[:, None, block]
+                along = torch.where(
+                    shrink < 1.0, (rows * grad).sum(1, keepdim=True), 2.0 * grad_diagonal[:, None, block]
+                )
+                grad = (grad - rows * along) * shrink
+            grad_whitening += grad @ affinity.mT
+            # K_im = exp(-|x_i - z_m|^2): its derivative is -2 (x_i - z_m) K_im in x_i and the opposite in z_m.
+            pull = (whitening.mT @ grad).mul_(affinity)  # (B, M, n)
+            x, z = features[:, :, block] - centre, landmarks - centre
+            grad_features[:, :, block] = 2.0 * (z @ pull - x * pull.sum(1, keepdim=True))
+            grad_landmarks += 2.0 * (x @ pull.mT - z * pull.sum(2).unsqueeze(1))
+        return grad_features, grad_landmarks.to(landmarks), grad_whitening.to(whitening), None

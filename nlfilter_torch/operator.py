@@ -1,0 +1,264 @@
+"""Guide to operator: the filter W as an object. Paper: Sec. II."""
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.bandwidth import estimate_bandwidth
+from nlfilter_torch.blocks import moment
+from nlfilter_torch.checks import (
+    check_choice,
+    check_count,
+    check_image,
+    check_positive,
+    check_same_size,
+)
+from nlfilter_torch.features import GuideChannels, extract_features, patch_window, reduce_channels
+from nlfilter_torch.landmarks import Sampling, choose_landmarks
+from nlfilter_torch.nystrom import Completion, nystrom_factor, whitener
+from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
+from nlfilter_torch.sinkhorn import balance
+from nlfilter_torch.spectrum import Spectrum, compute_spectrum
+
+DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Figures that tell how good an operator is; those of shape (B,) are lists with one entry per image.
+
+    Attributes:
+        pixels: N.
+        num_landmarks: M.
+        rank: eigenvectors that rise above rounding.
+        photometric_bandwidth: h_y in units of the guide.
+        balancing_steps: sweeps over the factor that balancing took.
+        row_sum_residual: largest deviation of a row sum from 1.
+        smallest_row_sum: the least row sum of the kernel before balancing; the plain method fails as it nears zero.
+        largest_eigenvalue: of the operator as it is, not clamped; 1 in theory.
+        eigenvector_residual: largest ||W v - lambda v|| over the unit eigenvectors.
+        orthogonality: largest deviation of V V^T from the identity.
+        diagonal_share: mean of the diagonal part r of W: how much of a pixel the landmarks leave to itself.
+    """
+
+    pixels: int
+    num_landmarks: int
+    rank: list[int]
+    photometric_bandwidth: list[float]
+    balancing_steps: int
+    row_sum_residual: list[float]
+    smallest_row_sum: list[float]
+    largest_eigenvalue: list[float]
+    eigenvector_residual: list[float]
+    orthogonality: list[float]
+    diagonal_share: list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class NonlocalOperator:
+    """The symmetric, doubly stochastic filter ``W = diag(d) (U^T U + diag(c)) diag(d)`` of an image, never formed.
+
+    Made by :func:`nonlocal_operator`. Every pixel is linked to every other one through M landmarks; W has unit row sums and
+    its eigenvalues lie in [0, 1].
+
+    Attributes:
+        factor: U, (B, M, N), pixels last.
+        diagonal: c, (B, N), what the landmarks miss of the kernel's unit diagonal; zeros without completion.
+        scaling: d, (B, N), positive.
+        size: (H, W).
+        photometric_bandwidth: h_y that was used, (B,) or (1,).
+        residual: largest deviation of a row sum from 1 when balancing stopped, (B,).
+        balancing_steps: sweeps over the factor that balancing took.
+        completion: ``"diagonal"`` or ``"none"``.
+    """
+
+    factor: Tensor
+    diagonal: Tensor
+    scaling: Tensor
+    size: tuple[int, int]
+    photometric_bandwidth: Tensor
+    residual: Tensor
+    balancing_steps: int
+    completion: Completion
+
+    def matmul(self, image: Tensor) -> Tensor:
+        """``W y``, also written ``operator @ image``. Paper: eq. (2).
+
+        Args:
+            image: (B, C, H, W) of the guide's height and width, any number of channels, any floating-point dtype. A batch
+                of 1 on either side is broadcast.
+
+        Returns:
+            (B, C, H, W) in the image's dtype, with the mean of the image. Differentiable in image and operator.
+
+        Raises:
+            TypeError, ValueError: if ``image`` is not a finite floating-point tensor of that size.
+        """
+        return self.powers(image, 1)[:, 0].to(image.dtype)
+
+    def __matmul__(self, image: Tensor) -> Tensor:
+        return self.matmul(image)
+
+    @full_precision
+    def powers(self, image: Tensor, order: int) -> Tensor:
+        """``W y, ..., W^k y`` as (B, k, C, H, W) in the operator's dtype; arguments and errors as :meth:`matmul`."""
+        check_image(image, "image")
+        check_same_size(image, self.size, "image", "operator")
+        folded = fold_batch(image.to(self.factor), self.factor.shape[0])
+        planes = apply_powers(self.factor, self.scaling, self.diagonal, folded, order)
+        return unfold_batch(planes, image.shape[0], self.size)
+
+    def row_sums(self) -> Tensor:
+        """(B, 1, H, W), one everywhere to :attr:`residual`."""
+        batch = self.factor.shape[0]
+        return self.matmul(self.factor.new_ones(batch, 1, *self.size))
+
+    @full_precision
+    def to_dense(self) -> Tensor:
+        """The whole matrix W, (B, N, N), symmetric. For small images.
+
+        Raises:
+            ValueError: if the image has more than 16384 pixels.
+        """
+        pixels = self.factor.shape[2]
+        if pixels > DENSE_LIMIT:
+            raise ValueError(
+                f"the operator must have at most {DENSE_LIMIT} pixels to become dense, got {pixels}; use a smaller image"
+            )
+        kernel = self.factor.mT @ self.factor + torch.diag_embed(self.diagonal)
+        return self.scaling.unsqueeze(2) * kernel * self.scaling.unsqueeze(1)
+
+    @full_precision
+    def spectrum(self, rank: int | None = None) -> Spectrum:
+        """Leading eigenvalues and eigenvectors. Paper: eq. (3), (4).
+
+        Args:
+            rank: at most so many; None keeps all that rise above rounding, at most M.
+
+        Raises:
+            TypeError, ValueError: if ``rank`` is not a positive integer.
+        """
+        if rank is not None:
+            check_count(rank, "rank")
+        diagonal = self.diagonal if self.completion == "diagonal" else None
+        return compute_spectrum(self.factor, self.scaling, diagonal, self.size, rank)
+
+    @full_precision
+    @torch.no_grad()
+    def diagnostics(self) -> Diagnostics:
+        """Measure how good the operator is. Costs several times as much as the spectrum."""
+        spectrum = self.spectrum()
+        vectors = spectrum.eigenvectors  # (B, R, H, W)
+        rank = vectors.shape[1]
+        image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
+        residual = (image - spectrum.eigenvalues[:, :, None, None] * vectors).flatten(2).norm(dim=2)
+        flat = vectors.flatten(2)
+        occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
+        total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1)).to(self.factor)
+        kernel_sums = (total.mT @ self.factor).squeeze(1) + self.diagonal
+        bandwidth = self.photometric_bandwidth.expand(self.factor.shape[0])
+        return Diagnostics(
+            pixels=self.factor.shape[2],
+            num_landmarks=self.factor.shape[1],
+            rank=spectrum.support.sum(1).tolist(),
+            photometric_bandwidth=bandwidth.tolist(),
+            balancing_steps=self.balancing_steps,
+            row_sum_residual=(self.row_sums() - 1).abs().amax((1, 2, 3)).tolist(),
+            smallest_row_sum=kernel_sums.amin(1).tolist(),
+            largest_eigenvalue=spectrum.largest.tolist(),
+            eigenvector_residual=residual.amax(1).tolist(),
+            orthogonality=(flat @ flat.mT - occupied).abs().amax((1, 2)).tolist(),
+            diagonal_share=(self.scaling.square() * self.diagonal).mean(1).tolist(),
+        )
+
+
+@full_precision
+def nonlocal_operator(
+    guide: Tensor,
+    *,
+    patch_size: int = 5,
+    photometric_bandwidth: float | Tensor | Literal["auto"] = "auto",
+    spatial_bandwidth: float | Tensor | None = None,
+    num_landmarks: int = 100,
+    landmarks: Sampling = "kmeans",
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "luminance",
+    patch_weights: Tensor | None = None,
+    tolerance: float | None = None,
+    generator: torch.Generator | None = None,
+) -> NonlocalOperator:
+    """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
+
+    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under autocast
+    too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks (for k-means,
+    the assignment of pixels to centroids) held.
+
+    Args:
+        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network.
+        patch_size: p, odd; pixels outside the image are reflected.
+        photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of shape
+            () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
+        spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
+        num_landmarks: M; reduced with a warning where the image has fewer pixels.
+        landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
+        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method, which
+            fails at small bandwidths.
+        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides of
+            another number of channels are taken whole.
+        patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
+        tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
+        generator: source of randomness for the landmarks; None draws the same for every call. The global generator is never
+            used.
+
+    Returns:
+        The operator, with row sums of 1 to ``tolerance`` or to rounding.
+
+    Raises:
+        TypeError, ValueError: naming the argument, what it must be, and what it was.
+
+    Example:
+        >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
+        >>> operator = nonlocal_operator(guide, photometric_bandwidth=0.2, num_landmarks=20)
+        >>> (operator @ guide).shape
+        torch.Size([1, 1, 32, 48])
+        >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
+        True
+    """
+    check_image(guide, "guide")
+    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"))
+    check_choice(completion, "completion", ("diagonal", "none"))
+    check_count(num_landmarks, "num_landmarks")
+    if tolerance is not None:
+        check_positive(tolerance, "tolerance")
+    batch, _, height, width = guide.shape
+    guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
+    weights = patch_window(patch_size) if patch_weights is None else patch_weights
+    bandwidth = estimate_bandwidth(guide) if isinstance(photometric_bandwidth, str) else photometric_bandwidth
+    if num_landmarks > height * width:
+        warnings.warn(
+            f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; using every pixel",
+            stacklevel=3,
+        )
+        num_landmarks = height * width
+
+    features = extract_features(
+        guide, patch_weights=weights, photometric_bandwidth=bandwidth, spatial_bandwidth=spatial_bandwidth
+    )
+    points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator)
+    factor, diagonal = nystrom_factor(features, points, whitener(points), completion)
+    balancing = balance(factor, diagonal, tolerance=tolerance)
+    return NonlocalOperator(
+        factor=factor,
+        diagonal=diagonal,
+        scaling=balancing.scaling,
+        size=(height, width),
+        photometric_bandwidth=torch.as_tensor(bandwidth, dtype=guide.dtype).detach().reshape(-1),
+        residual=balancing.residual,
+        balancing_steps=balancing.steps,
+        completion=completion,
+    )

@@ -1,0 +1,46 @@
+"""Numerical precision: the filter runs in float32 or float64 whatever surrounds it.
+
+Cholesky and eigen-decompositions reject half precision, and TF32 products lose the distances between patches. Every
+public function therefore leaves autocast, computes in :func:`working_dtype` and casts its result back.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def working_dtype(tensor: Tensor) -> torch.dtype:
+    """float64 for float64 input, float32 for everything narrower."""
+    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+@contextmanager
+def _no_tf32() -> Iterator[None]:
+    matmul, conv = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = matmul, conv
+
+
+def full_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """Run ``function`` without autocast and, where a CUDA device exists, without TF32."""
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        device = next((a.device.type for a in args if isinstance(a, Tensor)), "cuda")
+        with torch.autocast("cpu", enabled=False), torch.autocast(device, enabled=False):
+            if torch.cuda.is_available() and not torch.compiler.is_compiling():
+                with _no_tf32():
+                    return function(*args, **kwargs)
+            return function(*args, **kwargs)
+
+    return wrapper

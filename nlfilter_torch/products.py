@@ -1,0 +1,103 @@
+"""Products with ``W = F^T F + diag(r)``, F = factor diag(d), r = d^2 diagonal: all that the sliders need. Paper: eq. (13)."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nlfilter_torch.blocks import moment
+
+
+def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tensor, order: int) -> Tensor:
+    """``W y, W^2 y, ..., W^k y``.
+
+    Args:
+        factor: (B, M, N).
+        scaling: d, (B, N).
+        diagonal: (B, N) of the kernel, before scaling.
+        image: y, (B, C, N).
+        order: k, at least 1.
+
+    Returns:
+        (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long as
+        the operator needs no gradient.
+    """
+    remainder = scaling.square() * diagonal
+    if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
+        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order)
+        return result
+    return torch.stack(_powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order)[0][1:], dim=1)
+
+
+def _powers(
+    factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int
+) -> tuple[list[Tensor], list[Tensor]]:
+    """The k + 1 images from y to W^k y, and the k moments (B, M, C) that they passed through."""
+    images, moments = [image], []
+    for _ in range(order):
+        moments.append(moment(factor, scaling * images[-1]).to(factor))
+        images.append(scaling * (moments[-1].mT @ factor) + remainder * images[-1])
+    return images, moments
+
+
+def fold_batch(image: Tensor, batch: int) -> Tensor:
+    """Images (b, C, H, W) as (batch, C', N) for an operator of ``batch`` images; either batch may be 1.
+
+    Several images under one operator become its channels, so that the factor is read once for all.
+
+    Raises:
+        ValueError: if the batches differ and neither is 1.
+    """
+    if image.shape[0] != batch and 1 not in (image.shape[0], batch):
+        raise ValueError(
+            f"image must have the operator's batch size, {batch}, or 1, got {image.shape[0]}; "
+            "build the operator from as many guides"
+        )
+    if batch == 1:
+        return image.flatten(2).flatten(0, 1).unsqueeze(0)
+    return image.flatten(2).expand(batch, -1, -1)
+
+
+def unfold_batch(planes: Tensor, images: int, size: tuple[int, int]) -> Tensor:
+    """The inverse of :func:`fold_batch` for stacks (batch, k, C', N): (B, k, C, H, W), B the larger of the two batches."""
+    if planes.shape[0] == 1:
+        planes = planes.squeeze(0).unflatten(1, (images, -1)).transpose(0, 1)
+    return planes.unflatten(-1, size)
+
+
+class _Powers(torch.autograd.Function):
+    """All products share one gradient of the factor: a single matrix product, where autograd would write 2k full ones.
+
+    With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W A_i`` backwards, the loss changes by ``sum_i A_i^T dW P_(i-1)``.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int) -> Tensor:
+        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order)
+        ctx.save_for_backward(factor, scaling, remainder, *images, *moments)
+        return torch.stack(images[1:], dim=1)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        factor, scaling, remainder, *rest = ctx.saved_tensors
+        order = len(rest) // 2
+        images, moments = rest[: order + 1], rest[order + 1 :]
+        d, r = scaling.unsqueeze(1), remainder.unsqueeze(1)
+        grad_scaling, grad_remainder = torch.zeros_like(scaling), torch.zeros_like(remainder)
+        left, right = [], []  # columns (B, M, C) and rows (B, C, N) whose product is the gradient of the factor
+        adjoint = torch.zeros_like(images[0])
+        for i in range(order, 0, -1):
+            adjoint = adjoint + grad[:, i - 1]
+            before = images[i - 1]
+            total = moment(factor, d * adjoint).to(factor)
+            affinity = total.mT @ factor  # the image of the adjoint, before scaling
+            # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
+            grad_scaling += (adjoint * (moments[i - 1].mT @ factor) + before * affinity).sum(1)
+            grad_remainder += (adjoint * before).sum(1)
+            left += [moments[i - 1], total]
+            right += [d * adjoint, d * before]
+            adjoint = d * affinity + r * adjoint
+        grad_factor = torch.cat(left, dim=2) @ torch.cat(right, dim=1)
+        return grad_factor, grad_scaling, grad_remainder, adjoint, None

@@ -1,0 +1,175 @@
+"""Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
+
+With ``u = log d`` the equation is ``u + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies in
+[1, 2]: Chebyshev's semi-iteration for that interval gains a factor 5.8 a step, where the textbook alternation barely
+converges. The same interval makes the implicit gradient cheap: ten steps of the same recurrence solve ``(I + W) x = b``.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
+MAX_STEPS = 40
+ACCELERATOR_STEPS = 12  # on an accelerator a look at the residual would stop the queue: a fixed number of steps instead
+ALARM = 1e-3  # a residual that balancing ends above is worth a warning
+COARSE = 1 << 16  # an image with more pixels starts from the balancing of every STRIDE-th,
+STRIDE = 16
+COARSE_TOLERANCE = 1e-3  # to less than the sampling error of the part
+SOLVE_STEPS = {torch.float32: 10, torch.float64: 21}  # 2 * 5.8^-steps is below the rounding of the dtype
+TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
+SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
+
+
+@dataclass(frozen=True)
+class Balancing:
+    """Result of :func:`balance`.
+
+    Attributes:
+        scaling: d, (B, N), positive; differentiable in factor and diagonal.
+        residual: largest deviation of a row sum of W from 1, (B,).
+        steps: sweeps over the factor that it took.
+    """
+
+    scaling: Tensor
+    residual: Tensor
+    steps: int
+
+
+def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None) -> Balancing:
+    """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
+
+    Args:
+        factor: (B, M, N).
+        diagonal: (B, N), non-negative.
+        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. The iteration also stops where
+            rounding keeps the residual from falling, and warns if that is above 1e-3.
+    """
+    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance or TOLERANCE[factor.dtype])
+    if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
+        warnings.warn(
+            f"balancing left row sums off by up to {residual.max().item():.1e}; "
+            "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'",
+            stacklevel=3,
+        )
+    return Balancing(scaling, residual, int(steps))
+
+
+def _chebyshev(low: float, high: float) -> Iterator[tuple[float, float]]:
+    """Weights (momentum, gradient) of Chebyshev's semi-iteration for a spectrum in [low, high]."""
+    centre, radius = (high + low) / 2, (high - low) / 2
+    sigma = centre / radius
+    rho = 1 / sigma
+    yield 0.0, 1 / centre
+    while True:
+        previous, rho = rho, 1 / (2 * sigma - rho)
+        yield rho * previous, 2 * rho / radius
+
+
+def _sweep(factor: Tensor, total: Tensor, update: Callable[[slice, Tensor], Tensor]) -> Tensor:
+    """One read of the factor: hand ``factor^T total`` to ``update`` block by block, gather the moment of what returns.
+
+    Args:
+        factor: (B, M, N).
+        total: (B, M, 1) in float64, the moment of some vector.
+        update: takes a block of pixels and its (B, n) products, returns the (B, n) values of the next vector.
+    """
+    following = torch.zeros_like(total)
+    current = total.to(factor)
+    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+        rows = factor[:, :, block]
+        following += rows @ update(block, (current.mT @ rows).squeeze(1)).unsqueeze(2)
+    return following
+
+
+def _start(factor: Tensor, diagonal: Tensor) -> Tensor:
+    """A first guess of d (B, N): from the balancing of a part of the pixels, or (K 1)^(-1/2)."""
+    pixels = factor.shape[2]
+    if pixels <= COARSE:
+        affinity = (factor.sum(2, keepdim=True).mT @ factor).squeeze(1) + diagonal
+        return affinity.clamp(min=SMALLEST_AFFINITY).rsqrt()
+    part = factor[:, :, ::STRIDE].contiguous()
+    scaling, _, _ = _solve(part, diagonal[:, ::STRIDE], COARSE_TOLERANCE)
+    return scaling_from_moment(
+        factor, diagonal, moment(part, scaling.unsqueeze(1)).to(factor) * (pixels / part.shape[2])
+    )
+
+
+def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
+    """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
+
+    A pixel's equation is ``d (u . total + diagonal d) = 1``, so d is the positive root of a quadratic.
+    """
+    affinity = (total.mT @ factor).squeeze(1).clamp(min=SMALLEST_AFFINITY)
+    return 2 / (affinity + torch.sqrt(affinity.square() + 4 * diagonal))
+
+
+def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, int]:
+    """Scaling (B, N), its measured residual (B,), and the number of sweeps."""
+    scaling = _start(factor, diagonal)
+    total = moment(factor, scaling.unsqueeze(1))
+    move = torch.zeros_like(scaling)
+    watched = factor.device.type == "cpu"
+    worst = float("inf")
+    for steps, (momentum, gain) in enumerate(_chebyshev(1.0, 2.0), start=1):
+        residual = scaling.new_zeros(scaling.shape[0])
+        following = torch.empty_like(scaling)
+
+        def update(block: slice, affinity: Tensor) -> Tensor:
+            d = scaling[:, block]
+            sums = d * (affinity + diagonal[:, block] * d)  # row sums of W
+            torch.maximum(residual, (sums - 1).abs().amax(1), out=residual)
+            # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
+            step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
+            return torch.mul(d, step.exp(), out=following[:, block])
+
+        next_total = _sweep(factor, total, update)
+        previous, worst = worst, residual.max().item() if watched else worst
+        stalled = worst < ALARM and worst > previous / 2  # at the level of rounding
+        if worst <= tolerance or stalled or steps == (MAX_STEPS if watched else ACCELERATOR_STEPS):
+            break
+        scaling, total = following, next_total
+    return scaling, residual, steps
+
+
+class _Balance(torch.autograd.Function):
+    """Implicit differentiation of ``log d + log(K d) = 0``.
+
+    ``(I + W) d(log d) = -diag(d) dK d``, so with ``(I + W) x = d * g`` and ``a = d * x`` the loss changes by ``-a^T dK d``:
+    its gradient is ``-(z a^T + w d^T)`` in the factor, z = factor d, w = factor a, and ``-a d`` in the diagonal.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, int]:
+        scaling, residual, steps = _solve(factor, diagonal, tolerance)
+        ctx.save_for_backward(factor, diagonal, scaling)
+        ctx.mark_non_differentiable(residual)
+        return scaling, residual, steps
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+        factor, diagonal, scaling = ctx.saved_tensors
+        target = scaling * grad
+        solution, move = torch.zeros_like(target), torch.zeros_like(target)
+        total = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
+        for _, (momentum, gain) in zip(range(SOLVE_STEPS[factor.dtype]), _chebyshev(1.0, 2.0), strict=False):
+
+            def update(block: slice, affinity: Tensor) -> Tensor:
+                d, x = scaling[:, block], solution[:, block]
+                image = x + d * (affinity + diagonal[:, block] * d * x)  # (I + W) x
+                x += move[:, block].mul_(momentum).add_(target[:, block] - image, alpha=gain)
+                return d * x
+
+            total = _sweep(factor, total, update)
+        a = scaling * solution
+        totals = torch.cat([moment(factor, scaling.unsqueeze(1)), total], dim=2).to(factor)  # (B, M, 2)
+        grad_factor = -(totals @ torch.stack([a, scaling], dim=1))
+        return grad_factor, -a * scaling, None

@@ -1,0 +1,163 @@
+"""Operator to spectrum, by Rayleigh and Ritz in the span of the factor. Paper: Sec. II-A to II-C, eq. (3), (4).
+
+With ``F`` (M, N) the scaled factor, ``G = F F^T`` is m x m. The rows of ``G^(-1/2) F`` are orthonormal, and W seen by them is
+``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. All of it lives in m x m matrices, in float64; pixels are touched twice:
+once for G, once to form or apply eigenvectors. No square root of a sampled block, no permutation of pixels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from nlfilter_torch.blocks import moment, pixel_blocks
+from nlfilter_torch.matrix_function import SymmetricMatrix
+
+# Directions of G below this are rounding: float32 eigenvectors from above it are orthonormal to 1e-3.
+CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
+# Eigenvalues this close to 1 count as 1 when the constant vector is picked out of their eigenspace.
+CLUSTER = {torch.float32: 1e-4, torch.float64: 1e-8}
+
+Response = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
+
+    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first asked for; filters and masks never need
+    them, since :meth:`gain` applies any f(W) through m x m matrices.
+
+    Attributes:
+        eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
+            gradient is exact, also where they meet.
+        ritz: T, (B, M, M), float64.
+        root: G^(-1/2), (B, M, M), float64.
+        support: (B, M) bool, which of the eigenvalues of T count.
+        factor: (B, M, N), before scaling.
+        scaling: d, (B, N).
+        size: (H, W).
+        largest: the first eigenvalue before it was clamped to 1, (B,).
+    """
+
+    eigenvalues: Tensor
+    ritz: SymmetricMatrix
+    root: Tensor
+    support: Tensor
+    factor: Tensor
+    scaling: Tensor
+    size: tuple[int, int]
+    largest: Tensor
+
+    @cached_property
+    def eigenvectors(self) -> Tensor:
+        """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero where those are padding.
+
+        The first is the constant one, positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
+        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the choice
+        of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
+        """
+        vectors = self.ritz.vectors
+        if self.ritz.matrix.requires_grad and torch.is_grad_enabled():
+            vectors = torch.linalg.eigh(self.ritz.matrix).eigenvectors.flip(-1)
+        rank = self.eigenvalues.shape[1]
+        vectors = (vectors * self.support.unsqueeze(1))[:, :, :rank]
+        vectors = self._constant_first(vectors)
+        basis = (self.root @ vectors).mT.to(self.factor) @ self.factor  # (B, R, N)
+        return (basis * self.scaling.unsqueeze(1)).unflatten(2, self.size)
+
+    def gain(self, response: Response) -> Tensor:
+        """The m x m core X (B, M, M) of ``f(W) = F^T X F``, in float64: ``G^(-1/2) f(T) G^(-1/2)``.
+
+        Args:
+            response: f, an elementwise differentiable function of the eigenvalues, (B, R) to (B, R).
+
+        Returns:
+            Independent of the choice of eigenvectors; differentiable in the operator and in what ``response`` holds.
+        """
+        return self.root @ self.ritz.apply(response, self.support) @ self.root
+
+    def diffusion_basis(self, response: Response) -> Tensor:
+        """Rows (B, M, N) of ``f(T) G^(-1/2) F``: ``f(S) V^T`` up to a rotation that leaves distances alone."""
+        core = (self.ritz.apply(response, self.support) @ self.root).to(self.factor)
+        return (core @ self.factor) * self.scaling.unsqueeze(1)
+
+    def apply(self, response: Response, image: Tensor) -> Tensor:
+        """``V f(S) V^T y`` for images (B, C, N): one read of the factor for the coefficients, one for the result."""
+        scaling = self.scaling.unsqueeze(1)
+        total = moment(self.factor, scaling * image)  # (B, M, C), float64
+        return scaling * ((self.gain(response) @ total).mT.to(self.factor) @ self.factor)
+
+    def _constant_first(self, vectors: Tensor) -> Tensor:
+        """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
+        with torch.no_grad():
+            ones = moment(self.factor, self.scaling.unsqueeze(1))  # F 1, (B, M, 1)
+            cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
+            cluster[:, 0] = True
+            target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
+            mirror = target / target.norm(dim=1, keepdim=True).clamp(min=1e-12)
+            mirror[:, 0] -= 1.0
+            length = mirror.square().sum(1, keepdim=True).unsqueeze(2)
+            reflection = 2 * mirror.unsqueeze(2) * mirror.unsqueeze(1) / length.clamp(min=1e-12)
+        return vectors - vectors @ reflection
+
+
+def compute_spectrum(
+    factor: Tensor, scaling: Tensor, diagonal: Tensor | None, size: tuple[int, int], rank: int | None
+) -> Spectrum:
+    """Spectrum of ``W``; ``diagonal`` is None where W has no diagonal part."""
+    weights = [scaling.square()]  # F F^T = sum_i d_i^2 u_i u_i^T
+    if diagonal is not None:
+        weights.append(scaling.pow(4) * diagonal)  # F diag(r) F^T
+    grams: Tensor = _WeightedGram.apply(factor, torch.stack(weights, dim=1))  # (B, J, M, M)
+    gram = SymmetricMatrix.of(grams[:, 0])
+    kept = gram.eigenvalues > CUT[factor.dtype] * gram.eigenvalues[:, :1]
+    root = gram.apply(torch.rsqrt, kept)
+    inner = gram.matrix @ gram.matrix
+    if diagonal is not None:
+        inner = inner + grams[:, 1]
+    projected = root @ inner @ root
+    ritz = SymmetricMatrix.of((projected + projected.mT) / 2)
+    top = ritz.eigenvalues[:, 0]
+    ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
+
+    ranks = kept.sum(1)  # (B,)
+    full = int(ranks.max())
+    shown = full if rank is None else min(rank, full)
+    support = torch.arange(factor.shape[1], device=factor.device) < ranks.clamp(max=shown).unsqueeze(1)
+    # First-order perturbation: the derivative of an eigenvalue is v^T dT v, repeated or not.
+    eigenvalues = (ritz.vectors * (ritz.matrix @ ritz.vectors)).sum(1).clamp(0.0, 1.0) * support
+    return Spectrum(eigenvalues[:, :shown].to(factor), ritz, root, support, factor, scaling, size, top)
+
+
+class _WeightedGram(torch.autograd.Function):
+    """``sum_i w_ji u_i u_i^T`` for the columns u_i of the factor and several weightings j, block by block."""
+
+    @staticmethod
+    def forward(ctx: Any, factor: Tensor, weights: Tensor) -> Tensor:
+        batch, marks, pixels = factor.shape
+        count = weights.shape[1]
+        total = factor.new_zeros(batch, count * marks, marks, dtype=torch.float64)
+        for block in pixel_blocks(pixels, batch, factor.device):
+            rows = factor[:, :, block]
+            weighted = (rows.unsqueeze(1) * weights[:, :, None, block]).flatten(1, 2)  # (B, J*M, n)
+            total += weighted @ rows.mT
+        ctx.save_for_backward(factor, weights)
+        return total.unflatten(1, (count, marks))
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+        factor, weights = ctx.saved_tensors
+        grad_factor, grad_weights = torch.empty_like(factor), torch.empty_like(weights)
+        symmetric = (grad + grad.mT).flatten(1, 2).to(factor)  # (B, J*M, M)
+        for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device):
+            rows = factor[:, :, block]
+            pulled = (symmetric @ rows).unflatten(1, (weights.shape[1], -1))  # (B, J, M, n)
+            grad_factor[:, :, block] = (pulled * weights[:, :, None, block]).sum(1)
+            grad_weights[:, :, block] = (pulled * rows.unsqueeze(1)).sum(2) / 2
+        return grad_factor, grad_weights
