@@ -1,4 +1,7 @@
-"""A global, data-adapted image filter as a differentiable object (Talebi and Milanfar, "Nonlocal Image Editing", 2014)."""
+"""A global, data-adapted image filter as a differentiable object.
+
+Talebi and Milanfar, "Nonlocal Image Editing", IEEE Transactions on Image Processing 23(10), 2014.
+"""
 
 from nlfilter_torch.bandwidth import estimate_bandwidth
 from nlfilter_torch.filtering import captured_energy, detail_layers, polynomial_filter, spectral_filter

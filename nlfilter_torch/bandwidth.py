@@ -7,8 +7,8 @@ from nlfilter_torch.checks import check_choice, check_image
 from nlfilter_torch.features import GuideChannels, reduce_channels
 from nlfilter_torch.precision import full_precision, working_dtype
 
-# The paper's 0.6 belongs to its own patch weights, whose squares sum to 0.056; under weights of unit sum the same kernel has
-# a bandwidth larger by 1 / sqrt(0.056) = 4.2, hence 2.5.
+# The paper's 0.6 belongs to its own patch weights, whose squares sum to 0.056; under weights of unit sum the same
+# kernel has a bandwidth larger by 1 / sqrt(0.056) = 4.2, hence 2.5.
 FACTOR = 2.5
 SMALLEST = 1.0 / 255.0  # a flat image has no gradient; one grey level keeps the kernel defined
 

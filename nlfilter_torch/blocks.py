@@ -37,7 +37,7 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
     Returns:
         (B, M, C) in float64. Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
     """
-    batch, marks, pixels = factor.shape
+    batch, marks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
     total = factor.new_zeros(batch, marks, images.shape[1], dtype=torch.float64)
     for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):

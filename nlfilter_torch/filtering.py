@@ -13,7 +13,8 @@ from nlfilter_torch.spectrum import Response, Spectrum
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:
     """Split an image into detail layers, fine to coarse, and the smooth layer that remains.
 
-    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Whoever keeps the layers moves sliders
+    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Whoever keeps the layers moves
+        sliders
     without another look at the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, which is
     :class:`PolynomialSliders`.
 
@@ -23,7 +24,8 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
         order: k, at least 1.
 
     Returns:
-        (B, k+1, C, H, W) in the image's dtype; they sum to the image, to rounding. Differentiable in image and operator.
+        (B, k+1, C, H, W) in the image's dtype; they sum to the image, to rounding. Differentiable in image and
+        operator.
 
     Raises:
         TypeError, ValueError: if ``image`` does not fit the operator, or ``order`` is not a positive integer.
@@ -51,6 +53,7 @@ def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
     """``sum_i alpha_i y_i`` over the layers (B, k+1, C, H, W). Paper: eq. (12).
 
     Args:
+        layers: (B, k+1, C, H, W).
         alpha: (k+1,), (B, k+1) per image, or (B, k+1, H, W) per pixel; a batch of 1 on either side is broadcast.
     """
     check_alpha(alpha)
@@ -82,16 +85,17 @@ def polynomial_filter(
         image: y, (B, C, H, W).
         alpha: weights of the layers, fine to coarse, the last of the smooth layer: (k+1,), (B, k+1) per image, or
             (B, k+1, H, W) per pixel. Ones leave the image as it is.
-        residual: weight of ``y - V V^T y``, what the eigenvectors do not explain. None is alpha_1, which is exactly eq. (12);
-            0.0 drops it, which is the paper's eq. (13) and Appendix B; 1.0 leaves it untouched, which sharpens less noise. A
-            number, or a tensor of shape () or (B,).
+        residual: weight of ``y - V V^T y``, what the eigenvectors do not explain. None is alpha_1, which is exactly eq.
+            (12); 0.0 drops it, which is the paper's eq. (13) and Appendix B; 1.0 leaves it untouched, which sharpens
+            less noise. A number, or a tensor of shape () or (B,).
 
     Returns:
-        (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in all of these and
-        in the operator.
+        (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in all of
+        these and in the operator.
 
     Raises:
-        TypeError, ValueError: if ``image`` does not fit the operator, or ``alpha`` has fewer than two entries or another
+        TypeError, ValueError: if ``image`` does not fit the operator, or ``alpha`` has fewer than two entries or
+        another
             shape.
 
     Example:
@@ -127,8 +131,8 @@ def spectral_filter(spectrum: Spectrum, image: Tensor, response: Response, *, re
         residual: weight of ``y - V V^T y``, a number or a tensor of shape () or the spectrum's (B,).
 
     Returns:
-        (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of ``response``,
-        with a finite gradient where eigenvalues meet.
+        (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
+        ``response``, with a finite gradient where eigenvalues meet.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.

@@ -86,7 +86,7 @@ def assign(points: Tensor, centres: Tensor) -> Tensor:
 
 
 def cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
-    """Mean (B, D, K) of the points (B, D, S) of every cluster, or its column of ``fallback`` (B, D, K) where it is empty."""
+    """Mean (B, D, K) of the points (B, D, S) of every cluster; an empty one takes its column of ``fallback``."""
     members = points.new_zeros(points.shape[0], fallback.shape[2], points.shape[2])
     members.scatter_(1, assignment.unsqueeze(1), 1.0)
     sizes = members.sum(2).unsqueeze(1)  # (B, 1, K)

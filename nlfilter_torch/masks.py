@@ -15,7 +15,8 @@ ITERATIONS = 20  # of k-means, which starts close to its end
 def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     """Coordinates in which similar pixels lie close together: eigenvectors scaled by ``lambda^t``.
 
-    Paper: eq. (15), with eigenvectors of unit root mean square, ``sqrt(N) v``, so that distances do not shrink as the image
+    Paper: eq. (15), with eigenvectors of unit root mean square, ``sqrt(N) v``, so that distances do not shrink as the
+        image
     grows; with unit-norm ones every mask is 1 to rounding. The constant eigenvector is left out.
 
     Args:
@@ -37,9 +38,9 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
 def diffusion_mask(
     spectrum: Spectrum, region: Tensor, *, time: float | Tensor = 1.0, width: float | Tensor = 4.0
 ) -> Tensor:
-    """How similar every pixel is to a region: ``exp(-D_t^2 / width^2)``, D_t the diffusion distance to the region's mean.
+    """How similar every pixel is to a region: ``exp(-D_t^2 / width^2)``.
 
-    Paper: eq. (16), (17), with the eigenvectors of :func:`diffusion_map`.
+    Paper: eq. (16), (17), with D_t the distance to the region's mean in :func:`diffusion_map`.
 
     Args:
         spectrum: of the operator.
@@ -52,7 +53,8 @@ def diffusion_mask(
         eigenvalues meet.
 
     Raises:
-        TypeError, ValueError: if ``region`` does not fit, is negative or empty, or ``time`` or ``width`` is not positive.
+        TypeError, ValueError: if ``region`` does not fit, is negative or empty, or ``time`` or ``width`` is not
+        positive.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -104,11 +106,12 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         time: diffusion time t > 0; larger values weigh coarse structure more.
 
     Returns:
-        (B, K, H, W) of zeros and ones, in the regions' dtype, with a single one for every pixel. A cluster that loses all its
-        pixels keeps its centre. Not differentiable, as any assignment.
+        (B, K, H, W) of zeros and ones, in the regions' dtype, with a single one for every pixel. A cluster that loses
+        all its pixels keeps its centre. Not differentiable, as any assignment.
 
     Raises:
-        TypeError, ValueError: if ``regions`` does not fit, is negative or holds an empty one, or ``time`` is not positive.
+        TypeError, ValueError: if ``regions`` does not fit, is negative or holds an empty one, or ``time`` is not
+        positive.
     """
     check_positive(time, "time")
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)

@@ -1,9 +1,10 @@
 """Functions of small symmetric matrices, with a gradient that stands repeated eigenvalues.
 
 ``torch.linalg.eigh`` differentiates its eigenvectors, which divides by ``lambda_i - lambda_j`` and gives NaN where they
-meet: on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of Q, and its
-derivative is finite: ``Q (D * (Q^T dA Q)) Q^T`` with the divided differences ``D_ij = (f_i - f_j) / (lambda_i - lambda_j)``,
-or f' where the two meet (Daleckii and Krein, 1965).
+meet: on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of Q, and
+    its
+derivative is finite: ``Q (D * (Q^T dA Q)) Q^T`` with the divided differences ``D_ij = (f_i - f_j) / (lambda_i -
+lambda_j)``, or f' where the two meet (Daleckii and Krein, 1965).
 """
 
 from collections.abc import Callable
@@ -14,8 +15,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-# Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of cancellation
-# are both near 1e-10 then. Below FLOOR the comparison is absolute, since zero eigenvalues are only zero to rounding.
+# Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of
+# cancellation are both near 1e-10 then. Below FLOOR the comparison is absolute, since zero eigenvalues are only zero to
+# rounding.
 MEETING = 1e-5
 FLOOR = 1e-5
 
@@ -55,7 +57,7 @@ class SymmetricMatrix:
         values = torch.where(support, function(points), torch.zeros_like(points))
         if not self.matrix.requires_grad:
             return (self.vectors * values.unsqueeze(-2)) @ self.vectors.mT
-        result: Tensor = _SpectralFunction.apply(
+        result: Tensor = _SpectralFunction.apply(  # type: ignore[no-untyped-call]
             self.matrix, values, self.vectors, self._differences(function, values, support)
         )
         return result
@@ -88,7 +90,7 @@ class _SpectralFunction(torch.autograd.Function):
         return (vectors * values.unsqueeze(-2)) @ vectors.mT
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         vectors, differences = ctx.saved_tensors
         inner = vectors.mT @ ((grad + grad.mT) / 2) @ vectors

@@ -85,7 +85,7 @@ class PolynomialSliders(nn.Module):
         return polynomial_filter(operator, image, self.alpha, residual=self.residual)
 
     def combine(self, layers: Tensor) -> Tensor:
-        """The same from layers (B, k+1, C, H, W) of :func:`detail_layers` that the caller holds; ``residual`` is alpha_1."""
+        """The same, with ``residual`` alpha_1, from layers (B, k+1, C, H, W) of :func:`detail_layers` that are held."""
         return weigh_layers(layers, self.alpha)
 
     def extra_repr(self) -> str:
@@ -96,7 +96,8 @@ class PolynomialSliders(nn.Module):
 class NonlocalFilter(nn.Module):
     """Image to edited image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` in one layer.
 
-    Paper: eq. (12), (13). The operator is built anew for every call, from the guide as it is; to move sliders over one image,
+    Paper: eq. (12), (13). The operator is built anew for every call, from the guide as it is; to move sliders over one
+        image,
     hold its operator or its layers and call the parts.
 
     Args:

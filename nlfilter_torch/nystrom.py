@@ -47,7 +47,7 @@ def nystrom_factor(
         factor (B, M, N) with columns of norm at most 1, and diagonal (B, N) in [0, 1] (zero without completion).
         Differentiable once in the three tensors; the backward pass recomputes the affinities block by block.
     """
-    factor, diagonal, _ = _NystromFactor.apply(features, landmarks, whitening, completion == "diagonal")
+    factor, diagonal, _ = _NystromFactor.apply(features, landmarks, whitening, completion == "diagonal")  # type: ignore[no-untyped-call]
     return factor, diagonal
 
 
@@ -84,7 +84,7 @@ class _NystromFactor(torch.autograd.Function):
         return factor, diagonal, scale
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
         batch, _, pixels = features.shape
@@ -96,7 +96,8 @@ class _NystromFactor(torch.autograd.Function):
             affinity = _affinity(features[:, :, block], landmarks, centre)
             rows, grad = factor[:, :, block], grad_factor[:, :, block]
             if ctx.complete:
-                # Scaled columns u / |u| lose the gradient along themselves; the others pass it on, and that of 1 - |u|^2.
+                # Scaled columns u / |u| lose the gradient along themselves; the others pass it on, and that of 1 -
+                # |u|^2.
                 shrink = scale[:, None, block]
                 along = torch.where(
                     shrink < 1.0, (rows * grad).sum(1, keepdim=True), 2.0 * grad_diagonal[:, None, block]

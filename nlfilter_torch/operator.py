@@ -62,8 +62,8 @@ class Diagnostics:
 class NonlocalOperator:
     """The symmetric, doubly stochastic filter ``W = diag(d) (U^T U + diag(c)) diag(d)`` of an image, never formed.
 
-    Made by :func:`nonlocal_operator`. Every pixel is linked to every other one through M landmarks; W has unit row sums and
-    its eigenvalues lie in [0, 1].
+    Made by :func:`nonlocal_operator`. Every pixel is linked to every other one through M landmarks; W has unit row sums
+    and its eigenvalues lie in [0, 1].
 
     Attributes:
         factor: U, (B, M, N), pixels last.
@@ -89,8 +89,8 @@ class NonlocalOperator:
         """``W y``, also written ``operator @ image``. Paper: eq. (2).
 
         Args:
-            image: (B, C, H, W) of the guide's height and width, any number of channels, any floating-point dtype. A batch
-                of 1 on either side is broadcast.
+            image: (B, C, H, W) of the guide's height and width, any number of channels, any floating-point dtype. A
+                batch of 1 on either side is broadcast.
 
         Returns:
             (B, C, H, W) in the image's dtype, with the mean of the image. Differentiable in image and operator.
@@ -127,7 +127,7 @@ class NonlocalOperator:
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
-                f"the operator must have at most {DENSE_LIMIT} pixels to become dense, got {pixels}; use a smaller image"
+                f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
             )
         kernel = self.factor.mT @ self.factor + torch.diag_embed(self.diagonal)
         return self.scaling.unsqueeze(2) * kernel * self.scaling.unsqueeze(1)
@@ -193,26 +193,27 @@ def nonlocal_operator(
 ) -> NonlocalOperator:
     """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
 
-    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under autocast
-    too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks (for k-means,
-    the assignment of pixels to centroids) held.
+    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
+        autocast
+    too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks (for
+    k-means, the assignment of pixels to centroids) held.
 
     Args:
         guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network.
         patch_size: p, odd; pixels outside the image are reflected.
-        photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of shape
-            () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
+        photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
+            shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
         spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
-        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method, which
-            fails at small bandwidths.
-        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides of
-            another number of channels are taken whole.
+        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method,
+            which fails at small bandwidths.
+        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides
+            of another number of channels are taken whole.
         patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
         tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
-        generator: source of randomness for the landmarks; None draws the same for every call. The global generator is never
-            used.
+        generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
+            never used.
 
     Returns:
         The operator, with row sums of 1 to ``tolerance`` or to rounding.
@@ -235,13 +236,14 @@ def nonlocal_operator(
     check_count(num_landmarks, "num_landmarks")
     if tolerance is not None:
         check_positive(tolerance, "tolerance")
-    batch, _, height, width = guide.shape
+    height, width = guide.shape[-2:]
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
     weights = patch_window(patch_size) if patch_weights is None else patch_weights
     bandwidth = estimate_bandwidth(guide) if isinstance(photometric_bandwidth, str) else photometric_bandwidth
     if num_landmarks > height * width:
         warnings.warn(
-            f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; using every pixel",
+            f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; "
+            "using every pixel",
             stacklevel=3,
         )
         num_landmarks = height * width

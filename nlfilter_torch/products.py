@@ -1,4 +1,4 @@
-"""Products with ``W = F^T F + diag(r)``, F = factor diag(d), r = d^2 diagonal: all that the sliders need. Paper: eq. (13)."""
+"""Products with ``W = F^T F + diag(r)``, where F = factor diag(d) and r = d^2 diagonal. Paper: eq. (13)."""
 
 from typing import Any
 
@@ -20,12 +20,12 @@ def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tenso
         order: k, at least 1.
 
     Returns:
-        (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long as
-        the operator needs no gradient.
+        (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
+        as the operator needs no gradient.
     """
     remainder = scaling.square() * diagonal
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
-        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order)
+        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order)  # type: ignore[no-untyped-call]
         return result
     return torch.stack(_powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order)[0][1:], dim=1)
 
@@ -60,7 +60,7 @@ def fold_batch(image: Tensor, batch: int) -> Tensor:
 
 
 def unfold_batch(planes: Tensor, images: int, size: tuple[int, int]) -> Tensor:
-    """The inverse of :func:`fold_batch` for stacks (batch, k, C', N): (B, k, C, H, W), B the larger of the two batches."""
+    """Stacks (batch, k, C', N) back to (B, k, C, H, W), B the larger batch: the inverse of :func:`fold_batch`."""
     if planes.shape[0] == 1:
         planes = planes.squeeze(0).unflatten(1, (images, -1)).transpose(0, 1)
     return planes.unflatten(-1, size)
@@ -69,7 +69,8 @@ def unfold_batch(planes: Tensor, images: int, size: tuple[int, int]) -> Tensor:
 class _Powers(torch.autograd.Function):
     """All products share one gradient of the factor: a single matrix product, where autograd would write 2k full ones.
 
-    With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W A_i`` backwards, the loss changes by ``sum_i A_i^T dW P_(i-1)``.
+    With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W A_i`` backwards, the loss changes by ``sum_i A_i^T dW
+    P_(i-1)``.
     """
 
     @staticmethod
@@ -79,7 +80,7 @@ class _Powers(torch.autograd.Function):
         return torch.stack(images[1:], dim=1)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, scaling, remainder, *rest = ctx.saved_tensors
         order = len(rest) // 2

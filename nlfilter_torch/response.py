@@ -21,6 +21,7 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
         TypeError, ValueError: if ``alpha`` is not a floating-point tensor of such a shape with at least two entries.
 
     Example:
+        >>> import torch
         >>> polynomial_response(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 1.0, 1.0, 1.5]))
         tensor([3.0000, 2.0625, 1.5000])
     """

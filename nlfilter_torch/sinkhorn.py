@@ -1,13 +1,15 @@
 """Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
-With ``u = log d`` the equation is ``u + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies in
-[1, 2]: Chebyshev's semi-iteration for that interval gains a factor 5.8 a step, where the textbook alternation barely
-converges. The same interval makes the implicit gradient cheap: ten steps of the same recurrence solve ``(I + W) x = b``.
+With ``u = log d`` the equation is ``u + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies
+in [1, 2]: Chebyshev's semi-iteration for that interval gains a factor 5.8 a step, where the textbook alternation barely
+converges. The same interval makes the implicit gradient cheap: ten steps of the same recurrence solve ``(I + W) x =
+b``.
 """
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import torch
@@ -49,10 +51,10 @@ def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None)
     Args:
         factor: (B, M, N).
         diagonal: (B, N), non-negative.
-        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. The iteration also stops where
-            rounding keeps the residual from falling, and warns if that is above 1e-3.
+        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. The iteration also stops
+            where rounding keeps the residual from falling, and warns if that is above 1e-3.
     """
-    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance or TOLERANCE[factor.dtype])
+    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance or TOLERANCE[factor.dtype])  # type: ignore[no-untyped-call]
     if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
         warnings.warn(
             f"balancing left row sums off by up to {residual.max().item():.1e}; "
@@ -71,22 +73,6 @@ def _chebyshev(low: float, high: float) -> Iterator[tuple[float, float]]:
     while True:
         previous, rho = rho, 1 / (2 * sigma - rho)
         yield rho * previous, 2 * rho / radius
-
-
-def _sweep(factor: Tensor, total: Tensor, update: Callable[[slice, Tensor], Tensor]) -> Tensor:
-    """One read of the factor: hand ``factor^T total`` to ``update`` block by block, gather the moment of what returns.
-
-    Args:
-        factor: (B, M, N).
-        total: (B, M, 1) in float64, the moment of some vector.
-        update: takes a block of pixels and its (B, n) products, returns the (B, n) values of the next vector.
-    """
-    following = torch.zeros_like(total)
-    current = total.to(factor)
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        rows = factor[:, :, block]
-        following += rows @ update(block, (current.mT @ rows).squeeze(1)).unsqueeze(2)
-    return following
 
 
 def _start(factor: Tensor, diagonal: Tensor) -> Tensor:
@@ -119,18 +105,17 @@ def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, 
     watched = factor.device.type == "cpu"
     worst = float("inf")
     for steps, (momentum, gain) in enumerate(_chebyshev(1.0, 2.0), start=1):
-        residual = scaling.new_zeros(scaling.shape[0])
-        following = torch.empty_like(scaling)
-
-        def update(block: slice, affinity: Tensor) -> Tensor:
-            d = scaling[:, block]
-            sums = d * (affinity + diagonal[:, block] * d)  # row sums of W
-            torch.maximum(residual, (sums - 1).abs().amax(1), out=residual)
+        current, following = total.to(factor).mT, torch.empty_like(scaling)
+        next_total, residual = torch.zeros_like(total), scaling.new_zeros(scaling.shape[0])
+        # One read of the factor: a block gives its row sums, takes its update and adds to the next moment while cached.
+        for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+            rows, d = factor[:, :, block], scaling[:, block]
+            sums = d * ((current @ rows).squeeze(1) + diagonal[:, block] * d)  # row sums of W
+            residual = torch.maximum(residual, (sums - 1).abs().amax(1))
             # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
             step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
-            return torch.mul(d, step.exp(), out=following[:, block])
-
-        next_total = _sweep(factor, total, update)
+            torch.mul(d, step.exp(), out=following[:, block])
+            next_total += rows @ following[:, block].unsqueeze(2)
         previous, worst = worst, residual.max().item() if watched else worst
         stalled = worst < ALARM and worst > previous / 2  # at the level of rounding
         if worst <= tolerance or stalled or steps == (MAX_STEPS if watched else ACCELERATOR_STEPS):
@@ -142,8 +127,8 @@ def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, 
 class _Balance(torch.autograd.Function):
     """Implicit differentiation of ``log d + log(K d) = 0``.
 
-    ``(I + W) d(log d) = -diag(d) dK d``, so with ``(I + W) x = d * g`` and ``a = d * x`` the loss changes by ``-a^T dK d``:
-    its gradient is ``-(z a^T + w d^T)`` in the factor, z = factor d, w = factor a, and ``-a d`` in the diagonal.
+    ``(I + W) d(log d) = -diag(d) dK d``, so with ``(I + W) x = d * g`` and ``a = d * x`` the loss changes by ``-a^T dK
+    d``: its gradient is ``-(z a^T + w d^T)`` in the factor, z = factor d, w = factor a, and ``-a d`` in the diagonal.
     """
 
     @staticmethod
@@ -154,21 +139,19 @@ class _Balance(torch.autograd.Function):
         return scaling, residual, steps
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling = ctx.saved_tensors
         target = scaling * grad
         solution, move = torch.zeros_like(target), torch.zeros_like(target)
-        total = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
-        for _, (momentum, gain) in zip(range(SOLVE_STEPS[factor.dtype]), _chebyshev(1.0, 2.0), strict=False):
-
-            def update(block: slice, affinity: Tensor) -> Tensor:
-                d, x = scaling[:, block], solution[:, block]
-                image = x + d * (affinity + diagonal[:, block] * d * x)  # (I + W) x
+        total = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)  # factor @ (d x)
+        for momentum, gain in islice(_chebyshev(1.0, 2.0), SOLVE_STEPS[factor.dtype]):
+            current, total = total.to(factor).mT, torch.zeros_like(total)
+            for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+                rows, d, x = factor[:, :, block], scaling[:, block], solution[:, block]
+                image = x + d * ((current @ rows).squeeze(1) + diagonal[:, block] * d * x)  # (I + W) x
                 x += move[:, block].mul_(momentum).add_(target[:, block] - image, alpha=gain)
-                return d * x
-
-            total = _sweep(factor, total, update)
+                total += rows @ (d * x).unsqueeze(2)
         a = scaling * solution
         totals = torch.cat([moment(factor, scaling.unsqueeze(1)), total], dim=2).to(factor)  # (B, M, 2)
         grad_factor = -(totals @ torch.stack([a, scaling], dim=1))

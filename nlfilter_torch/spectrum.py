@@ -1,8 +1,9 @@
 """Operator to spectrum, by Rayleigh and Ritz in the span of the factor. Paper: Sec. II-A to II-C, eq. (3), (4).
 
-With ``F`` (M, N) the scaled factor, ``G = F F^T`` is m x m. The rows of ``G^(-1/2) F`` are orthonormal, and W seen by them is
-``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. All of it lives in m x m matrices, in float64; pixels are touched twice:
-once for G, once to form or apply eigenvectors. No square root of a sampled block, no permutation of pixels.
+With ``F`` (M, N) the scaled factor, ``G = F F^T`` is m x m. The rows of ``G^(-1/2) F`` are orthonormal, and W seen by
+them is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. All of it lives in m x m matrices, in float64; pixels are
+touched twice: once for G, once to form or apply eigenvectors. No square root of a sampled block, no permutation of
+pixels.
 """
 
 from collections.abc import Callable
@@ -29,8 +30,8 @@ Response = Callable[[Tensor], Tensor]
 class Spectrum:
     """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
 
-    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first asked for; filters and masks never need
-    them, since :meth:`gain` applies any f(W) through m x m matrices.
+    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first asked for; filters and masks never
+    need them, since :meth:`gain` applies any f(W) through m x m matrices.
 
     Attributes:
         eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
@@ -58,8 +59,8 @@ class Spectrum:
         """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero where those are padding.
 
         The first is the constant one, positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
-        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the choice
-        of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
+        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the
+        choice of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
         """
         vectors = self.ritz.vectors
         if self.ritz.matrix.requires_grad and torch.is_grad_enabled():
@@ -113,7 +114,7 @@ def compute_spectrum(
     weights = [scaling.square()]  # F F^T = sum_i d_i^2 u_i u_i^T
     if diagonal is not None:
         weights.append(scaling.pow(4) * diagonal)  # F diag(r) F^T
-    grams: Tensor = _WeightedGram.apply(factor, torch.stack(weights, dim=1))  # (B, J, M, M)
+    grams: Tensor = _WeightedGram.apply(factor, torch.stack(weights, dim=1))  # (B, J, M, M)  # type: ignore[no-untyped-call]
     gram = SymmetricMatrix.of(grams[:, 0])
     kept = gram.eigenvalues > CUT[factor.dtype] * gram.eigenvalues[:, :1]
     root = gram.apply(torch.rsqrt, kept)
@@ -150,7 +151,7 @@ class _WeightedGram(torch.autograd.Function):
         return total.unflatten(1, (count, marks))
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
         factor, weights = ctx.saved_tensors
         grad_factor, grad_weights = torch.empty_like(factor), torch.empty_like(weights)
