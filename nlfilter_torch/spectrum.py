@@ -114,7 +114,8 @@ def compute_spectrum(
     weights = [scaling.square()]  # F F^T = sum_i d_i^2 u_i u_i^T
     if diagonal is not None:
         weights.append(scaling.pow(4) * diagonal)  # F diag(r) F^T
-    grams: Tensor = _WeightedGram.apply(factor, torch.stack(weights, dim=1))  # (B, J, M, M)  # type: ignore[no-untyped-call]  # type: ignore[no-untyped-call]
+    # (B, J, M, M)
+    grams: Tensor = _WeightedGram.apply(factor, torch.stack(weights, dim=1))  # type: ignore[no-untyped-call]
     gram = SymmetricMatrix.of(grams[:, 0])
     kept = gram.eigenvalues > CUT[factor.dtype] * gram.eigenvalues[:, :1]
     root = gram.apply(torch.rsqrt, kept)
