@@ -43,6 +43,15 @@ def check_finite(tensor: Tensor, name: str) -> None:
         raise ValueError(f"{name} must be finite, got {bad} NaN or infinite value(s); replace them first")
 
 
+def check_unit_range(tensor: Tensor, name: str) -> None:
+    """Raise unless all values are in [0, 1]; skipped where :func:`check_finite` is."""
+    if tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor):
+        return
+    low, high = tensor.detach().aminmax()
+    if low < 0 or high > 1:
+        raise ValueError(f"{name} must be in [0, 1], got values from {low:g} to {high:g}; scale or clamp it")
+
+
 def is_transformed(tensor: Tensor) -> bool:
     """True under ``torch.func`` transforms, where the values of a tensor cannot be looked at."""
     return bool(torch._C._functorch.is_functorch_wrapped_tensor(tensor))

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_positive, check_same_size
+from nlfilter_torch.checks import check_finite, check_image, check_positive, check_same_size, check_unit_range
 from nlfilter_torch.landmarks import assign, cluster_means
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import Spectrum
@@ -16,8 +16,7 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     """Coordinates in which similar pixels lie close together: eigenvectors scaled by ``lambda^t``.
 
     Paper: eq. (15), with eigenvectors of unit root mean square, ``sqrt(N) v``, so that distances do not shrink as the
-        image
-    grows; with unit-norm ones every mask is 1 to rounding. The constant eigenvector is left out.
+    image grows; with unit-norm ones every mask is 1 to rounding. The constant eigenvector is left out.
 
     Args:
         spectrum: of the operator.
@@ -36,25 +35,32 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
 
 @full_precision
 def diffusion_mask(
-    spectrum: Spectrum, region: Tensor, *, time: float | Tensor = 1.0, width: float | Tensor = 4.0
+    spectrum: Spectrum,
+    region: Tensor,
+    *,
+    time: float | Tensor = 1.0,
+    width: float | Tensor = 4.0,
+    negative: Tensor | None = None,
 ) -> Tensor:
-    """How similar every pixel is to a region: ``exp(-D_t^2 / width^2)``.
+    """How similar every pixel is to a region: ``exp(-D_t^2 / width)``.
 
-    Paper: eq. (16), (17), with D_t the distance to the region's mean in :func:`diffusion_map`.
+    Paper: eq. (16), (17), whose width is 1, with D_t the distance to the region's mean in :func:`diffusion_map`. Two
+    kinds of pixels that W keeps apart are at a squared distance of at least 4, whatever the size of the image.
 
     Args:
         spectrum: of the operator.
         region: (B, K, H, W), non-negative weights of the pixels of K regions.
         time: diffusion time t > 0, a number or a tensor of shape () or (B,); larger reaches further.
-        width: distance at which the mask has fallen to 1/e, likewise; 4 gives useful masks.
+        width: squared distance at which the mask has fallen to 1/e, likewise.
+        negative: (B, 1 or K, H, W), weights of pixels that the mask has to stay away from: it is halved where a pixel
+            is as close to them as to the region, and falls further where it is closer to them. None is no such region.
 
     Returns:
-        (B, K, H, W) in (0, 1], in the region's dtype. Differentiable in operator, region, time and width, also where
-        eigenvalues meet.
+        (B, K, H, W) in (0, 1], in the region's dtype; without ``negative`` it grows with time at every pixel.
+        Differentiable in operator, regions, time and width, also where eigenvalues meet.
 
     Raises:
-        TypeError, ValueError: if ``region`` does not fit, is negative or empty, or ``time`` or ``width`` is not
-        positive.
+        TypeError, ValueError: if a region does not fit, is negative or empty, or ``time`` or ``width`` is not positive.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -70,13 +76,27 @@ def diffusion_mask(
     weights = region_weights(spectrum, region)  # (B, K, N)
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
     # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
-    coordinates = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
-    centres = weights @ coordinates.mT  # (B, K, M)
-    squared = torch.stack([(coordinates - c.unsqueeze(2)).square().sum(1) for c in centres.unbind(1)], dim=1)
-    scale = coordinates.shape[2] / torch.as_tensor(width).to(squared).reshape(-1, 1, 1).square()
+    basis = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
+    scale = basis.shape[2] / torch.as_tensor(width).to(basis).reshape(-1, 1, 1)
+    exponents = scale * _squared_distances(basis, weights)  # (B, K, N)
     # Far pixels would underflow to 0, where a product of masks loses what it stands for.
-    mask = torch.exp((-scale * squared).clamp(min=-60.0))
+    mask = torch.exp(-exponents.clamp(max=60.0))
+    if negative is not None:
+        others = region_weights(spectrum, negative, name="negative")
+        if others.shape[1] not in (1, weights.shape[1]):
+            raise ValueError(
+                f"negative must have 1 channel or the region's {weights.shape[1]}, got {others.shape[1]}; "
+                "give one for all regions or one for each"
+            )
+        margin = scale * _squared_distances(basis, others) - exponents
+        mask = mask * torch.sigmoid(margin.clamp(min=-20.0))
     return mask.unflatten(2, spectrum.size).to(region.dtype)
+
+
+def _squared_distances(coordinates: Tensor, weights: Tensor) -> Tensor:
+    """Squared distances (B, K, N) of all pixels to the weighted means of regions (B, K, N), coordinates (B, M, N)."""
+    centres = weights @ coordinates.mT  # (B, K, M)
+    return torch.stack([(coordinates - c.unsqueeze(2)).square().sum(1) for c in centres.unbind(1)], dim=1)
 
 
 def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") -> Tensor:
@@ -127,3 +147,42 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
     return mask.unflatten(2, spectrum.size).to(regions.dtype)
+
+
+def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
+    """Sliders for every pixel from sliders for every region: inside a mask its own, outside of all the image as it is.
+
+    Paper: Figs. 12, 13, where eq. (12) acts inside a propagated mask. The result is an ``alpha`` of
+    :func:`polynomial_filter`; with one region it is the edit blended by its mask.
+
+    Args:
+        masks: (B, K, H, W) in [0, 1] of K regions, soft or hard. Where they add up to more than 1 they share the pixel
+            in proportion.
+        alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
+
+    Returns:
+        (B, k+1, H, W): ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in both.
+
+    Raises:
+        TypeError, ValueError: if ``masks`` is no such tensor or leaves [0, 1], or ``alpha`` has another number of
+            regions.
+
+    Example:
+        >>> masks = torch.tensor([1.0, 0.0, 0.5]).view(1, 1, 1, 3)
+        >>> compose_alpha(masks, torch.tensor([[3.0, 1.0]]))[0, :, 0]
+        tensor([[3., 1., 2.],
+                [1., 1., 1.]])
+    """
+    check_image(masks, "masks")
+    check_unit_range(masks, "masks")
+    if not isinstance(alpha, Tensor):
+        raise TypeError(f"alpha must be a torch.Tensor, got {type(alpha).__name__}; convert it with torch.tensor")
+    if alpha.ndim not in (2, 3) or alpha.shape[-2] != masks.shape[1] or alpha.shape[-1] < 2:
+        raise ValueError(
+            f"alpha must have shape ({masks.shape[1]}, k+1) or (B, {masks.shape[1]}, k+1), a row of sliders for every "
+            f"mask, got {tuple(alpha.shape)}; reshape it"
+        )
+    check_finite(alpha, "alpha")
+    shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
+    change = alpha.to(masks) - 1.0
+    return 1.0 + torch.einsum("bkhw,bkl->blhw", shares, change.expand(masks.shape[0], -1, -1))
