@@ -148,7 +148,9 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
     Call it before long work, so that the sentence comes at once.
     """
     path = Path(path)
-    check_folder(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; add a file name to it")
+    _check_parent(path)
     kind = SUFFIXES.get(path.suffix.lower())
     if kind is None:
         raise ValueError(f"{path} must end in .png, .jpg, .webp or .tif, got {path.suffix!r}; choose one of these")
@@ -163,11 +165,15 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
     return kind
 
 
-def check_folder(path: str | Path) -> None:
-    """Raise ValueError unless a file can be made at ``path``."""
-    path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; add a file name to it")
+def check_folder(folder: str | Path) -> None:
+    """Raise ValueError unless ``folder`` is one that can be written to, or could be made."""
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file, not a folder; name a folder for the output")
+    _check_parent(folder / "file" if folder.exists() else folder)
+
+
+def _check_parent(path: Path) -> None:
     if not path.parent.is_dir():
         raise ValueError(f"{path} cannot be written because the folder {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):

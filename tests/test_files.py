@@ -14,8 +14,7 @@ import tifffile
 import torch
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
-from nlfilter_torch import files
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.files import Photograph, check_folder, read_photograph, write_photograph
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 INTEGERS = ("uint8", "uint16")
@@ -337,7 +336,20 @@ def test_a_folder_is_no_output(tmp_path: Path) -> None:
 def test_a_read_only_folder_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write anywhere
     with pytest.raises(ValueError, match="is read-only; choose another"):
-        files.check_folder(tmp_path / "out.png")
+        write_photograph(photograph(stored_values(3, "uint8")), tmp_path / "out.png")
+    with pytest.raises(ValueError, match="is read-only; choose another"):
+        check_folder(tmp_path)
+
+
+def test_output_folders(tmp_path: Path) -> None:
+    check_folder(tmp_path)
+    check_folder(tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="is a file, not a folder"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(ValueError, match="does not exist; make it first"):
+        check_folder(tmp_path / "new" / "newer")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

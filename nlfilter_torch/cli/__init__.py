@@ -1,0 +1,19 @@
+"""The command line ``nlfilter-torch``. Each verb has its own file; options that verbs share are in ``options``.
+
+Bad input of any kind is one sentence on the standard error stream and exit status 2.
+"""
+
+import sys
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status."""
+    try:
+        from nlfilter_torch.cli.application import run
+    except ModuleNotFoundError as error:
+        sys.stderr.write(
+            f"nlfilter-torch: the command line needs {error.name}, which is not installed; "
+            "install it with: pip install 'nlfilter-torch[cli]'\n"
+        )
+        return 2
+    return run(arguments)

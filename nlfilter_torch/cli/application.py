@@ -1,0 +1,71 @@
+"""The verbs put together, and what happens when one of them is given something it cannot use."""
+
+import sys
+import warnings
+from typing import Annotated, TextIO
+
+import typer
+
+from nlfilter_torch import __version__
+from nlfilter_torch.cli.demo import demo
+from nlfilter_torch.cli.detail import detail
+from nlfilter_torch.cli.inspect import inspect
+
+NAME = "nlfilter-torch"
+
+app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app.command()(detail)
+app.command()(inspect)
+app.command()(demo)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{NAME} {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Edit photographs with a filter that treats similar spots alike wherever they are.
+
+    It compares small patches all over the picture, so that fine texture, larger details, edges and shading come apart,
+    and each can be made stronger or weaker. `nlfilter-torch COMMAND --help` explains each command.
+    """
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run the command line; bad input becomes one sentence and exit status 2."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        try:
+            status = app(args=arguments or ["--help"], prog_name=NAME, standalone_mode=False)
+        except typer.TyperException as error:  # a wrong option or argument
+            return _refuse(error.format_message())
+        except (ValueError, OSError, MemoryError) as error:  # a bad file or value, found by the library
+            return _refuse(str(error))
+    return status if isinstance(status, int) else 0
+
+
+def _refuse(message: str) -> int:
+    # Typer puts the class of an error before some of its own messages; a photographer has no use for it.
+    sentence = " ".join(message.replace("Value error, ", "").split())
+    sys.stderr.write(f"{NAME}: {sentence}\n")
+    return 2
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """A warning as a reader of pictures wants it: without the place in the code."""
+    sys.stderr.write(f"{NAME}: note: {message}\n")

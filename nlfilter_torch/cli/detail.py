@@ -1,0 +1,110 @@
+"""``nlfilter-torch detail``: raise or lower the details of a photograph, scale by scale."""
+
+import math
+from dataclasses import replace
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+from torch import Tensor
+
+from nlfilter_torch.cli import options
+from nlfilter_torch.cli.progress import steps
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.files import Depth, check_output, read_photograph, write_photograph
+from nlfilter_torch.filtering import polynomial_filter
+
+
+class FileDepth(StrEnum):
+    """What a channel of the output file holds."""
+
+    eight = "8"
+    sixteen = "16"
+    floats = "float"
+
+
+DEPTHS: dict[FileDepth, Depth] = {
+    FileDepth.eight: "uint8",
+    FileDepth.sixteen: "uint16",
+    FileDepth.floats: "float32",
+}
+
+Target = Annotated[
+    str,
+    typer.Argument(
+        metavar="OUT", help="The edited photograph; the ending of its name (.png, .jpg, .tif, .webp) gives the type."
+    ),
+]
+Residual = Annotated[
+    float | None,
+    typer.Option(
+        metavar="GAIN",
+        help="Strength of the grain that no typical patch explains. 1 leaves it as it is, which keeps noise down. "
+        "Left out: as the first slider of --alpha.",
+    ),
+]
+Edited = Annotated[
+    options.Channels,
+    typer.Option(help="Edit brightness and keep the colours, or edit red, green and blue alike, colours too."),
+]
+OutputDepth = Annotated[
+    FileDepth | None,
+    typer.Option(help="Bits a channel of the output, or floats (TIFF only). Left out: as many as the input has."),
+]
+
+
+def detail(
+    source: options.Source,
+    target: Target,
+    alpha: options.Alpha = "3,3,4,1.05",
+    bandwidth: options.Bandwidth = "auto",
+    residual: Residual = None,
+    channels: Edited = options.Channels.luminance,
+    depth: OutputDepth = None,
+    spatial_bandwidth: options.SpatialBandwidth = None,
+    patch_size: options.PatchSize = 5,
+    landmarks: options.Landmarks = 100,
+    sampling: options.LandmarkSampling = options.Sampling.kmeans,
+    seed: options.Seed = 0,
+) -> None:
+    """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
+
+    Colours stay as they are, and so do the file's depth, transparency, colour profile and notes of the camera (EXIF).
+
+    Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,4,1.05`
+
+    Sharpen a little, spare the grain: `nlfilter-torch detail in.jpg out.jpg --alpha 1.5,1.5,1.5,1 --residual 1`
+
+    Smooth skin or noise away: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
+    """
+    sliders = options.parse_alpha(alpha)
+    if residual is not None and not math.isfinite(residual):
+        raise ValueError(f"--residual must be a finite number, such as 1, got {residual}")
+    with steps(4) as begin:
+        begin("Reading")
+        photograph = read_photograph(source, bytes_per_pixel=options.working_bytes(landmarks, patch_size))
+        edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
+        check_output(target, edited)
+
+        begin("Comparing patches")
+        image = photograph.pixels
+        operator = options.build_operator(
+            reduce_channels(image, "luminance"),
+            bandwidth=bandwidth,
+            spatial_bandwidth=spatial_bandwidth,
+            patch_size=patch_size,
+            landmarks=landmarks,
+            sampling=sampling,
+            seed=seed,
+        )
+
+        begin("Filtering")
+
+        def edit(planes: Tensor) -> Tensor:
+            return polynomial_filter(operator, planes, sliders, residual=residual)
+
+        pixels = edit_luminance(image, edit) if channels is options.Channels.luminance else edit(image)
+
+        begin("Writing")
+        write_photograph(edited.with_pixels(pixels), target)

@@ -1,0 +1,116 @@
+"""``nlfilter-torch inspect``: look into the filter of a photograph."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from nlfilter_torch.cli import options
+from nlfilter_torch.cli.progress import steps
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.files import check_folder, open_beside, read_photograph
+from nlfilter_torch.filtering import captured_energy
+from nlfilter_torch.operator import NonlocalOperator
+from nlfilter_torch.pictures import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
+from nlfilter_torch.spectrum import Spectrum
+
+Folder = Annotated[
+    Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
+]
+# What each figure of the diagnostics tells, for someone who has not read the paper.
+MEANINGS = {
+    "height": "pixels from top to bottom",
+    "width": "pixels from left to right",
+    "landmarks": "typical patches that stand for all others",
+    "rank": "independent patterns found",
+    "bandwidth": "grey levels of 255 within which spots count as alike",
+    "balancing_steps": "passes until every pixel got the same total weight",
+    "row_sum_residual": "how far the total weight of a pixel is from 1, at worst",
+    "smallest_row_sum": "least total weight before balancing; 1 is a pixel with no partner at all",
+    "largest_eigenvalue": "1 for a sound filter",
+    "eigenvector_residual": "error of the eigenvectors, at worst",
+    "orthogonality": "deviation of the eigenvectors from a right angle, at worst",
+    "diagonal_share": "part of a pixel that only itself explains, on average",
+    "captured_energy": "part of the picture that the patterns explain (beta in the paper)",
+}
+
+
+def inspect(
+    source: options.Source,
+    folder: Folder,
+    alpha: options.Alpha = "3,3,4,1.05",
+    bandwidth: options.Bandwidth = "auto",
+    spatial_bandwidth: options.SpatialBandwidth = None,
+    patch_size: options.PatchSize = 5,
+    landmarks: options.Landmarks = 100,
+    sampling: options.LandmarkSampling = options.Sampling.kmeans,
+    seed: options.Seed = 0,
+) -> None:
+    """Show how the filter sees a photograph: the patterns it finds, how strong they are, and what sliders do to them.
+
+    Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table.
+
+    Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
+    """
+    sliders = options.parse_alpha(alpha)
+    check_folder(folder)
+    with steps(4) as begin:
+        begin("Reading")
+        photograph = read_photograph(source, bytes_per_pixel=2 * options.working_bytes(landmarks, patch_size))
+        guide = reduce_channels(photograph.pixels, "luminance")
+        begin("Comparing patches")
+        operator = options.build_operator(
+            guide,
+            bandwidth=bandwidth,
+            spatial_bandwidth=spatial_bandwidth,
+            patch_size=patch_size,
+            landmarks=landmarks,
+            sampling=sampling,
+            seed=seed,
+        )
+        begin("Finding patterns")
+        spectrum = operator.spectrum()
+        figures = summarize(operator, spectrum, guide)
+        begin("Drawing")
+        folder.mkdir(exist_ok=True)
+        save_figure(show_eigenvectors(spectrum), folder / "eigenvectors.png")
+        save_figure(plot_eigenvalues(spectrum), folder / "eigenvalues.png")
+        save_figure(plot_response(sliders, spectrum), folder / "response.png")
+        report = {**figures, "eigenvalues": spectrum.eigenvalues[0].tolist()}
+        with open_beside(folder / "diagnostics.json") as stream:
+            stream.write(json.dumps(report, indent=2).encode() + b"\n")
+    print_table(figures, f"The filter of {source}")
+
+
+def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> dict[str, Any]:
+    """The diagnostics of one image as plain numbers, bandwidth in grey levels."""
+    figures = {
+        name: value[0] if isinstance(value, list) else value for name, value in asdict(operator.diagnostics()).items()
+    }
+    del figures["pixels"]
+    height, width = guide.shape[-2:]
+    return {
+        "height": height,
+        "width": width,
+        "landmarks": figures.pop("num_landmarks"),
+        "rank": figures.pop("rank"),
+        "bandwidth": options.LEVELS * figures.pop("photometric_bandwidth"),
+        **figures,
+        "captured_energy": float(captured_energy(spectrum, guide)),
+    }
+
+
+def print_table(figures: dict[str, Any], title: str) -> None:
+    """Print diagnostics with what each of them tells."""
+    table = Table(title=title, title_justify="left")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    table.add_column("what it tells")
+    for name, value in figures.items():
+        table.add_row(name.replace("_", " "), f"{value:.4g}", MEANINGS.get(name, ""))
+    Console().print(table)

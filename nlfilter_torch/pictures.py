@@ -1,0 +1,152 @@
+"""Labelled figures of images, layers, eigenvectors, masks and responses. Needs the ``cli`` extra (matplotlib).
+
+Every function returns a matplotlib figure that belongs to no window and no global state; :func:`save_figure` writes it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch.files import open_beside
+from nlfilter_torch.response import polynomial_response
+from nlfilter_torch.spectrum import Spectrum
+
+DPI = 100
+PANEL = 5.2  # inches along the longer side of a picture: enough for every pixel of the photographs of scikit-image
+LABEL = 0.45  # inches above a picture for its title
+FAR = 0.995  # colour scales end at this quantile, so that one odd pixel does not grey out the rest
+
+
+def show_images(images: Mapping[str, Tensor], *, columns: int | None = None) -> Figure:
+    """Pictures side by side, each (1, C, H, W) or (C, H, W) in [0, 1], under their titles."""
+    pictures = {title: _picture(image) for title, image in images.items()}
+    figure, axes = _panels(next(iter(pictures.values())).shape, len(pictures), columns)
+    for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
+        _draw(axis, title, picture)
+    return figure
+
+
+def show_layers(layers: Tensor) -> Figure:
+    """Detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the smooth rest as it is."""
+    stack = layers[0].mean(1).numpy(force=True)  # (k+1, H, W)
+    figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))))
+    for number, (axis, layer) in enumerate(zip(axes, stack[:-1], strict=False), start=1):
+        reach = _reach(layer)
+        name = {1: " (finest detail)", len(stack) - 1: " (coarsest detail)"}.get(number, "")
+        _draw(axis, f"Layer {number}{name}: black to white is ±{255 * reach:.0f} of 255 levels", layer, reach=reach)
+    _draw(axes[-1], f"Layer {len(stack)}: the smooth rest, as it is", stack[-1].clip(0, 1))
+    return figure
+
+
+def show_eigenvectors(spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50)) -> Figure:
+    """Eigenvectors by their number from 1, as in the paper's Fig. 1; numbers beyond the last are left out."""
+    vectors = spectrum.eigenvectors[0].numpy(force=True)
+    shown = [number for number in numbers if number <= len(vectors)]
+    figure, axes = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))))
+    for axis, number in zip(axes, shown, strict=True):
+        vector = vectors[number - 1]
+        title = f"Eigenvector {number}, eigenvalue {float(spectrum.eigenvalues[0, number - 1]):.4f}"
+        _draw(axis, title, vector, reach=_reach(vector), colours="RdBu_r")
+    return figure
+
+
+def show_mask(image: Tensor, region: Tensor, mask: Tensor) -> Figure:
+    """A photograph with a region outlined, the mask that grew from it, and the photograph in colour where the mask is.
+
+    Args:
+        image: (1, C, H, W) in [0, 1].
+        region: (1, 1, H, W), above 0.5 inside.
+        mask: (1, 1, H, W) in [0, 1].
+    """
+    picture = _picture(image)
+    weight = mask[0, 0].numpy(force=True)[..., None]
+    figure, axes = _panels(picture.shape, 3, columns=3)
+    _draw(axes[0], "The region that was selected", picture)
+    axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["white"], linewidths=3)
+    axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["black"], linewidths=1)
+    drawn = _draw(axes[1], "Its mask: 1 is like the region, 0 is not", weight[..., 0], colours="magma")
+    drawn.set_clim(0, 1)
+    figure.colorbar(drawn, ax=axes[1], fraction=0.04, pad=0.02)
+    faded = np.broadcast_to(0.6 + 0.25 * picture.mean(-1, keepdims=True), picture.shape)
+    _draw(axes[2], "What an edit would reach", weight * picture + (1 - weight) * faded)
+    return figure
+
+
+def plot_eigenvalues(spectrum: Spectrum) -> Figure:
+    """Eigenvalues against their number: how fast they fall tells how few patterns make up the image."""
+    figure = Figure(figsize=(8, 5), dpi=DPI, layout="constrained")
+    axis = figure.subplots()
+    values = spectrum.eigenvalues[0].numpy(force=True)
+    axis.plot(np.arange(1, len(values) + 1), values, marker="o", markersize=3)
+    axis.set(xlabel="number", ylabel="eigenvalue λ", ylim=(-0.02, 1.05), title="Eigenvalues of the filter")
+    axis.grid(alpha=0.3)
+    return figure
+
+
+def plot_response(alpha: Tensor, spectrum: Spectrum) -> Figure:
+    """What the sliders do to each eigenvalue, eq. (14), with the image's own eigenvalues marked on the curve."""
+    figure = Figure(figsize=(8, 5), dpi=DPI, layout="constrained")
+    axis = figure.subplots()
+    line = torch.linspace(0, 1, 401, dtype=torch.float64)
+    values = spectrum.eigenvalues[0].double().cpu()
+    sliders = alpha.double().cpu()
+    names = ", ".join(f"{value:g}" for value in alpha.tolist())
+    axis.axhline(1, color="grey", linewidth=1, linestyle="--", label="untouched")
+    axis.plot(line, polynomial_response(line, sliders), label=f"f(λ) for alpha = ({names})")
+    axis.plot(values, polynomial_response(values, sliders), "o", markersize=4, label="eigenvalues of this image")
+    axis.set(
+        xlabel="eigenvalue λ (0: finest detail, 1: smooth shading)",
+        ylabel="gain f(λ)",
+        title="What the sliders do to each scale",
+    )
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG; the file appears complete or not at all."""
+    with open_beside(path) as stream:
+        figure.savefig(stream, format="png")
+
+
+def _picture(image: Tensor) -> NDArray[Any]:
+    """(1, C, H, W) or (C, H, W) as (H, W, 3) in [0, 1]."""
+    channels = image.detach().reshape(-1, *image.shape[-2:]).clamp(0, 1)
+    return channels.expand(3, -1, -1).permute(1, 2, 0).numpy(force=True)
+
+
+def _reach(values: NDArray[Any]) -> float:
+    """Symmetric end of a colour scale; a plane of zeros still needs one."""
+    return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
+
+
+def _panels(shape: tuple[int, ...], count: int, columns: int | None) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels for pictures of that height and width."""
+    height, width = shape[:2]
+    across = min(columns or count, count)
+    down = math.ceil(count / across)
+    scale = PANEL / max(height, width)
+    size = (across * (width * scale + 0.15), down * (height * scale + LABEL))
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    grid = figure.subplots(down, across, squeeze=False).ravel().tolist()
+    for empty in grid[count:]:
+        empty.set_axis_off()
+    return figure, grid[:count]
+
+
+def _draw(axis: Axes, title: str, picture: NDArray[Any], *, reach: float | None = None, colours: str = "gray") -> Any:
+    """One picture under its title, values spread over ±reach where given, over [0, 1] otherwise."""
+    lowest, highest = (0.0, 1.0) if reach is None else (-reach, reach)
+    drawn = axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
+    axis.set_title(title, fontsize=11)
+    axis.set_axis_off()
+    return drawn
