@@ -5,6 +5,7 @@ Talebi and Milanfar, "Nonlocal Image Editing", IEEE Transactions on Image Proces
 
 from nlfilter_torch.bandwidth import estimate_bandwidth
 from nlfilter_torch.filtering import captured_energy, detail_layers, polynomial_filter, spectral_filter
+from nlfilter_torch.fitting import fit_alpha
 from nlfilter_torch.masks import diffusion_map, diffusion_mask, segment_mask
 from nlfilter_torch.modules import (
     DiffusionMask,
@@ -33,6 +34,7 @@ __all__ = [
     "diffusion_map",
     "diffusion_mask",
     "estimate_bandwidth",
+    "fit_alpha",
     "nonlocal_operator",
     "polynomial_filter",
     "polynomial_response",

@@ -1,0 +1,253 @@
+"""Image and target to the sliders that turn one into the other. Paper: eq. (12), read backwards.
+
+The filter is linear in alpha, so least squares finds it at once from the (k+1) x (k+1) products of the layers. Layers
+that are nearly alike, or nearly nothing, leave some mixtures of sliders undecided: those stay as close to 1, which
+changes nothing, as the target allows.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.checks import check_count, check_image, check_same_size
+from nlfilter_torch.filtering import detail_layers
+from nlfilter_torch.matrix_function import SymmetricMatrix
+from nlfilter_torch.operator import NonlocalOperator
+from nlfilter_torch.precision import full_precision
+
+Loss = Callable[[Tensor, Tensor], Tensor]
+
+# Mixtures of layers of unit norm whose squared norm is below this are rounding of the operator's dtype.
+CUT = {torch.float32: 1e-10, torch.float64: 1e-14}
+# A layer whose power is this small beside that of the image is what balancing left of a constant one.
+VANISHED = {torch.float32: 1e-9, torch.float64: 1e-22}
+DESCENT_STEPS = 200
+HALF_LEVEL = 0.5 / 255
+OFF_LEVEL = 1e-3  # of a level: values of 8 bits as floats are this close to one
+NEWTON_STEPS, HALVINGS = 50, 8
+SETTLED = 1e-9
+
+
+@full_precision
+def fit_alpha(
+    operator: NonlocalOperator,
+    image: Tensor,
+    target: Tensor,
+    *,
+    order: int = 3,
+    mask: Tensor | None = None,
+    ridge: float = 0.0,
+    shared: bool = False,
+    rounding: float | None = None,
+    loss: Loss | None = None,
+) -> Tensor:
+    """Find the sliders that bring ``polynomial_filter(operator, image, alpha)`` closest to ``target``.
+
+    Paper: eq. (12), read backwards. Solved in float64 whatever the images are in.
+
+    Args:
+        operator: W.
+        image: y, (B, C, H, W), before the edit.
+        target: (B, C, H, W), after it; all channels count alike.
+        order: k, at least 1: one slider fewer than are found.
+        mask: (B, 1, H, W) or (1, 1, H, W), non-negative weights of the pixels; None counts all of them.
+        ridge: weight of ``|alpha - 1|^2`` beside the mean squared error, at least 0: holds the sliders back.
+        shared: one alpha for the whole batch, rather than one for each image.
+        rounding: half the step between the values that ``target`` can hold, such as 0.5 / 255 for 8 bits. Errors up to
+            it count for nothing, nor does what goes beyond a target of 0 or 1, where a file clips. None is 0.5 / 255
+            where ``target`` holds only multiples of 1 / 255, and 0.0, plain least squares, where it does not.
+        loss: ``loss(filtered, target)``, a number to be made small by gradient descent from the least squares solution;
+            None is the least squares solution itself. Where ``mask`` is 0 both arguments hold the target, in between
+            they are blended.
+
+    Returns:
+        alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype: every other alpha has a mean squared error (or
+        a ``loss``) at least as large. Ones where the image decides nothing, as a constant one. Differentiable in image,
+        target, mask and operator; with a ``loss``, not.
+
+    Raises:
+        TypeError, ValueError: if ``image``, ``target`` or ``mask`` do not fit together, ``mask`` is negative or all
+        zero for an image, ``order`` is not a positive integer, or ``ridge`` or ``rounding`` is negative.
+
+    Example:
+        >>> from nlfilter_torch import nonlocal_operator, polynomial_filter
+        >>> image = torch.rand(1, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+        >>> operator = nonlocal_operator(image, num_landmarks=20)
+        >>> edited = polynomial_filter(operator, image, torch.tensor([3.0, 1.0, 1.2]))
+        >>> [round(a, 2) for a in fit_alpha(operator, image, edited, order=2)[0].tolist()]
+        [3.0, 1.0, 1.2]
+    """
+    check_count(order, "order")
+    check_image(image, "image")
+    check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
+    check_same_size(image, operator.size, "image", "operator")
+    check_same_size(target, operator.size, "target", "image")
+    _check_not_negative(ridge, "ridge")
+    if rounding is None:
+        rounding = HALF_LEVEL if _is_rounded(target) else 0.0
+    _check_not_negative(rounding, "rounding")
+
+    layers = detail_layers(operator, image.to(operator.factor), order=order).double()  # (B, k+1, C, H, W)
+    problem = _Problem(
+        layers=layers.flatten(2),
+        edit=(target.double() - layers.sum(1)).flatten(1),
+        dead_zone=_dead_zone(target.detach().double().flatten(1), rounding) if rounding > 0.0 else None,
+        weights=_pixel_weights(mask, layers).flatten(1),
+        ridge=ridge,
+        shared=shared,
+        precision=operator.factor.dtype,
+    )
+    change = problem.fit()
+    if loss is not None:
+        change = problem.descend(change, loss, target.double(), mask)
+    return (1.0 + change).to(image.dtype)
+
+
+def _check_not_negative(value: float, name: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{name} must be a number, got {type(value).__name__}; pass 0.0 or more")
+    if not (value >= 0 and math.isfinite(value)):
+        raise ValueError(f"{name} must be at least 0 and finite, got {value}; 0.0 is plain least squares")
+
+
+def _is_rounded(target: Tensor) -> bool:
+    """Does ``target`` hold nothing but multiples of 1/255?"""
+    levels = target.detach().double() * 255
+    return bool(((levels - levels.round()).abs() < OFF_LEVEL).all())
+
+
+def _dead_zone(target: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
+    """Errors (target less filtered) between which a pixel is explained: from a clipped one, any beyond the clipping."""
+    low = torch.where(target >= 1.0, -math.inf, -rounding)
+    high = torch.where(target <= 0.0, math.inf, rounding)
+    return low, high
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Explain ``edit`` by a change of the sliders from 1, under which the filter leaves the image alone.
+
+    Attributes:
+        layers: (B, k+1, P), all values of an image in a row.
+        edit: (B, P).
+        dead_zone: limits (B, P) between which errors count for nothing; None where all count.
+        weights: (B, P) or (1, P), of unit sum.
+        ridge: see :func:`fit_alpha`.
+        shared: one change for all images.
+        precision: dtype in which the layers were worked out.
+    """
+
+    layers: Tensor
+    edit: Tensor
+    dead_zone: tuple[Tensor, Tensor] | None
+    weights: Tensor
+    ridge: float
+    shared: bool
+    precision: torch.dtype
+
+    def fit(self) -> Tensor:
+        """Change (B, k+1) of least squares, with the dead zone.
+
+        Rounding is no noise: where the edit is smaller than half a level, it takes it away, always, and plain least
+        squares finds sliders that do too little. With the dead zone the true sliders are free of error. The objective
+        is convex, piecewise quadratic, and differentiable; Newton's method ends after a few steps.
+        """
+        batch = 1 if self.shared else self.layers.shape[0]
+        start = self.layers.new_zeros(batch, self.layers.shape[1])
+        if self.dead_zone is None:
+            return self._step(start)
+        with torch.no_grad():
+            change = replace(self, dead_zone=None)._step(start)
+            for _ in range(NEWTON_STEPS):
+                step, cost = self._step(change), self._cost(change)
+                for _ in range(HALVINGS):
+                    worse = self._cost(change + step) > cost
+                    step = torch.where(worse.unsqueeze(1), step / 2, step)
+                change = change + step
+                if bool((step.abs() < SETTLED).all()):
+                    break
+        return change + self._step(change)  # a last step for the gradient
+
+    def _errors(self, change: Tensor) -> Tensor:
+        """What of the edit (B, P) is left unexplained."""
+        errors = self.edit - (change.unsqueeze(1) @ self.layers).squeeze(1)
+        return errors if self.dead_zone is None else errors - errors.clamp(*self.dead_zone)
+
+    def _pool(self, values: Tensor) -> Tensor:
+        return values.mean(0, keepdim=True) if self.shared else values
+
+    def _cost(self, change: Tensor) -> Tensor:
+        return self._pool((self.weights * self._errors(change).square()).sum(1)) + self.ridge * change.square().sum(1)
+
+    def _step(self, change: Tensor) -> Tensor:
+        """Newton's step (B, k+1): from anywhere to the solution where all errors count."""
+        errors = self._errors(change)
+        counted = self.weights if self.dead_zone is None else self.weights * (errors != 0.0)
+        products = self._pool((self.layers * counted.unsqueeze(1)) @ self.layers.mT)  # (B, k+1, k+1)
+        slope = self._pool((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2)) - self.ridge * change
+        scale, inverse = self._inverse(products)
+        return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)
+
+    def _inverse(self, products: Tensor) -> tuple[Tensor, Tensor]:
+        """Scales (B, k+1) of the layers, and the pseudo-inverse (B, k+1, k+1) of their products so scaled."""
+        products = products + self.ridge * torch.eye(products.shape[1]).to(products)
+        power = products.diagonal(dim1=1, dim2=2)
+        # The layers sum to the image, so the largest of them is of its size.
+        present = power > VANISHED[self.precision] * power.amax(1, keepdim=True)
+        scale = torch.where(present, power, torch.ones_like(power)).rsqrt() * present
+        matrix = SymmetricMatrix.of(scale.unsqueeze(2) * products * scale.unsqueeze(1))
+        return scale, matrix.apply(torch.reciprocal, matrix.eigenvalues > CUT[self.precision])
+
+    @torch.no_grad()
+    def descend(self, start: Tensor, loss: Loss, target: Tensor, mask: Tensor | None) -> Tensor:
+        """Change (B, k+1) that minimises ``loss``, by L-BFGS in a basis in which the squared error is round."""
+        scale, inverse = self._inverse(self._pool((self.layers * self.weights.unsqueeze(1)) @ self.layers.mT))
+        basis = scale.unsqueeze(2) * SymmetricMatrix.of(inverse).apply(torch.sqrt, torch.ones_like(scale).bool())
+        filtered_shape = (self.layers.shape[0], *target.shape[1:])
+        target = target.expand(filtered_shape)
+        image = target - self.edit.view(filtered_shape)
+        coefficients = torch.zeros_like(start).requires_grad_()
+        optimizer = torch.optim.LBFGS(
+            [coefficients],
+            max_iter=DESCENT_STEPS,
+            tolerance_grad=1e-9,
+            tolerance_change=1e-12,
+            line_search_fn="strong_wolfe",
+        )
+
+        def change_of(c: Tensor) -> Tensor:
+            return start + (basis @ c.unsqueeze(2)).squeeze(2)
+
+        @torch.enable_grad()
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            change = change_of(coefficients)
+            filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
+            if mask is not None:
+                filtered = torch.lerp(target, filtered, mask.to(filtered))
+            value = loss(filtered, target) + self.ridge * change.square().sum()
+            value.backward()
+            return value
+
+        optimizer.step(closure)
+        return change_of(coefficients.detach())
+
+
+def _pixel_weights(mask: Tensor | None, layers: Tensor) -> Tensor:
+    """Weights (B, C, H, W) or (1, C, H, W) of the pixels, of unit sum for every image."""
+    batch, _, channels, height, width = layers.shape
+    if mask is None:
+        return layers.new_full((1, channels, height, width), 1.0 / (channels * height * width))
+    check_image(mask, "mask", channels=1, batch=batch)
+    check_same_size(mask, (height, width), "mask", "image")
+    if bool((mask < 0).any()):
+        raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
+    total = mask.double().sum((2, 3), keepdim=True)
+    if bool((total <= 0).any()):
+        raise ValueError(
+            "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"
+        )
+    return (mask.double() / (channels * total)).expand(-1, channels, -1, -1)

@@ -1,0 +1,233 @@
+"""Sliders from a pair of images: what went in comes out, through rounding, clipping, masks and other losses."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nlfilter_torch import fit_alpha, nonlocal_operator, polynomial_filter
+from tests.images import PHOTOGRAPHS, hard_images
+from tests.problems import noise, picture, seeded
+
+ALPHAS = ((2.5, 1.7, 0.6, 1.05), (3.0, 3.0, 4.0, 1.05), (0.2, 0.5, 1.2, 1.0))
+
+
+def grey(name: str, side: int = 96, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """A photograph in 8 bits with room for edits below and above."""
+    return ((255 * (0.5 + 0.5 * (picture(name, side, side) - 0.5))).round() / 255).to(dtype)
+
+
+def through_png(image: torch.Tensor) -> torch.Tensor:
+    """An image (1, 1, H, W) after it was saved as an 8-bit PNG and read again."""
+    levels = (image[0, 0].clamp(0, 1) * 255).round().byte().numpy()
+    stream = io.BytesIO()
+    Image.fromarray(levels).save(stream, format="PNG")
+    return torch.from_numpy(np.asarray(Image.open(stream)).copy())[None, None] / 255
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_own_output_gives_its_sliders(name: str, alpha: tuple[float, ...]) -> None:
+    image = grey(name)
+    operator = nonlocal_operator(image, num_landmarks=60)
+    wanted = torch.tensor(alpha)
+    found = fit_alpha(operator, image, polynomial_filter(operator, image, wanted))
+    assert found.shape == (1, 4)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found[0], wanted, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("order", [1, 2, 5])
+def test_own_output_of_another_order(order: int) -> None:
+    image = grey("chelsea")
+    operator = nonlocal_operator(image, num_landmarks=60)
+    wanted = torch.linspace(2.0, 0.8, order + 1)
+    found = fit_alpha(operator, image, polynomial_filter(operator, image, wanted), order=order)
+    torch.testing.assert_close(found[0], wanted, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_an_8_bit_png_gives_its_sliders_to_5_per_cent(name: str, alpha: tuple[float, ...]) -> None:
+    image = grey(name, 192)
+    operator = nonlocal_operator(image, photometric_bandwidth=10 / 255)
+    wanted = torch.tensor(alpha)
+    target = through_png(polynomial_filter(operator, image, wanted))
+    torch.testing.assert_close(fit_alpha(operator, image, target)[0], wanted, atol=0, rtol=0.05)
+
+
+def test_rounding_misleads_plain_least_squares() -> None:
+    # Why errors below half a level are left out: on this picture they are no noise.
+    image = grey("camera", 192)
+    operator = nonlocal_operator(image, photometric_bandwidth=10 / 255)
+    wanted = torch.tensor(ALPHAS[0])
+    target = through_png(polynomial_filter(operator, image, wanted))
+    plain = (fit_alpha(operator, image, target, rounding=0.0)[0] / wanted - 1).abs().max()
+    aware = (fit_alpha(operator, image, target)[0] / wanted - 1).abs().max()
+    assert aware < 0.1 * plain
+
+
+def test_clipped_pixels_tell_only_a_bound() -> None:
+    image = picture("coins", 192, 192, torch.float32)
+    operator = nonlocal_operator(image)
+    wanted = torch.tensor([3.0, 3.0, 4.0, 1.05])
+    edited = polynomial_filter(operator, image, wanted)
+    assert ((edited < 0) | (edited > 1)).float().mean() > 1e-3
+    torch.testing.assert_close(fit_alpha(operator, image, through_png(edited))[0], wanted, atol=0, rtol=0.05)
+
+
+def test_fit_is_the_least_squares_solution() -> None:
+    image, target = grey("astronaut", dtype=torch.float64), picture("camera", 96, 96)
+    operator = nonlocal_operator(image, num_landmarks=40)
+    found = fit_alpha(operator, image, target)
+
+    def error(alpha: torch.Tensor) -> float:
+        return float((polynomial_filter(operator, image, alpha) - target).square().mean())
+
+    best = error(found)
+    for step in torch.cat([torch.eye(4), -torch.eye(4)]).double():
+        assert error(found + 1e-3 * step) > best
+
+
+def test_batch_is_fitted_image_by_image_or_together() -> None:
+    image = torch.cat([grey("astronaut"), grey("chelsea")])
+    operator = nonlocal_operator(image, num_landmarks=50)
+    alphas = torch.tensor([[2.0, 1.5, 0.7, 1.0], [0.5, 1.2, 1.4, 1.1]])
+    target = polynomial_filter(operator, image, alphas)
+    torch.testing.assert_close(fit_alpha(operator, image, target), alphas, atol=1e-4, rtol=0)
+
+    same = polynomial_filter(operator, image, alphas[0])
+    together = fit_alpha(operator, image, same, shared=True)
+    assert together.shape == (1, 4)
+    torch.testing.assert_close(together[0], alphas[0], atol=1e-4, rtol=0)
+    between = fit_alpha(operator, image, target, shared=True)[0]
+    assert not torch.allclose(between, alphas[0], atol=0.05)
+    assert not torch.allclose(between, alphas[1], atol=0.05)
+
+
+def test_colour_images_are_fitted_over_all_channels() -> None:
+    image = 0.25 + 0.5 * noise(1, 3, 40, 40, dtype=torch.float32)
+    operator = nonlocal_operator(image, num_landmarks=30)
+    wanted = torch.tensor([1.5, 0.5, 2.0])
+    found = fit_alpha(operator, image, polynomial_filter(operator, image, wanted), order=2)
+    torch.testing.assert_close(found[0], wanted, atol=1e-4, rtol=0)
+
+
+def test_mask_keeps_the_rest_out() -> None:
+    image = grey("chelsea")
+    operator = nonlocal_operator(image, num_landmarks=50)
+    wanted = torch.tensor([2.0, 1.5, 0.7, 1.0])
+    mask = torch.zeros(1, 1, 96, 96)
+    mask[..., 20:80, 10:70] = 1
+    target = torch.where(mask > 0, polynomial_filter(operator, image, wanted), 1 - image)
+    torch.testing.assert_close(fit_alpha(operator, image, target, mask=mask)[0], wanted, atol=1e-4, rtol=0)
+    assert not torch.allclose(fit_alpha(operator, image, target)[0], wanted, atol=0.1)
+
+
+def test_ridge_holds_the_sliders_at_one() -> None:
+    image = grey("chelsea")
+    operator = nonlocal_operator(image, num_landmarks=50)
+    target = polynomial_filter(operator, image, torch.tensor([3.0, 3.0, 4.0, 1.05]))
+    distance = [
+        (fit_alpha(operator, image, target, ridge=r, rounding=rounding) - 1).norm()
+        for rounding in (0.0, 0.5 / 255)
+        for r in (0.0, 1e-5, 1e-3, 1e3)
+    ]
+    for free, weak, strong, held in (distance[:4], distance[4:]):
+        assert free > weak > strong > held
+        assert held < 1e-4
+
+
+@pytest.mark.parametrize("name", ["constant", "8x8", "1x64", "two colours"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_an_image_does_not_decide_stays_at_one(name: str, dtype: torch.dtype) -> None:
+    image = torch.from_numpy(hard_images()[name])[None, None].to(dtype)
+    operator = nonlocal_operator(image, num_landmarks=10)
+    torch.testing.assert_close(fit_alpha(operator, image, image), torch.ones(1, 4, dtype=dtype), atol=1e-4, rtol=0)
+    brighter = fit_alpha(operator, image, 1.1 * image)
+    assert brighter.isfinite().all()
+    assert (polynomial_filter(operator, image, brighter) - 1.1 * image).abs().max() < 0.06
+    if name == "constant":
+        torch.testing.assert_close(brighter, torch.tensor([[1, 1, 1, 1.1]], dtype=dtype), atol=1e-4, rtol=0)
+
+
+def test_another_loss_is_made_small_by_descent() -> None:
+    image = grey("chelsea", 64)
+    operator = nonlocal_operator(image, num_landmarks=50)
+    wanted = torch.tensor([2.0, 1.5, 0.7, 1.0])
+    target = polynomial_filter(operator, image, wanted)
+    target[torch.rand(target.shape, generator=seeded()) < 0.05] = 1.0  # dust, which least squares falls for
+    absolute = fit_alpha(operator, image, target, loss=torch.nn.functional.l1_loss)
+    assert (absolute[0] - wanted).abs().max() < 0.02
+    assert (fit_alpha(operator, image, target)[0] - wanted).abs().max() > 0.2
+
+
+def test_descent_on_the_squared_error_is_least_squares() -> None:
+    image, other = grey("astronaut", 64, torch.float64), picture("camera", 64, 64)
+    operator = nonlocal_operator(image, num_landmarks=40)
+    mask = torch.zeros(1, 1, 64, 64, dtype=torch.float64)
+    mask[..., 10:50, 5:60] = 1
+    exact = fit_alpha(operator, image, other, mask=mask)
+    found = fit_alpha(operator, image, other, mask=mask, loss=torch.nn.functional.mse_loss)
+    torch.testing.assert_close(found, exact, atol=1e-6, rtol=0)
+
+
+def test_gradient_reaches_image_target_mask_and_guide() -> None:
+    guide, target, mask = noise(1, 1, 9, 8), noise(1, 1, 9, 8, seed=1), 0.1 + noise(1, 1, 9, 8, seed=2)
+
+    def fit(guide: torch.Tensor, image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        operator = nonlocal_operator(guide, num_landmarks=6, photometric_bandwidth=0.3)
+        return fit_alpha(operator, image, target, order=2, mask=mask)
+
+    tensors = [t.requires_grad_() for t in (guide, noise(1, 1, 9, 8, seed=3), target, mask)]
+    assert torch.autograd.gradcheck(fit, tensors)
+
+
+def test_gradient_beyond_the_dead_zone() -> None:
+    image, target = noise(1, 1, 9, 8), noise(1, 1, 9, 8, seed=1)
+    operator = nonlocal_operator(image, num_landmarks=6, photometric_bandwidth=0.3)
+    assert torch.autograd.gradcheck(
+        lambda t: fit_alpha(operator, image, t, order=2, rounding=0.05), target.requires_grad_()
+    )
+
+
+def test_half_precision_and_autocast_change_the_dtype_alone() -> None:
+    image = grey("chelsea", 64)
+    operator = nonlocal_operator(image, num_landmarks=50)
+    target = polynomial_filter(operator, image, torch.tensor([2.0, 1.5, 0.7, 1.0]))
+    exact = fit_alpha(operator, image, target)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(fit_alpha(operator, image, target), exact)
+    assert fit_alpha(operator, image.half(), target.half()).dtype == torch.float16
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        (
+            {"target": torch.rand(1, 1, 8, 9)},
+            ValueError,
+            r"target must have the height and width of the image, 8x8, got 8x9",
+        ),
+        ({"target": torch.rand(1, 3, 8, 8)}, ValueError, r"target must have 1 channel\(s\), got 3"),
+        ({"target": torch.rand(3, 1, 8, 8)}, ValueError, r"target must have batch size 1 or 2, got 3"),
+        ({"target": torch.ones(1, 1, 8, 8, dtype=torch.uint8)}, TypeError, "target must be of a floating-point dtype"),
+        ({"image": torch.rand(2, 1, 9, 8)}, ValueError, "image must have the height and width of the operator"),
+        ({"mask": torch.zeros(1, 1, 8, 8)}, ValueError, "mask must hold a pixel of positive weight"),
+        ({"mask": -torch.ones(1, 1, 8, 8)}, ValueError, "mask must be non-negative, got -1"),
+        ({"mask": torch.ones(1, 2, 8, 8)}, ValueError, r"mask must have 1 channel\(s\), got 2"),
+        ({"mask": torch.ones(1, 1, 4, 8)}, ValueError, "mask must have the height and width of the image"),
+        ({"order": 0}, ValueError, "order must be at least 1, got 0"),
+        ({"ridge": -1.0}, ValueError, "ridge must be at least 0 and finite, got -1"),
+        ({"ridge": "much"}, TypeError, "ridge must be a number, got str"),
+        ({"rounding": float("nan")}, ValueError, "rounding must be at least 0 and finite, got nan"),
+    ],
+)
+def test_bad_input_is_one_clear_sentence(changes: dict[str, object], error: type[Exception], message: str) -> None:
+    image = noise(2, 1, 8, 8, dtype=torch.float32)
+    arguments = {"image": image, "target": image} | changes
+    operator = nonlocal_operator(image, num_landmarks=10)
+    with pytest.raises(error, match=message):
+        fit_alpha(operator, arguments.pop("image"), arguments.pop("target"), **arguments)  # type: ignore[arg-type]
