@@ -1,0 +1,91 @@
+"""Measure, print every figure as it comes, and write them to a JSON file."""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.speed.machine import describe
+from benchmarks.speed.suites import QUICK, SUITES, Plan, Record
+
+MINUTES = 9.0  # no suite starts later than this
+
+
+def run(plan: Plan, names: Sequence[str], minutes: float) -> dict[str, Any]:
+    """Run the suites and gather their records."""
+    start = time.perf_counter()
+    results: list[Record] = []
+    skipped: list[str] = []
+    machine = describe()
+    print(f"{machine['processor']}, {machine['cores']} cores, load {machine['load_average']:.1f}", flush=True)
+    for name in names:
+        if time.perf_counter() - start > 60 * minutes:
+            skipped.append(name)
+            print(f"{name} is left out: {minutes:g} minutes are over", flush=True)
+            continue
+        for result in SUITES[name](plan):
+            results.append(result)
+            show(result)
+    return {
+        "quick": plan == QUICK,
+        "machine": machine,
+        "seconds": time.perf_counter() - start,
+        "load_average_after": os.getloadavg()[0],
+        "skipped": skipped,
+        "results": results,
+    }
+
+
+def show(result: Record) -> None:
+    """Print one record, with every time as a multiple of the floor where that was measured."""
+    print(f"\n{result['suite']}: {result['label']}")
+    floor = result.get("floor")
+    for name, timing in result["timings"].items():
+        multiple = f"{timing['median'] / floor['seconds']:9.3f} floors" if floor else ""
+        print(f"  {name:34}{1e3 * timing['median']:10.2f} ms  (IQR {1e3 * timing['iqr']:.2f}){multiple}")
+    if floor:
+        print(f"  {'floor':34}{1e3 * floor['seconds']:10.2f} ms, of which a read {1e3 * floor['read']:.2f} ms")
+    if "error" in result:
+        print("  against float64: RMS {rms:.1e}, at most {max:.1e} grey levels".format(**result["error"]))
+    if "memory" in result:
+        print(
+            "  {work}: {added_mib:.0f} MiB added at the peak, factor {factor_mib:.0f} MiB".format(
+                work=result["work"], **result["memory"]
+            )
+        )
+    for remedy in result.get("missing", {}).values():
+        print(f"  {remedy}")
+    sys.stdout.flush()
+
+
+def write(path: Path, results: dict[str, Any]) -> None:
+    """Write JSON, complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".json", delete=False) as stream:
+        json.dump(results, stream, indent=1)
+        stream.write("\n")
+    os.replace(stream.name, path)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that everything runs, not how fast")
+    parser.add_argument("--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"some of {', '.join(SUITES)}")
+    parser.add_argument("--out", type=Path, default=Path("out/speed.json"), help="JSON file (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="of torch (default: %(default)s)")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="start no suite later (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    plan = QUICK if options.quick else Plan(device=options.device)
+    results = run(plan, options.only or list(SUITES), options.minutes)
+    write(options.out, results)
+    print(f"\n{results['seconds']:.0f} s; written to {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Peak memory and rounding error of one case, each measured apart from the timings.
+
+``python -m benchmarks.speed.probe WORK JSON`` is the fresh process: it does its work once and prints a line of JSON.
+"""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.speed.cases import Case
+from nlfilter_torch import NonlocalFilter
+from nlfilter_torch.nystrom import whitener
+from nlfilter_torch.sinkhorn import balance
+
+ALPHA = (3.0, 3.0, 4.0, 1.05)
+
+
+def peak_memory(case: Case, work: str) -> dict[str, float]:
+    """MiB that ``"operator"`` or a ``"training step"`` adds at its peak to a process that holds the image."""
+    command = [sys.executable, "-m", "benchmarks.speed.probe", work, json.dumps(case.to_json())]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"the process that measures the memory of {work}, {case.label()}, failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def training_step(case: Case, image: Tensor) -> None:
+    """Filter and differentiate in the image and in alpha."""
+    layer = NonlocalFilter(ALPHA, **case.options())
+    layer(image.requires_grad_()).square().mean().backward()
+
+
+def build(case: Case, image: Tensor) -> None:
+    """Make the operator, nothing else."""
+    with torch.no_grad():
+        case.operator(image)
+
+
+WORKS = {"operator": build, "training step": training_step}
+
+
+def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
+    """Difference of ``W y`` to the same filter in float64, with the same landmarks, in grey levels of 255.
+
+    Landmarks are chosen by a discrete search that rounding may turn another way, so those of the case itself, as
+    float64 numbers, serve both; what is left is rounding and the tolerance of the balancing.
+    """
+    with torch.no_grad():
+        operator = case.operator(image)
+        given = (operator @ image).double()
+        kernel = operator.kernel
+        points = kernel.landmarks.double()
+        exact_kernel = replace(
+            kernel,
+            patch_weights=kernel.patch_weights.double(),
+            photometric_bandwidth=torch.as_tensor(kernel.photometric_bandwidth).double(),
+            landmarks=points,
+            whitening=whitener(points),
+        )
+        factor, diagonal = exact_kernel.columns(image.double())
+        scaling = balance(factor, diagonal).scaling
+        exact = replace(operator, factor=factor, diagonal=diagonal, scaling=scaling, kernel=exact_kernel)
+        difference = 255 * (given - exact @ image.double())
+    return {"rms": difference.square().mean().sqrt().item(), "max": difference.abs().max().item()}
+
+
+def main() -> None:
+    """Measure one case in this process."""
+    work, given = sys.argv[1], json.loads(sys.argv[2])
+    case = Case(**given)
+    torch.set_num_threads(case.used_threads)
+    import kornia.color
+    import kornia.filters  # noqa: F401  imported on first use by the package: it is no part of the work
+
+    image = case.image()
+    forget_peak()
+    before = resident("VmRSS")
+    WORKS[work](case, image)
+    peak = resident("VmHWM")
+    print(json.dumps({"added_mib": peak - before, "process_mib": peak, "factor_mib": case.factor_bytes / MIB}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,304 @@
+"""The measurements, one function each: a plan in, records out.
+
+A record is a dictionary that JSON can hold: suite, label, case, timings by name, and where they apply the floor, the
+rounding error, the peak memory and notes about peers that were left out.
+"""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from benchmarks.speed import peers
+from benchmarks.speed.cases import Case
+from benchmarks.speed.floor import floor_calls, floor_summary
+from benchmarks.speed.probe import ALPHA, peak_memory, rounding_error, training_step
+from benchmarks.speed.timing import Call, Timing, discard, take_turns
+from nlfilter_torch import NonlocalFilter, PolynomialSliders, detail_layers, polynomial_filter, spectral_filter
+from nlfilter_torch.blocks import moment
+
+Record = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How large and how often.
+
+    Attributes:
+        side: of the main image.
+        landmarks: of the main operator.
+        sizes: height and width of the series over pixels.
+        doublings: of the series that takes turns, each twice the pixels of the one before.
+        counts: m of the series over landmarks, and the side of its image.
+        counts_side: its image.
+        growth: m of the series that takes turns.
+        patches: sizes.
+        crops: number, side and m of the batches.
+        dense_side: of the image that the dense filter can do.
+        seconds: that a group of calls takes turns, after the least number of rounds.
+        least: rounds.
+        processes: that measure what an import takes.
+    """
+
+    side: int = 1024
+    landmarks: int = 100
+    sizes: tuple[tuple[int, int], ...] = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2048, 2048))
+    doublings: tuple[tuple[int, int], ...] = ((512, 512), (512, 1024), (1024, 1024), (1024, 2048), (2048, 2048))
+    counts: tuple[int, ...] = (25, 50, 100, 200, 400)
+    counts_side: int = 512
+    growth: tuple[int, ...] = (50, 100, 200)
+    patches: tuple[int, ...] = (1, 3, 5, 7, 11)
+    crops: tuple[int, int, int] = (16, 128, 64)
+    dense_side: int = 256
+    seconds: float = 6.0
+    least: int = 3
+    processes: int = 7
+    threads: tuple[int, ...] = ()
+    device: str = "cpu"
+
+    def case(self, **changes: Any) -> Case:
+        """The main case, or one that differs from it."""
+        main = Case(height=self.side, width=self.side, landmarks=self.landmarks, device=self.device)
+        return replace(main, **changes)
+
+
+QUICK = Plan(
+    side=64,
+    landmarks=12,
+    sizes=((32, 32), (64, 64)),
+    doublings=((32, 32), (32, 64)),
+    counts=(8, 16),
+    counts_side=48,
+    growth=(8, 16),
+    patches=(1, 3),
+    crops=(4, 16, 8),
+    dense_side=32,
+    seconds=0.0,
+    least=1,
+    processes=1,
+)
+
+
+def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) -> Record:
+    """What one case showed."""
+    floor = {"floor": floor_summary(timings)} if any(": " in name for name in timings) else {}
+    return {
+        "suite": suite,
+        "label": case.label(),
+        "case": case.to_json(),
+        "timings": {name: timing.to_json() for name, timing in timings.items()},
+        **floor,
+        **facts,
+    }
+
+
+def measured(
+    suite: str, plan: Plan, case: Case, calls: Mapping[str, Call], *, error: bool = False, **facts: Any
+) -> Record:
+    """Let ``calls`` take turns with the floor of the case."""
+    timings = take_turns(
+        {**calls, **floor_calls(case)}, threads=case.used_threads, seconds=plan.seconds, least=plan.least
+    )
+    if error:
+        facts["error"] = rounding_error(case, case.image())
+    return record(suite, case, timings, **facts)
+
+
+def filter_calls(case: Case, *, backward: bool) -> dict[str, Call]:
+    """The operator, one filtering with it, and the backward pass of both."""
+    image = case.image()
+    operator = case.operator(image)
+    alpha = torch.tensor(ALPHA, device=case.device)
+    calls = {
+        "operator": discard(case.operator, image),
+        "apply": discard(polynomial_filter, operator, image, alpha),
+    }
+    return calls | ({"backward": backward_call(case)} if backward else {})
+
+
+def backward_call(case: Case) -> Call:
+    """The gradient of a filtered image in the image, as its own guide, and in alpha; the forward pass is done."""
+    image = case.image().requires_grad_()
+    layer = NonlocalFilter(ALPHA, **case.options()).to(case.device)
+    filtered = layer(image)
+    incoming = torch.randn(filtered.shape, generator=torch.Generator().manual_seed(0)).to(filtered)
+    return lambda: torch.autograd.grad(filtered, [image, *layer.parameters()], incoming, retain_graph=True)
+
+
+def main_case(plan: Plan) -> Iterator[Record]:
+    """The main operator, the sliders over it and the peers, all taking turns on one image."""
+    case = plan.case()
+    image = case.image()
+    operator = case.operator(image)
+    spectrum, layers = operator.spectrum(), detail_layers(operator, image)
+    sliders = PolynomialSliders(ALPHA).to(case.device)
+    scaling = operator.scaling.unsqueeze(1)
+    coefficients = moment(operator.factor, scaling * image.flatten(2))  # (B, M, 1)
+
+    def response_of_coefficients() -> torch.Tensor:
+        gain = spectrum.gain(lambda eigenvalues: eigenvalues**0.1)
+        return scaling * ((gain @ coefficients).mT.to(scaling) @ operator.factor)
+
+    calls: dict[str, Call] = {
+        "operator": discard(case.operator, image),
+        "spectrum": discard(operator.spectrum),
+        "detail_layers": discard(detail_layers, operator, image),
+        "new alpha, operator held": discard(polynomial_filter, operator, image, torch.tensor(ALPHA)),
+        "slider, layers held": discard(sliders.combine, layers),
+        "response, spectrum held": discard(spectral_filter, spectrum, image, lambda eigenvalues: eigenvalues**0.1),
+        "response, coefficients held": discard(response_of_coefficients),
+    }
+    others, missing = peers.prepare_all(peers.QUICK_PEERS, case)
+    yield measured(
+        "main",
+        plan,
+        case,
+        calls | others,
+        error=True,
+        missing=missing,
+        does={peer.name: peer.does for peer in peers.QUICK_PEERS},
+        steps=operator.balancing_steps,
+        residual=operator.residual.max().item(),
+    )
+
+
+def slow_peers(plan: Plan) -> Iterator[Record]:
+    """A peer that takes many times as long, beside the operator."""
+    case = plan.case()
+    others, missing = peers.prepare_all((peers.NLM_7_11,), case)
+    calls = {"operator": discard(case.operator, case.image())} | others
+    timings = take_turns(calls, threads=case.used_threads, seconds=0.0, least=min(2, plan.least))
+    yield record("slow", case, timings, missing=missing, does={peers.NLM_7_11.name: peers.NLM_7_11.does})
+
+
+def dense(plan: Plan) -> Iterator[Record]:
+    """The dense filter, N x N affinities, beside operator and product, on an image that it can do."""
+    case = plan.case(height=plan.dense_side, width=plan.dense_side)
+    image = case.image()
+    operator = case.operator(image)
+    others, missing = peers.prepare_all((peers.DENSE,), case)
+    calls = {"operator": discard(case.operator, image), "product W y": discard(operator.matmul, image)} | others
+    timings = take_turns(calls, threads=case.used_threads, seconds=plan.seconds, least=min(2, plan.least))
+    yield record("dense", case, timings, missing=missing, does={peers.DENSE.name: peers.DENSE.does})
+
+
+def sizes(plan: Plan) -> Iterator[Record]:
+    """Time, backward and error over the number of pixels."""
+    for height, width in plan.sizes:
+        case = plan.case(height=height, width=width)
+        yield measured("sizes", plan, case, filter_calls(case, backward=case.pixels <= 1 << 20), error=True)
+
+
+def landmarks(plan: Plan) -> Iterator[Record]:
+    """The same over the number of landmarks."""
+    for count in plan.counts:
+        case = plan.case(height=plan.counts_side, width=plan.counts_side, landmarks=count)
+        yield measured("landmarks", plan, case, filter_calls(case, backward=True), error=True)
+
+
+def patches(plan: Plan) -> Iterator[Record]:
+    """The same over the size of the patches."""
+    for size in plan.patches:
+        case = plan.case(height=plan.counts_side, width=plan.counts_side, patch_size=size)
+        yield measured("patches", plan, case, filter_calls(case, backward=True), error=True)
+
+
+def dtypes(plan: Plan) -> Iterator[Record]:
+    """The same over number types; half precision is computed in float32."""
+    for dtype in ("float32", "float64", "bfloat16"):
+        case = plan.case(height=plan.counts_side, width=plan.counts_side, dtype=dtype)
+        yield measured("dtypes", plan, case, filter_calls(case, backward=True), error=True)
+
+
+def threads(plan: Plan) -> Iterator[Record]:
+    """The main operator on one thread, and on all."""
+    counts = plan.threads or tuple(sorted({1, torch.get_num_threads()}))
+    for count in counts:
+        case = plan.case(threads=count)
+        yield measured("threads", plan, case, {"operator": discard(case.operator, case.image())})
+
+
+def growth(plan: Plan) -> Iterator[Record]:
+    """Operators of different sizes that take turns: how time grows with pixels and with landmarks."""
+    for suite, series in {
+        "growth in pixels": [plan.case(height=height, width=width) for height, width in plan.doublings],
+        "growth in landmarks": [plan.case(landmarks=count) for count in plan.growth],
+    }.items():
+        calls = {case.label(): discard(case.operator, case.image()) for case in series}
+        timings = take_turns(calls, threads=series[0].used_threads, seconds=plan.seconds, least=plan.least)
+        for case in series:
+            yield record(suite, case, {"operator": timings[case.label()]})
+
+
+def batches(plan: Plan) -> Iterator[Record]:
+    """A training step on a batch of crops, and on one image that has as many pixels."""
+    count, side, marks = plan.crops
+    across = round(count**0.5)
+    series = [
+        plan.case(batch=count, height=side, width=side, landmarks=marks),
+        plan.case(height=across * side, width=across * side, landmarks=marks),
+    ]
+    steps = {case.label(): _step(case) for case in series}
+    operators = {f"{case.label()}, operator": discard(case.operator, case.image()) for case in series}
+    timings = take_turns(steps | operators, threads=series[0].used_threads, seconds=plan.seconds, least=plan.least)
+    for case in series:
+        pair = {"training step": timings[case.label()], "operator": timings[f"{case.label()}, operator"]}
+        yield record("batches", case, pair)
+
+
+def _step(case: Case) -> Call:
+    image = case.image()
+    return lambda: training_step(case, image.detach())
+
+
+def memory(plan: Plan) -> Iterator[Record]:
+    """Peak memory of fresh processes."""
+    half = plan.counts_side
+    cases = [
+        ("operator", plan.case()),
+        ("operator", plan.case(landmarks=2 * plan.landmarks)),
+        ("operator", plan.case(height=2 * plan.side, width=2 * plan.side)),
+        ("training step", plan.case(height=half, width=half)),
+        ("training step", plan.case()),
+    ]
+    for work, case in cases:
+        yield record("memory", case, {}, work=work, memory=peak_memory(case, work))
+
+
+def imports(plan: Plan) -> Iterator[Record]:
+    """What ``import nlfilter_torch`` takes over ``import torch``, in fresh processes that take turns."""
+    seconds: dict[str, list[float]] = {"torch": [], "nlfilter_torch": []}
+    for _ in range(plan.processes + 1):
+        for name, times in seconds.items():
+            times.append(_import_seconds(name))
+    timings = {}
+    for name, times in seconds.items():
+        values = torch.tensor(times[1:], dtype=torch.float64)  # the first reads the files from the disk
+        low, middle, high = values.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
+        timings[f"import {name}"] = Timing(middle, high - low, len(values), 1)
+    yield record("imports", plan.case(), timings)
+
+
+def _import_seconds(name: str) -> float:
+    program = f"import time; start = time.perf_counter(); import {name}; print(time.perf_counter() - start)"
+    return float(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
+
+
+SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
+    "main": main_case,
+    "growth": growth,
+    "batches": batches,
+    "memory": memory,
+    "imports": imports,
+    "slow": slow_peers,
+    "dense": dense,
+    "sizes": sizes,
+    "landmarks": landmarks,
+    "patches": patches,
+    "dtypes": dtypes,
+    "threads": threads,
+}

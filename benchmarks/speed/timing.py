@@ -1,0 +1,94 @@
+"""Medians and quartiles of calls that take turns, so that a slow minute of the machine slows all of them alike."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch.utils.benchmark import Measurement, TaskSpec, set_torch_threads, timer
+
+Call = Callable[[], Any]
+
+SHORTEST = 0.01  # seconds; a call that takes less is repeated within one sample, or the clock would count, too
+LONG = 0.5  # seconds; a call that takes more is warm after one
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one call.
+
+    Attributes:
+        median: of the samples.
+        iqr: between the quartiles of the samples.
+        samples: how many there are.
+        calls: in each sample, which is their mean.
+    """
+
+    median: float
+    iqr: float
+    samples: int
+    calls: int
+
+    def to_json(self) -> dict[str, float]:
+        """As a plain dictionary."""
+        return asdict(self)
+
+
+def take_turns(
+    calls: Mapping[str, Call], *, threads: int, seconds: float, least: int = 3, most: int = 15
+) -> dict[str, Timing]:
+    """Time several calls round after round, one sample of each per round.
+
+    Args:
+        calls: what to time, by name.
+        threads: of torch.
+        seconds: start no further round after so many, once there have been ``least``.
+        least: rounds.
+        most: rounds.
+
+    Returns:
+        A timing by name. The first call of each, which pays for imports and memory, is not counted.
+    """
+    samples: dict[str, list[float]] = {name: [] for name in calls}
+    with set_torch_threads(threads):
+        repeats = {name: _calls_per_sample(call) for name, call in calls.items()}
+        start = time.perf_counter()
+        for done in range(1, most + 1):
+            for name, call in calls.items():
+                samples[name].append(_sample(call, repeats[name]))
+            if done >= least and time.perf_counter() - start >= seconds:
+                break
+    return {name: _summary(name, samples[name], repeats[name], threads) for name in calls}
+
+
+def _calls_per_sample(call: Call) -> int:
+    """Enough calls to take :data:`SHORTEST`; warms up on the way, twice unless once took long."""
+    seconds = _sample(call, 1)
+    if seconds < LONG:
+        seconds = _sample(call, 1)
+    return max(1, math.ceil(SHORTEST / max(seconds, 1e-9)))
+
+
+def _sample(call: Call, count: int) -> float:
+    """Seconds that ``count`` calls take; torch's clock waits for an accelerator to finish."""
+    begin = timer()
+    for _ in range(count):
+        call()
+    return timer() - begin
+
+
+def _summary(name: str, times: list[float], count: int, threads: int) -> Timing:
+    measured = Measurement(count, times, TaskSpec(stmt=name, setup="", num_threads=threads))
+    return Timing(measured.median, measured.iqr, len(times), count)
+
+
+def discard(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Call:
+    """A call without arguments, outside of autograd, whose result is dropped."""
+
+    def run() -> None:
+        with torch.no_grad():
+            call(*args, **kwargs)
+
+    return run
