@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c const
 PINS := pyproject.toml constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types bench-quick pictures clean
+.PHONY: demo test lint types bench-quick pictures notebooks clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
@@ -38,11 +38,17 @@ types: $(VENV)/.installed-test
 
 # Every benchmark once, on a size that takes seconds: that it runs, not how fast.
 bench-quick: $(VENV)/.installed-test
-	$(BIN)/python -m benchmarks --quick
+	$(BIN)/python -m benchmarks.memory --side 128 --repeats 1
+	$(BIN)/python -m benchmarks.tables --long-side 64
 
 # The pictures of the README.
 pictures: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.detail_pictures docs
+
+# Every notebook from the script it is paired with, run, with its pictures.
+notebooks: $(VENV)/.installed-test
+	$(BIN)/jupytext --to ipynb notebooks/*.py
+	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 clean:
 	rm -rf $(VENV) out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis

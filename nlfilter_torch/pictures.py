@@ -1,6 +1,7 @@
 """Labelled figures of images, layers, eigenvectors, masks and responses. Needs the ``cli`` extra (matplotlib).
 
 Every function returns a matplotlib figure that belongs to no window and no global state; :func:`save_figure` writes it.
+``side`` is the length in pixels of the longer side of each picture in it.
 """
 
 import math
@@ -20,37 +21,40 @@ from nlfilter_torch.response import polynomial_response
 from nlfilter_torch.spectrum import Spectrum
 
 DPI = 100
-PANEL = 5.2  # inches along the longer side of a picture: enough for every pixel of the photographs of scikit-image
-LABEL = 0.45  # inches above a picture for its title
+SIDE = 512  # pixels along the longer side of a picture
+LABEL = 35  # pixels above a picture for its title
+GAP = 15  # pixels between pictures
 FAR = 0.995  # colour scales end at this quantile, so that one odd pixel does not grey out the rest
 
 
-def show_images(images: Mapping[str, Tensor], *, columns: int | None = None) -> Figure:
+def show_images(images: Mapping[str, Tensor], *, columns: int | None = None, side: int = SIDE) -> Figure:
     """Pictures side by side, each (1, C, H, W) or (C, H, W) in [0, 1], under their titles."""
     pictures = {title: _picture(image) for title, image in images.items()}
-    figure, axes = _panels(next(iter(pictures.values())).shape, len(pictures), columns)
+    figure, axes = _panels(next(iter(pictures.values())).shape, len(pictures), columns, side)
     for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
         _draw(axis, title, picture)
     return figure
 
 
-def show_layers(layers: Tensor) -> Figure:
+def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
     """Detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the smooth rest as it is."""
     stack = layers[0].mean(1).numpy(force=True)  # (k+1, H, W)
-    figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))))
+    figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))), side=side)
     for number, (axis, layer) in enumerate(zip(axes, stack[:-1], strict=False), start=1):
         reach = _reach(layer)
-        name = {1: " (finest detail)", len(stack) - 1: " (coarsest detail)"}.get(number, "")
-        _draw(axis, f"Layer {number}{name}: black to white is ±{255 * reach:.0f} of 255 levels", layer, reach=reach)
-    _draw(axes[-1], f"Layer {len(stack)}: the smooth rest, as it is", stack[-1].clip(0, 1))
+        name = {1: " (finest)", len(stack) - 1: " (coarsest)"}.get(number, "")
+        _draw(axis, f"Layer {number}{name}, ±{255 * reach:.0f} levels of 255", layer, reach=reach)
+    _draw(axes[-1], f"Layer {len(stack)}: the smooth rest", stack[-1].clip(0, 1))
     return figure
 
 
-def show_eigenvectors(spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50)) -> Figure:
+def show_eigenvectors(
+    spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50), *, side: int = SIDE
+) -> Figure:
     """Eigenvectors by their number from 1, as in the paper's Fig. 1; numbers beyond the last are left out."""
     vectors = spectrum.eigenvectors[0].numpy(force=True)
     shown = [number for number in numbers if number <= len(vectors)]
-    figure, axes = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))))
+    figure, axes = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))), side=side)
     for axis, number in zip(axes, shown, strict=True):
         vector = vectors[number - 1]
         title = f"Eigenvector {number}, eigenvalue {float(spectrum.eigenvalues[0, number - 1]):.4f}"
@@ -58,7 +62,7 @@ def show_eigenvectors(spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 
     return figure
 
 
-def show_mask(image: Tensor, region: Tensor, mask: Tensor) -> Figure:
+def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) -> Figure:
     """A photograph with a region outlined, the mask that grew from it, and the photograph in colour where the mask is.
 
     Args:
@@ -68,13 +72,11 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor) -> Figure:
     """
     picture = _picture(image)
     weight = mask[0, 0].numpy(force=True)[..., None]
-    figure, axes = _panels(picture.shape, 3, columns=3)
+    figure, axes = _panels(picture.shape, 3, columns=3, side=side)
     _draw(axes[0], "The region that was selected", picture)
     axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["white"], linewidths=3)
     axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["black"], linewidths=1)
-    drawn = _draw(axes[1], "Its mask: 1 is like the region, 0 is not", weight[..., 0], colours="magma")
-    drawn.set_clim(0, 1)
-    figure.colorbar(drawn, ax=axes[1], fraction=0.04, pad=0.02)
+    _draw(axes[1], "How alike the rest is (white: alike)", weight[..., 0])
     faded = np.broadcast_to(0.6 + 0.25 * picture.mean(-1, keepdims=True), picture.shape)
     _draw(axes[2], "What an edit would reach", weight * picture + (1 - weight) * faded)
     return figure
@@ -129,24 +131,24 @@ def _reach(values: NDArray[Any]) -> float:
     return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
 
 
-def _panels(shape: tuple[int, ...], count: int, columns: int | None) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels for pictures of that height and width."""
-    height, width = shape[:2]
+def _panels(shape: tuple[int, ...], count: int, columns: int | None, side: int) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels for pictures of that height and width, placed to the pixel."""
     across = min(columns or count, count)
     down = math.ceil(count / across)
-    scale = PANEL / max(height, width)
-    size = (across * (width * scale + 0.15), down * (height * scale + LABEL))
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
-    grid = figure.subplots(down, across, squeeze=False).ravel().tolist()
-    for empty in grid[count:]:
-        empty.set_axis_off()
-    return figure, grid[:count]
+    height, width = (round(length * side / max(shape[:2])) for length in shape[:2])
+    full = (across * (width + GAP) + GAP, down * (height + LABEL) + GAP)  # width, height in pixels
+    figure = Figure(figsize=(full[0] / DPI, full[1] / DPI), dpi=DPI)
+    axes = []
+    for number in range(count):
+        row, column = divmod(number, across)
+        left, bottom = GAP + column * (width + GAP), full[1] - (row + 1) * (height + LABEL)
+        axes.append(figure.add_axes((left / full[0], bottom / full[1], width / full[0], height / full[1])))
+    return figure, axes
 
 
-def _draw(axis: Axes, title: str, picture: NDArray[Any], *, reach: float | None = None, colours: str = "gray") -> Any:
+def _draw(axis: Axes, title: str, picture: NDArray[Any], *, reach: float | None = None, colours: str = "gray") -> None:
     """One picture under its title, values spread over ±reach where given, over [0, 1] otherwise."""
     lowest, highest = (0.0, 1.0) if reach is None else (-reach, reach)
-    drawn = axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
-    axis.set_title(title, fontsize=11)
+    axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
+    axis.set_title(title, fontsize=min(11.0, max(6.0, axis.get_window_extent().width / 28)))  # fits 36 letters
     axis.set_axis_off()
-    return drawn
