@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c const
 PINS := pyproject.toml constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types bench-quick pictures notebooks clean
+.PHONY: demo test lint types bench bench-quick pictures notebooks clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
@@ -36,8 +36,15 @@ lint: $(VENV)/.installed-test
 types: $(VENV)/.installed-test
 	$(BIN)/mypy
 
+# All figures of speed, in ten minutes; on a machine that does nothing else meanwhile.
+bench: $(VENV)/.installed-test
+	$(BIN)/python -m benchmarks.speed --out out/speed.json
+	$(BIN)/python -m benchmarks.report out/speed.json
+
 # Every benchmark once, on a size that takes seconds: that it runs, not how fast.
 bench-quick: $(VENV)/.installed-test
+	$(BIN)/python -m benchmarks.speed --quick --out out/quick/speed.json
+	$(BIN)/python -m benchmarks.report out/quick/speed.json
 	$(BIN)/python -m benchmarks.memory --side 128 --repeats 1
 	$(BIN)/python -m benchmarks.tables --long-side 64
 

@@ -6,7 +6,6 @@ rounding error, the peak memory and notes about peers that were left out.
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -33,8 +32,8 @@ class Plan:
         landmarks: of the main operator.
         sizes: height and width of the series over pixels.
         doublings: of the series that takes turns, each twice the pixels of the one before.
-        counts: m of the series over landmarks, and the side of its image.
-        counts_side: its image.
+        counts: m of the series over landmarks.
+        counts_side: side of the image of that series, and of those over patches and number types.
         growth: m of the series that takes turns.
         patches: sizes.
         crops: number, side and m of the batches.
@@ -42,6 +41,9 @@ class Plan:
         seconds: that a group of calls takes turns, after the least number of rounds.
         least: rounds.
         processes: that measure what an import takes.
+        probes: cases whose memory is measured.
+        threads: counts; none is one, and all.
+        device: of torch.
     """
 
     side: int = 1024
@@ -57,6 +59,7 @@ class Plan:
     seconds: float = 6.0
     least: int = 3
     processes: int = 7
+    probes: int = 5
     threads: tuple[int, ...] = ()
     device: str = "cpu"
 
@@ -80,6 +83,7 @@ QUICK = Plan(
     seconds=0.0,
     least=1,
     processes=1,
+    probes=2,
 )
 
 
@@ -260,12 +264,12 @@ def memory(plan: Plan) -> Iterator[Record]:
     half = plan.counts_side
     cases = [
         ("operator", plan.case()),
-        ("operator", plan.case(landmarks=2 * plan.landmarks)),
-        ("operator", plan.case(height=2 * plan.side, width=2 * plan.side)),
         ("training step", plan.case(height=half, width=half)),
         ("training step", plan.case()),
+        ("operator", plan.case(landmarks=2 * plan.landmarks)),
+        ("operator", plan.case(height=2 * plan.side, width=2 * plan.side)),
     ]
-    for work, case in cases:
+    for work, case in cases[: plan.probes]:
         yield record("memory", case, {}, work=work, memory=peak_memory(case, work))
 
 

@@ -1,0 +1,306 @@
+"""Tables and plots from the JSON of :mod:`benchmarks.speed`: ``python -m benchmarks.report FILE.json``.
+
+Writes ``speed.md`` and two plots into a folder; with ``--readme`` it also puts the table of claims and peers between
+the two marker comments of that file, so that no figure there is ever typed.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from benchmarks.speed.claims import Claim, Results, claims
+from benchmarks.speed.floor import READS
+from benchmarks.speed.suites import Record
+
+BEGIN, END = "<!-- speed: written by python -m benchmarks.report -->", "<!-- end of speed -->"
+OURS, FLOOR, OTHERS = "#2a6f97", "#8a8a8a", "#c8553d"
+SERIES = {
+    "sizes": ("Over the size of the image", "image", lambda case: f"{case['height']}x{case['width']}"),
+    "landmarks": ("Over the number of landmarks", "m", lambda case: str(case["landmarks"])),
+    "patches": ("Over the size of the patches", "patch", lambda case: f"{case['patch_size']}x{case['patch_size']}"),
+    "dtypes": ("Over number types (half precision is computed in float32)", "type", lambda case: case["dtype"]),
+    "threads": ("Over threads", "threads", lambda case: str(case["threads"])),
+}
+HELD = ("slider, layers held", "response, coefficients held", "response, spectrum held", "new alpha, operator held")
+
+
+def seconds(value: float) -> str:
+    """Seconds or milliseconds with three significant digits."""
+    scaled, unit = (value, "s") if value >= 1 else (1e3 * value, "ms")
+    digits = 0 if scaled >= 100 else 1 if scaled >= 10 else 2
+    return f"{scaled:.{digits}f} {unit}"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A markdown table, its first column to the left and the others to the right."""
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *rows))
+
+
+def claims_table(given: Sequence[Claim]) -> str:
+    """Every claim with its limit, what was measured, and whether it holds."""
+    verdicts = {True: "holds", False: "**falls short**", None: "not measured"}
+
+    def figure(claim: Claim, value: float | None) -> str:
+        digits = 0 if claim.unit == "MiB" else 1 if value is not None and value >= 20 else 2
+        return "" if value is None else f"{value:.{digits}f} {claim.unit}".rstrip()
+
+    return table(
+        ["claim", "limit", "measured", "verdict"],
+        [
+            [
+                claim.text,
+                f"{'at most' if claim.at_most else 'at least'} {figure(claim, claim.limit)}",
+                figure(claim, claim.measured),
+                verdicts[claim.holds],
+            ]
+            for claim in given
+        ],
+    )
+
+
+def main_table(results: Results) -> str:
+    """Operator, sliders and peers on one image, quickest first."""
+    main = next(record for record in results["results"] if record["suite"] == "main")
+    floor = main["floor"]["seconds"]
+    entries = [(name, timing, main) for name, timing in main["timings"].items() if ": " not in name]
+    for record in _of(results, "slow"):
+        entries += [(name, timing, record) for name, timing in record["timings"].items() if name != "operator"]
+    does = {"operator": "**this filter, built from the image**", "spectrum": "eigenvalues and m x m core"}
+    rows = [
+        [
+            name,
+            seconds(timing["median"]),
+            seconds(timing["iqr"]),
+            f"{timing['median'] / floor:.3f}",
+            f"{timing['median'] / record['timings']['operator']['median']:.3f}",
+            record["does"].get(name, does.get(name, "")),
+        ]
+        for name, timing, record in sorted(entries, key=lambda entry: entry[1]["median"])
+    ]
+    return table(["what", "median", "IQR", "floors", "operators", "what it computes"], rows)
+
+
+def series_table(records: Sequence[Record], column: str, key: Any) -> str:
+    """One row per case: operator, one filtering, backward, error."""
+
+    def cell(record: Record, name: str) -> list[str]:
+        timing = record["timings"].get(name)
+        if timing is None:
+            return ["", ""]
+        return [seconds(timing["median"]), f"{timing['median'] / record['floor']['seconds']:.2f}"]
+
+    rows = [
+        [
+            key(record["case"]),
+            seconds(record["floor"]["seconds"]),
+            *cell(record, "operator"),
+            *cell(record, "apply"),
+            *cell(record, "backward"),
+            "{rms:.1e}".format(**record["error"]) if "error" in record else "",
+        ]
+        for record in records
+    ]
+    header = [column, "floor", "operator", "floors", "filter, k = 3", "floors", "backward", "floors", "error (RMS)"]
+    return table(header, rows)
+
+
+def other_tables(results: Results) -> list[str]:
+    """Sections for what is not a series with a floor."""
+    parts = []
+    for suite, title in (
+        ("growth in pixels", "Twice the pixels, taking turns"),
+        ("growth in landmarks", "More landmarks, taking turns"),
+        ("batches", "A batch of crops and one image of as many pixels, taking turns"),
+        ("dense", "Beside the dense filter, on an image that it can do"),
+        ("imports", "Imports, in fresh processes that take turns"),
+    ):
+        rows = [
+            [record["label"] if suite != "imports" else "", name, seconds(timing["median"]), seconds(timing["iqr"])]
+            for record in _of(results, suite)
+            for name, timing in record["timings"].items()
+        ]
+        if rows:
+            parts.append(f"## {title}\n\n" + table(["case", "what", "median", "IQR"], rows))
+    rows = [
+        [
+            record["label"],
+            record["work"],
+            f"{record['memory']['factor_mib']:.0f}",
+            f"{record['memory']['added_mib']:.0f}",
+            f"{record['memory']['added_mib'] / record['memory']['factor_mib']:.2f}",
+        ]
+        for record in _of(results, "memory")
+    ]
+    if rows:
+        header = ["case", "work", "factor, MiB", "added at the peak, MiB", "factors"]
+        parts.append("## Peak memory of fresh processes\n\n" + table(header, rows))
+    return parts
+
+
+def machine_lines(results: Results) -> str:
+    """What everything was measured on."""
+    machine = results["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    kind = " **A quick run on tiny sizes: its figures say nothing about speed.**" if results["quick"] else ""
+    return (
+        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads, {machine['instructions']}, "
+        f"{machine['memory_gib']} GiB; Python {machine['python']}, {versions}; commit {machine['commit']}, "
+        f"{machine['started']}; load average {machine['load_average']:.1f} before the run, which took "
+        f"{results['seconds'] / 60:.1f} minutes.{kind}"
+    )
+
+
+def explanation(results: Results) -> str:
+    """What the floor is, in words, with its parts."""
+    main = next(iter(_of(results, "main")), None)
+    if main is None:
+        return ""
+    floor = main["floor"]
+    return (
+        "Times are medians of calls that take turns on the same image. The floor is what cannot be avoided: the matrix "
+        f"products N x D x M and twice N x M x M ({seconds(floor['products'])} here) and {READS} reads of the factor "
+        f"({seconds(floor['read'])} each), every part measured beside the rest in several ways of which the quickest "
+        "counts; exponentials, features, landmarks and the memory for the factor are not in it. The other filters are "
+        "other operators; what they share with this one is the errand."
+    )
+
+
+def report(results: Results) -> str:
+    """The whole report in markdown."""
+    parts = ["# Speed", machine_lines(results), explanation(results), "## Claims", claims_table(claims(results))]
+    missing = [remedy for record in results["results"] for remedy in record.get("missing", {}).values()]
+    if any(_of(results, "main")):
+        parts += ["## On one image", *missing, main_table(results)]
+    for suite, (title, column, key) in SERIES.items():
+        records = list(_of(results, suite))
+        if records:
+            parts += [f"## {title}", series_table(records, column, key)]
+    parts += other_tables(results)
+    parts += [f"Left out for lack of time: {', '.join(results['skipped'])}."] if results["skipped"] else []
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def readme_part(results: Results) -> str:
+    """Claims and comparison, for the README."""
+    return "\n\n".join(
+        [claims_table(claims(results)), main_table(results), explanation(results), machine_lines(results)]
+    )
+
+
+def between_markers(text: str, part: str) -> str:
+    """``text`` with what stands between the markers replaced.
+
+    Raises:
+        ValueError: if it lacks one of them.
+    """
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the README must hold the lines {BEGIN!r} and {END!r}, got neither or one; add both")
+    return f"{before}{BEGIN}\n\n{part}\n\n{END}{after}"
+
+
+def plot_growth(results: Results) -> Figure:
+    """Time over pixels and over landmarks, with the floor; those of the two that were measured."""
+    panels = [
+        (suite, label, size, records)
+        for suite, label, size in (
+            ("sizes", "pixels", lambda case: case["height"] * case["width"]),
+            ("landmarks", "landmarks m", lambda case: case["landmarks"]),
+        )
+        if (records := _of(results, suite))
+    ]
+    figure = Figure(figsize=(5.5 * len(panels), 4.6), dpi=110, layout="constrained")
+    for axis, (suite, label, size, records) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True
+    ):
+        for name, colour, title in (
+            ("backward", OTHERS, "backward pass"),
+            ("operator", OURS, "operator"),
+            ("apply", "#61a5c2", "one filtering with it, k = 3"),
+        ):
+            timed = [record for record in records if name in record["timings"]]
+            across = [size(record["case"]) for record in timed]
+            axis.plot(across, [r["timings"][name]["median"] for r in timed], marker="o", color=colour, label=title)
+        floors = [record["floor"]["seconds"] for record in records]
+        across = [size(record["case"]) for record in records]
+        axis.plot(across, floors, linestyle="--", color=FLOOR, label="floor of the operator")
+        first = records[0]["case"]
+        rest = f"m = {first['landmarks']}" if suite == "sizes" else f"{first['height']}x{first['width']}"
+        axis.set(xscale="log", yscale="log", xlabel=label, ylabel="seconds, median")
+        axis.set_title(f"Time over {label} ({rest}, {first['threads']} threads)")
+        axis.grid(which="both", alpha=0.25)
+        axis.legend()
+    return figure
+
+
+def plot_peers(results: Results) -> Figure:
+    """Operator, sliders and peers on one image as bars."""
+    main = next(record for record in results["results"] if record["suite"] == "main")
+    bars = {name: t["median"] for name, t in main["timings"].items() if ": " not in name}
+    for record in _of(results, "slow"):
+        bars |= {name: t["median"] for name, t in record["timings"].items() if name != "operator"}
+    bars["floor of the operator"] = main["floor"]["seconds"]
+    names = sorted(bars, key=lambda name: bars[name], reverse=True)
+    ours = {"operator", "spectrum", "detail_layers", *HELD}
+    colours = [OURS if name in ours else FLOOR if name.startswith("floor") else OTHERS for name in names]
+    figure = Figure(figsize=(10, 0.42 * len(names) + 1.2), dpi=110, layout="constrained")
+    axis = figure.subplots()
+    drawn = axis.barh(names, [bars[name] for name in names], color=colours)
+    axis.bar_label(drawn, labels=[seconds(bars[name]) for name in names], padding=4)
+    axis.set(xscale="log", xlabel="seconds, median (logarithmic)")
+    axis.set_title(f"{main['label']}: this filter (blue), its floor (grey), other filters (red)")
+    axis.margins(x=0.12)
+    axis.grid(axis="x", alpha=0.25)
+    axis.set_axisbelow(True)
+    return figure
+
+
+def write(path: Path, content: str | Figure) -> None:
+    """Write a text or a plot, complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("wb", dir=path.parent, suffix=path.suffix, delete=False) as stream:
+        if isinstance(content, str):
+            stream.write(content.encode())
+        else:
+            content.savefig(stream, format="png")
+    os.chmod(stream.name, 0o644)
+    os.replace(stream.name, path)
+
+
+def _of(results: Results, suite: str) -> list[Record]:
+    return [record for record in results["results"] if record["suite"] == suite]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.report", description=__doc__)
+    parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.speed")
+    parser.add_argument("--folder", type=Path, help="where the report goes (default: beside FILE)")
+    parser.add_argument("--readme", type=Path, help="file whose table between the markers is replaced")
+    options = parser.parse_args(arguments)
+    results = json.loads(options.file.read_text())
+    folder = options.folder or options.file.parent
+    text = report(results)
+    write(folder / "speed.md", text)
+    if _of(results, "sizes") or _of(results, "landmarks"):
+        write(folder / "speed_growth.png", plot_growth(results))
+    if _of(results, "main"):
+        write(folder / "speed_peers.png", plot_peers(results))
+    if options.readme:
+        if results["quick"] or not _of(results, "main"):
+            sys.exit("the README takes figures of a full run only; run python -m benchmarks.speed without --quick")
+        write(options.readme, between_markers(options.readme.read_text(), readme_part(results)))
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
