@@ -1,0 +1,111 @@
+"""Guide to operator, as a layer."""
+
+from collections.abc import Collection
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from nlfilter_torch.bandwidth import estimate_bandwidth
+from nlfilter_torch.checks import check_choice
+from nlfilter_torch.features import GuideChannels, unit_window
+from nlfilter_torch.landmarks import Sampling
+from nlfilter_torch.modules.learning import UnitWindow, check_learn, current, shown, start_or_positive
+from nlfilter_torch.nystrom import Completion
+from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
+
+LEARNABLE = ("photometric_bandwidth", "spatial_bandwidth", "patch_weights")
+
+
+class NonlocalAffinity(nn.Module):
+    """Guide to operator, a layer around :func:`nonlocal_operator`, whose options it takes.
+
+    Args:
+        learn: what trains besides the network that makes the guide: any of ``"photometric_bandwidth"`` (of which
+            ``"auto"`` is then the start, image by image, and one factor trains), ``"spatial_bandwidth"`` (which must
+            have a number to start from) and ``"patch_weights"``. All stay positive.
+        **options: of :func:`nonlocal_operator`. A ``generator`` gives every call other landmarks; do not combine it
+            with gradient checkpointing, which runs the layer twice and expects the same.
+
+    Raises:
+        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive.
+    """
+
+    def __init__(
+        self,
+        *,
+        patch_size: int = 5,
+        photometric_bandwidth: float | Literal["auto"] = "auto",
+        spatial_bandwidth: float | None = None,
+        num_landmarks: int = 100,
+        landmarks: Sampling = "kmeans",
+        completion: Completion = "diagonal",
+        guide_channels: GuideChannels = "luminance",
+        patch_weights: Tensor | None = None,
+        tolerance: float | None = None,
+        generator: torch.Generator | None = None,
+        learn: Collection[str] = (),
+    ) -> None:
+        super().__init__()
+        names = check_learn(learn, LEARNABLE)
+        self.patch_size = patch_size
+        self.num_landmarks = num_landmarks
+        self.landmarks: Sampling = landmarks
+        self.completion: Completion = completion
+        self.guide_channels: GuideChannels = guide_channels
+        self.tolerance = tolerance
+        self.generator = generator
+
+        self.automatic = isinstance(photometric_bandwidth, str)
+        if isinstance(photometric_bandwidth, str):
+            check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
+            photometric_bandwidth = 1.0  # a factor from here on
+        self.photometric_bandwidth = start_or_positive(photometric_bandwidth, "photometric_bandwidth", names)
+        if spatial_bandwidth is None and "spatial_bandwidth" in names:
+            raise ValueError(
+                "spatial_bandwidth must be a number of pixels to learn from, got None; "
+                "a third of the image's height is a start"
+            )
+        self.spatial_bandwidth = (
+            None if spatial_bandwidth is None else start_or_positive(spatial_bandwidth, "spatial_bandwidth", names)
+        )
+        # Non-persistent: like the other options, it belongs to the constructor, not to what was learned.
+        self.patch_weights: Tensor | UnitWindow | None
+        if "patch_weights" in names:
+            self.patch_weights = UnitWindow(unit_window(patch_size, patch_weights))
+        else:
+            given = None if patch_weights is None else unit_window(patch_size, patch_weights)
+            self.register_buffer("patch_weights", given, persistent=False)
+
+    def forward(self, guide: Tensor) -> NonlocalOperator:
+        """Operator of a guide (B, C, H, W)."""
+        photometric: float | Tensor | Literal["auto"] = current(self.photometric_bandwidth)
+        if self.automatic and isinstance(photometric, Tensor):
+            photometric = photometric * estimate_bandwidth(guide, guide_channels=self.guide_channels)
+        elif self.automatic:
+            photometric = "auto"
+        weights = self.patch_weights
+        return nonlocal_operator(
+            guide,
+            patch_size=self.patch_size,
+            photometric_bandwidth=photometric,
+            spatial_bandwidth=current(self.spatial_bandwidth),
+            num_landmarks=self.num_landmarks,
+            landmarks=self.landmarks,
+            completion=self.completion,
+            guide_channels=self.guide_channels,
+            patch_weights=weights() if isinstance(weights, UnitWindow) else weights,
+            tolerance=self.tolerance,
+            generator=self.generator,
+        )
+
+    def extra_repr(self) -> str:
+        """The options that decide what the operator does."""
+        photometric = shown(self.photometric_bandwidth)
+        if self.automatic:
+            photometric = "auto" if photometric == 1.0 else f"{photometric} * auto"
+        return (
+            f"patch_size={self.patch_size}, photometric_bandwidth={photometric}, "
+            f"spatial_bandwidth={shown(self.spatial_bandwidth)}, num_landmarks={self.num_landmarks}, "
+            f"landmarks={self.landmarks!r}, completion={self.completion!r}, guide_channels={self.guide_channels!r}"
+        )

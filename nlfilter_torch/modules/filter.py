@@ -1,0 +1,76 @@
+"""Image to edited image, as a layer."""
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nlfilter_torch.checks import check_image, check_same_size
+from nlfilter_torch.modules import affinity, sliders
+from nlfilter_torch.modules.affinity import NonlocalAffinity
+from nlfilter_torch.modules.learning import check_learn
+from nlfilter_torch.modules.sliders import PolynomialSliders
+
+
+class NonlocalFilter(nn.Module):
+    """Image to edited image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` in one layer.
+
+    Paper: eq. (12), (13). The operator is built anew for every call, from the guide as it is; to move sliders over one
+    image, hold its operator or its layers and call the parts.
+
+    Args:
+        alpha: start of the sliders, fine to coarse; ones leave the image as it is.
+        residual: weight of what the eigenvectors do not explain; None is alpha_1.
+        learn: what trains: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``, ``"spatial_bandwidth"`` and
+            ``"patch_weights"``; see the two layers. Gradients reach image and guide in any case.
+        **options: of :func:`nonlocal_operator`.
+
+    Raises:
+        TypeError, ValueError: if ``learn`` has another name, or an option is out of its range.
+
+    Example:
+        >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), photometric_bandwidth=0.1, num_landmarks=30)
+        >>> layer(torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))).shape
+        torch.Size([2, 3, 32, 32])
+        >>> list(layer.state_dict())
+        ['sliders.alpha']
+        >>> layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.1)
+        >>> list(layer.state_dict())
+        ['affinity.photometric_bandwidth.logarithm', 'sliders.alpha']
+    """
+
+    def __init__(
+        self,
+        alpha: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
+        *,
+        residual: float | None = None,
+        learn: Collection[str] = ("alpha",),
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        names = check_learn(learn, sliders.LEARNABLE + affinity.LEARNABLE)
+        self.affinity = NonlocalAffinity(learn=names.intersection(affinity.LEARNABLE), **options)
+        self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(sliders.LEARNABLE))
+
+    def forward(
+        self, image: Tensor, guide: Tensor | None = None, mask: Tensor | None = None, alpha: Tensor | None = None
+    ) -> Tensor:
+        """Filter an image.
+
+        Args:
+            image: (B, C, H, W).
+            guide: (B, C', H, W) from which the operator is built; None is the image itself.
+            mask: (B, 1, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
+            alpha: sliders of this call in place of the layer's own: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
+                pixel, such as another network finds them.
+
+        Returns:
+            (B, C, H, W) in the image's dtype.
+        """
+        filtered: Tensor = self.sliders(self.affinity(image if guide is None else guide), image, alpha)
+        if mask is None:
+            return filtered
+        check_image(mask, "mask", batch=image.shape[0])
+        check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
+        return torch.lerp(image, filtered, mask.to(image))

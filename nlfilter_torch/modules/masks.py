@@ -1,0 +1,56 @@
+"""Spectrum and regions to masks, as layers."""
+
+from collections.abc import Collection
+
+from torch import Tensor, nn
+
+from nlfilter_torch.masks import diffusion_mask, segment_mask
+from nlfilter_torch.modules.learning import check_learn, current, shown, start_or_positive
+from nlfilter_torch.spectrum import Spectrum
+
+
+class DiffusionMask(nn.Module):
+    """Spectrum and region to mask, a layer around :func:`diffusion_mask`.
+
+    Args:
+        time: diffusion time t > 0.
+        width: squared diffusion distance at which the mask has fallen to 1/e.
+        learn: what trains, any of ``"time"`` and ``"width"``; both stay positive.
+
+    Raises:
+        TypeError, ValueError: if ``time`` or ``width`` is not positive, or ``learn`` has another name.
+    """
+
+    def __init__(self, *, time: float = 1.0, width: float = 4.0, learn: Collection[str] = ()) -> None:
+        super().__init__()
+        names = check_learn(learn, ("time", "width"))
+        self.time = start_or_positive(time, "time", names)
+        self.width = start_or_positive(width, "width", names)
+
+    def forward(self, spectrum: Spectrum, region: Tensor, negative: Tensor | None = None) -> Tensor:
+        """Mask (B, K, H, W) in (0, 1] of regions (B, K, H, W), away from the regions ``negative``."""
+        return diffusion_mask(spectrum, region, time=current(self.time), width=current(self.width), negative=negative)
+
+    def extra_repr(self) -> str:
+        """Time and width."""
+        return f"time={shown(self.time)}, width={shown(self.width)}"
+
+
+class SegmentMask(nn.Module):
+    """Spectrum and regions to a partition, a layer around :func:`segment_mask`.
+
+    Args:
+        time: diffusion time t > 0.
+    """
+
+    def __init__(self, *, time: float = 1.0) -> None:
+        super().__init__()
+        self.time = time
+
+    def forward(self, spectrum: Spectrum, regions: Tensor) -> Tensor:
+        """Partition (B, K, H, W) of zeros and ones from regions (B, K, H, W)."""
+        return segment_mask(spectrum, regions, time=self.time)
+
+    def extra_repr(self) -> str:
+        """Time."""
+        return f"time={self.time}"

@@ -1,0 +1,75 @@
+"""Operator and image to filtered image, as a layer."""
+
+from collections.abc import Collection, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from nlfilter_torch.checks import check_alpha
+from nlfilter_torch.filtering import polynomial_filter, weigh_layers
+from nlfilter_torch.modules.learning import check_learn
+from nlfilter_torch.operator import NonlocalOperator
+
+LEARNABLE = ("alpha", "residual")
+
+
+class PolynomialSliders(nn.Module):
+    """Operator and image to filtered image, a layer around :func:`polynomial_filter`.
+
+    Args:
+        alpha: start of the sliders, fine to coarse; ones leave the image as it is. Paper: eq. (12).
+        residual: weight of what the eigenvectors do not explain; None is alpha_1, and where it is to be learned the
+            start is the start of alpha_1.
+        learn: what trains, any of ``"alpha"`` and ``"residual"``; the others are buffers. Give none of them where a
+            network finds ``alpha`` for every call.
+
+    Attributes:
+        alpha: (k+1,), parameter or buffer.
+        residual: (), parameter or buffer, or None.
+
+    Raises:
+        TypeError, ValueError: if ``alpha`` has fewer than two finite entries, or ``learn`` another name.
+    """
+
+    alpha: Tensor
+    residual: Tensor | None
+
+    def __init__(
+        self,
+        alpha: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
+        *,
+        residual: float | None = None,
+        learn: Collection[str] = ("alpha",),
+    ) -> None:
+        super().__init__()
+        names = check_learn(learn, LEARNABLE)
+        start = torch.tensor([float(a) for a in alpha])
+        check_alpha(start)
+        if residual is None and "residual" in names:
+            residual = float(start[0])
+        weight = None if residual is None else torch.tensor(float(residual))
+        for name, value in (("alpha", start), ("residual", weight)):
+            if value is not None and name in names:
+                self.register_parameter(name, nn.Parameter(value))
+            else:
+                self.register_buffer(name, value)
+
+    def forward(self, operator: NonlocalOperator, image: Tensor, alpha: Tensor | None = None) -> Tensor:
+        """Filtered image (B, C, H, W) in the image's dtype.
+
+        Args:
+            operator: W.
+            image: (B, C, H, W).
+            alpha: sliders of this call in place of the layer's own: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
+                pixel, of any order k.
+        """
+        return polynomial_filter(operator, image, self.alpha if alpha is None else alpha, residual=self.residual)
+
+    def combine(self, layers: Tensor, alpha: Tensor | None = None) -> Tensor:
+        """The same, with ``residual`` alpha_1, from layers (B, k+1, C, H, W) of :func:`detail_layers` that are held."""
+        return weigh_layers(layers, self.alpha if alpha is None else alpha)
+
+    def extra_repr(self) -> str:
+        """The sliders as they are now."""
+        residual = None if self.residual is None else round(self.residual.item(), 4)
+        return f"alpha={[round(a, 4) for a in self.alpha.tolist()]}, residual={residual}"
