@@ -6,21 +6,18 @@ the two marker comments of that file, so that no figure there is ever typed.
 
 import argparse
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
-from benchmarks.speed.claims import Claim, Results, claims
+from benchmarks.speed.claims import Claim, claims
 from benchmarks.speed.floor import READS
-from benchmarks.speed.suites import Record
+from benchmarks.speed.output import write
+from benchmarks.speed.plan import Record, Results, records_of
+from benchmarks.speed.plots import plot_growth, plot_peers, png, seconds
 
 BEGIN, END = "<!-- speed: written by python -m benchmarks.report -->", "<!-- end of speed -->"
-OURS, FLOOR, OTHERS = "#2a6f97", "#8a8a8a", "#c8553d"
 SERIES = {
     "sizes": ("Over the size of the image", "image", lambda case: f"{case['height']}x{case['width']}"),
     "landmarks": ("Over the number of landmarks", "m", lambda case: str(case["landmarks"])),
@@ -28,14 +25,6 @@ SERIES = {
     "dtypes": ("Over number types (half precision is computed in float32)", "type", lambda case: case["dtype"]),
     "threads": ("Over threads", "threads", lambda case: str(case["threads"])),
 }
-HELD = ("slider, layers held", "response, coefficients held", "response, spectrum held", "new alpha, operator held")
-
-
-def seconds(value: float) -> str:
-    """Seconds or milliseconds with three significant digits."""
-    scaled, unit = (value, "s") if value >= 1 else (1e3 * value, "ms")
-    digits = 0 if scaled >= 100 else 1 if scaled >= 10 else 2
-    return f"{scaled:.{digits}f} {unit}"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -68,10 +57,10 @@ def claims_table(given: Sequence[Claim]) -> str:
 
 def main_table(results: Results) -> str:
     """Operator, sliders and peers on one image, quickest first."""
-    main = next(record for record in results["results"] if record["suite"] == "main")
+    main = records_of(results, "main")[0]
     floor = main["floor"]["seconds"]
     entries = [(name, timing, main) for name, timing in main["timings"].items() if ": " not in name]
-    for record in _of(results, "slow"):
+    for record in records_of(results, "slow"):
         entries += [(name, timing, record) for name, timing in record["timings"].items() if name != "operator"]
     does = {"operator": "**this filter, built from the image**", "spectrum": "eigenvalues and m x m core"}
     rows = [
@@ -120,11 +109,12 @@ def other_tables(results: Results) -> list[str]:
         ("growth in landmarks", "More landmarks, taking turns"),
         ("batches", "A batch of crops and one image of as many pixels, taking turns"),
         ("dense", "Beside the dense filter, on an image that it can do"),
+        ("autograd", "Beside the same filter in plain autograd"),
         ("imports", "Imports, in fresh processes that take turns"),
     ):
         rows = [
             [record["label"] if suite != "imports" else "", name, seconds(timing["median"]), seconds(timing["iqr"])]
-            for record in _of(results, suite)
+            for record in records_of(results, suite)
             for name, timing in record["timings"].items()
         ]
         if rows:
@@ -137,7 +127,7 @@ def other_tables(results: Results) -> list[str]:
             f"{record['memory']['added_mib']:.0f}",
             f"{record['memory']['added_mib'] / record['memory']['factor_mib']:.2f}",
         ]
-        for record in _of(results, "memory")
+        for record in records_of(results, "memory")
     ]
     if rows:
         header = ["case", "work", "factor, MiB", "added at the peak, MiB", "factors"]
@@ -160,7 +150,7 @@ def machine_lines(results: Results) -> str:
 
 def explanation(results: Results) -> str:
     """What the floor is, in words, with its parts."""
-    main = next(iter(_of(results, "main")), None)
+    main = next(iter(records_of(results, "main")), None)
     if main is None:
         return ""
     floor = main["floor"]
@@ -177,10 +167,10 @@ def report(results: Results) -> str:
     """The whole report in markdown."""
     parts = ["# Speed", machine_lines(results), explanation(results), "## Claims", claims_table(claims(results))]
     missing = [remedy for record in results["results"] for remedy in record.get("missing", {}).values()]
-    if any(_of(results, "main")):
+    if any(records_of(results, "main")):
         parts += ["## On one image", *missing, main_table(results)]
     for suite, (title, column, key) in SERIES.items():
-        records = list(_of(results, suite))
+        records = list(records_of(results, suite))
         if records:
             parts += [f"## {title}", series_table(records, column, key)]
     parts += other_tables(results)
@@ -208,78 +198,6 @@ def between_markers(text: str, part: str) -> str:
     return f"{before}{BEGIN}\n\n{part}\n\n{END}{after}"
 
 
-def plot_growth(results: Results) -> Figure:
-    """Time over pixels and over landmarks, with the floor; those of the two that were measured."""
-    panels = [
-        (suite, label, size, records)
-        for suite, label, size in (
-            ("sizes", "pixels", lambda case: case["height"] * case["width"]),
-            ("landmarks", "landmarks m", lambda case: case["landmarks"]),
-        )
-        if (records := _of(results, suite))
-    ]
-    figure = Figure(figsize=(5.5 * len(panels), 4.6), dpi=110, layout="constrained")
-    for axis, (suite, label, size, records) in zip(
-        figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True
-    ):
-        for name, colour, title in (
-            ("backward", OTHERS, "backward pass"),
-            ("operator", OURS, "operator"),
-            ("apply", "#61a5c2", "one filtering with it, k = 3"),
-        ):
-            timed = [record for record in records if name in record["timings"]]
-            across = [size(record["case"]) for record in timed]
-            axis.plot(across, [r["timings"][name]["median"] for r in timed], marker="o", color=colour, label=title)
-        floors = [record["floor"]["seconds"] for record in records]
-        across = [size(record["case"]) for record in records]
-        axis.plot(across, floors, linestyle="--", color=FLOOR, label="floor of the operator")
-        first = records[0]["case"]
-        rest = f"m = {first['landmarks']}" if suite == "sizes" else f"{first['height']}x{first['width']}"
-        axis.set(xscale="log", yscale="log", xlabel=label, ylabel="seconds, median")
-        axis.set_title(f"Time over {label} ({rest}, {first['threads']} threads)")
-        axis.grid(which="both", alpha=0.25)
-        axis.legend()
-    return figure
-
-
-def plot_peers(results: Results) -> Figure:
-    """Operator, sliders and peers on one image as bars."""
-    main = next(record for record in results["results"] if record["suite"] == "main")
-    bars = {name: t["median"] for name, t in main["timings"].items() if ": " not in name}
-    for record in _of(results, "slow"):
-        bars |= {name: t["median"] for name, t in record["timings"].items() if name != "operator"}
-    bars["floor of the operator"] = main["floor"]["seconds"]
-    names = sorted(bars, key=lambda name: bars[name], reverse=True)
-    ours = {"operator", "spectrum", "detail_layers", *HELD}
-    colours = [OURS if name in ours else FLOOR if name.startswith("floor") else OTHERS for name in names]
-    figure = Figure(figsize=(10, 0.42 * len(names) + 1.2), dpi=110, layout="constrained")
-    axis = figure.subplots()
-    drawn = axis.barh(names, [bars[name] for name in names], color=colours)
-    axis.bar_label(drawn, labels=[seconds(bars[name]) for name in names], padding=4)
-    axis.set(xscale="log", xlabel="seconds, median (logarithmic)")
-    axis.set_title(f"{main['label']}: this filter (blue), its floor (grey), other filters (red)")
-    axis.margins(x=0.12)
-    axis.grid(axis="x", alpha=0.25)
-    axis.set_axisbelow(True)
-    return figure
-
-
-def write(path: Path, content: str | Figure) -> None:
-    """Write a text or a plot, complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("wb", dir=path.parent, suffix=path.suffix, delete=False) as stream:
-        if isinstance(content, str):
-            stream.write(content.encode())
-        else:
-            content.savefig(stream, format="png")
-    os.chmod(stream.name, 0o644)
-    os.replace(stream.name, path)
-
-
-def _of(results: Results, suite: str) -> list[Record]:
-    return [record for record in results["results"] if record["suite"] == suite]
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.report", description=__doc__)
@@ -290,15 +208,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = json.loads(options.file.read_text())
     folder = options.folder or options.file.parent
     text = report(results)
-    write(folder / "speed.md", text)
-    if _of(results, "sizes") or _of(results, "landmarks"):
-        write(folder / "speed_growth.png", plot_growth(results))
-    if _of(results, "main"):
-        write(folder / "speed_peers.png", plot_peers(results))
+    write(folder / "speed.md", text.encode())
+    if records_of(results, "sizes") or records_of(results, "landmarks"):
+        write(folder / "speed_growth.png", png(plot_growth(results)))
+    if records_of(results, "main"):
+        write(folder / "speed_peers.png", png(plot_peers(results)))
     if options.readme:
-        if results["quick"] or not _of(results, "main"):
+        if results["quick"] or not records_of(results, "main"):
             sys.exit("the README takes figures of a full run only; run python -m benchmarks.speed without --quick")
-        write(options.readme, between_markers(options.readme.read_text(), readme_part(results)))
+        write(options.readme, between_markers(options.readme.read_text(), readme_part(results)).encode())
     print(text)
 
 

@@ -12,10 +12,10 @@ from benchmarks.speed.__main__ import main as measure
 from benchmarks.speed.cases import Case
 from benchmarks.speed.claims import claims
 from benchmarks.speed.floor import READS, floor_calls, floor_summary
-from benchmarks.speed.suites import QUICK
+from benchmarks.speed.plan import QUICK
 from benchmarks.speed.timing import Timing, take_turns
 
-SUITES = ("main", "growth", "batches", "slow", "dense", "landmarks", "dtypes")
+SUITES = ("main", "growth", "batches", "slow", "dense", "autograd", "landmarks", "dtypes")
 
 
 @pytest.fixture(scope="module")

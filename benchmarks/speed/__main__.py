@@ -4,14 +4,15 @@ import argparse
 import json
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.speed.machine import describe
-from benchmarks.speed.suites import QUICK, SUITES, Plan, Record
+from benchmarks.speed.output import write
+from benchmarks.speed.plan import QUICK, Plan, Record
+from benchmarks.speed.suites import SUITES
 
 MINUTES = 9.0  # no suite starts later than this
 
@@ -63,15 +64,6 @@ def show(result: Record) -> None:
     sys.stdout.flush()
 
 
-def write(path: Path, results: dict[str, Any]) -> None:
-    """Write JSON, complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".json", delete=False) as stream:
-        json.dump(results, stream, indent=1)
-        stream.write("\n")
-    os.replace(stream.name, path)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
@@ -83,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     plan = QUICK if options.quick else Plan(device=options.device)
     results = run(plan, options.only or list(SUITES), options.minutes)
-    write(options.out, results)
+    write(options.out, (json.dumps(results, indent=1) + "\n").encode())
     print(f"\n{results['seconds']:.0f} s; written to {options.out}")
 
 

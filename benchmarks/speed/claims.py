@@ -1,15 +1,13 @@
 """What the project promises of its speed, each with its limit and what a run measured."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 from benchmarks.memory import MIB
-from benchmarks.speed.suites import Plan, Record
+from benchmarks.speed.plan import Plan, Record, Results, records_of
 
-Results = dict[str, Any]
 MAIN = Plan()
 
 
@@ -41,19 +39,21 @@ class Claim:
 
 def claims(results: Results) -> list[Claim]:
     """All promises, judged by the medians of one run; a quick run keeps and breaks none."""
-    records = [] if results["quick"] else results["results"]
-    main = next(_records(records, "main"), None)
+    measured = {"results": [] if results["quick"] else results["results"]}
+    main = _first(measured, "main")
     operator = _median(main, "operator")
     floor, read = (main["floor"][name] if main else None for name in ("seconds", "read"))
     slider = _median(main, "slider, layers held")
     side = f"{MAIN.side}x{MAIN.side}, m = {MAIN.landmarks}"
-    memory = next(
-        (r for r in _records(records, "memory") if r["work"] == "operator" and r["label"] == MAIN.case().label()), None
-    )
+    shape = {"height": MAIN.side, "width": MAIN.side, "landmarks": MAIN.landmarks, "batch": 1}
+    probes = [
+        r for r in records_of(measured, "memory") if r["work"] == "operator" and r["case"].items() >= shape.items()
+    ]
+    memory = probes[0]["memory"]["added_mib"] if probes else None
     allowed = 1.3 * MAIN.case().factor_bytes / MIB + 200e6 / MIB
-    pixels = [_median(record, "operator") for record in _records(records, "growth in pixels")]
-    steps = [_median(record, "training step") for record in _records(records, "batches")]
-    imported = next(_records(records, "imports"), None)
+    pixels = [_median(record, "operator") for record in records_of(measured, "growth in pixels")]
+    steps = [_median(record, "training step") for record in records_of(measured, "batches")]
+    imported = _first(measured, "imports")
     return [
         Claim(f"operator ({side}), as a multiple of the floor", True, 1.6, _ratio(operator, floor)),
         Claim(
@@ -68,14 +68,14 @@ def claims(results: Results) -> list[Claim]:
             2.0,
             _ratio(_median(main, "response, coefficients held"), read),
         ),
-        Claim("peak memory of the operator", True, allowed, memory and memory["memory"]["added_mib"], "MiB"),
+        Claim("peak memory of the operator", True, allowed, memory, "MiB"),
         Claim(
             "time of twice the pixels, worst of 0.25 to 4 MP",
             True,
             2.2,
             max((after / before for before, after in pairwise(pixels)), default=None),
         ),
-        Claim(f"exponent of m in the time, m = {MAIN.growth[0]} to {MAIN.growth[-1]}", True, 1.6, _exponent(records)),
+        Claim(f"exponent of m in the time, m = {MAIN.growth[0]} to {MAIN.growth[-1]}", True, 1.6, _exponent(measured)),
         Claim(
             "training step on {0} crops of {1}x{1}, m = {2} / on one image of as many pixels".format(*MAIN.crops),
             True,
@@ -86,14 +86,14 @@ def claims(results: Results) -> list[Claim]:
             "import of the package over that of torch",
             True,
             0.3,
-            imported and _median(imported, "import nlfilter_torch") - _median(imported, "import torch"),
+            _median(imported, "import nlfilter_torch") - _median(imported, "import torch") if imported else None,
             "s",
         ),
     ]
 
 
-def _records(records: list[Record], suite: str) -> Iterator[Record]:
-    return (record for record in records if record["suite"] == suite)
+def _first(results: Results, suite: str) -> Record | None:
+    return next(iter(records_of(results, suite)), None)
 
 
 def _median(record: Record | None, name: str) -> Any:
@@ -105,9 +105,9 @@ def _ratio(above: float | None, below: float | None) -> float | None:
     return above / below if above is not None and below is not None else None
 
 
-def _exponent(records: list[Record]) -> float | None:
+def _exponent(results: Results) -> float | None:
     """Slope between the first and the last of the series over landmarks, on logarithmic axes."""
-    series = list(_records(records, "growth in landmarks"))
+    series = records_of(results, "growth in landmarks")
     if len(series) < 2:
         return None
     first, last = series[0], series[-1]

@@ -1,115 +1,25 @@
-"""The measurements, one function each: a plan in, records out.
-
-A record is a dictionary that JSON can hold: suite, label, case, timings by name, and where they apply the floor, the
-rounding error, the peak memory and notes about peers that were left out.
-"""
+"""The measurements, one function each: a plan in, records out."""
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import torch
 
 from benchmarks.speed import peers
 from benchmarks.speed.cases import Case
-from benchmarks.speed.floor import floor_calls, floor_summary
-from benchmarks.speed.probe import ALPHA, peak_memory, rounding_error, training_step
+from benchmarks.speed.plan import Plan, Record, measured, record
+from benchmarks.speed.probe import ALPHA, peak_memory, training_step
 from benchmarks.speed.timing import Call, Timing, discard, take_turns
-from nlfilter_torch import NonlocalFilter, PolynomialSliders, detail_layers, polynomial_filter, spectral_filter
-from nlfilter_torch.blocks import moment
-
-Record = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How large and how often.
-
-    Attributes:
-        side: of the main image.
-        landmarks: of the main operator.
-        sizes: height and width of the series over pixels.
-        doublings: of the series that takes turns, each twice the pixels of the one before.
-        counts: m of the series over landmarks.
-        counts_side: side of the image of that series, and of those over patches and number types.
-        growth: m of the series that takes turns.
-        patches: sizes.
-        crops: number, side and m of the batches.
-        dense_side: of the image that the dense filter can do.
-        seconds: that a group of calls takes turns, after the least number of rounds.
-        least: rounds.
-        processes: that measure what an import takes.
-        probes: cases whose memory is measured.
-        threads: counts; none is one, and all.
-        device: of torch.
-    """
-
-    side: int = 1024
-    landmarks: int = 100
-    sizes: tuple[tuple[int, int], ...] = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2048, 2048))
-    doublings: tuple[tuple[int, int], ...] = ((512, 512), (512, 1024), (1024, 1024), (1024, 2048), (2048, 2048))
-    counts: tuple[int, ...] = (25, 50, 100, 200, 400)
-    counts_side: int = 512
-    growth: tuple[int, ...] = (50, 100, 200)
-    patches: tuple[int, ...] = (1, 3, 5, 7, 11)
-    crops: tuple[int, int, int] = (16, 128, 64)
-    dense_side: int = 256
-    seconds: float = 6.0
-    least: int = 3
-    processes: int = 7
-    probes: int = 5
-    threads: tuple[int, ...] = ()
-    device: str = "cpu"
-
-    def case(self, **changes: Any) -> Case:
-        """The main case, or one that differs from it."""
-        main = Case(height=self.side, width=self.side, landmarks=self.landmarks, device=self.device)
-        return replace(main, **changes)
-
-
-QUICK = Plan(
-    side=64,
-    landmarks=12,
-    sizes=((32, 32), (64, 64)),
-    doublings=((32, 32), (32, 64)),
-    counts=(8, 16),
-    counts_side=48,
-    growth=(8, 16),
-    patches=(1, 3),
-    crops=(4, 16, 8),
-    dense_side=32,
-    seconds=0.0,
-    least=1,
-    processes=1,
-    probes=2,
+from nlfilter_torch import (
+    NonlocalFilter,
+    PolynomialSliders,
+    detail_layers,
+    estimate_bandwidth,
+    polynomial_filter,
+    spectral_filter,
 )
-
-
-def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) -> Record:
-    """What one case showed."""
-    floor = {"floor": floor_summary(timings)} if any(": " in name for name in timings) else {}
-    return {
-        "suite": suite,
-        "label": case.label(),
-        "case": case.to_json(),
-        "timings": {name: timing.to_json() for name, timing in timings.items()},
-        **floor,
-        **facts,
-    }
-
-
-def measured(
-    suite: str, plan: Plan, case: Case, calls: Mapping[str, Call], *, error: bool = False, **facts: Any
-) -> Record:
-    """Let ``calls`` take turns with the floor of the case."""
-    timings = take_turns(
-        {**calls, **floor_calls(case)}, threads=case.used_threads, seconds=plan.seconds, least=plan.least
-    )
-    if error:
-        facts["error"] = rounding_error(case, case.image())
-    return record(suite, case, timings, **facts)
+from nlfilter_torch.blocks import moment
 
 
 def filter_calls(case: Case, *, backward: bool) -> dict[str, Call]:
@@ -188,6 +98,39 @@ def dense(plan: Plan) -> Iterator[Record]:
     calls = {"operator": discard(case.operator, image), "product W y": discard(operator.matmul, image)} | others
     timings = take_turns(calls, threads=case.used_threads, seconds=plan.seconds, least=min(2, plan.least))
     yield record("dense", case, timings, missing=missing, does={peers.DENSE.name: peers.DENSE.does})
+
+
+def autograd(plan: Plan) -> Iterator[Record]:
+    """A training step, beside the same filter as plain tensor operations that autograd differentiates one by one."""
+    from tests.plain_autograd import plain_filter
+
+    case = plan.case(height=plan.counts_side, width=plan.counts_side)
+    image = case.image()
+    bandwidth = estimate_bandwidth(image).item()
+    alpha = torch.tensor(ALPHA)
+
+    def plain(guide: torch.Tensor) -> torch.Tensor:
+        return plain_filter(
+            guide,
+            guide,
+            alpha,
+            patch_size=case.patch_size,
+            photometric_bandwidth=bandwidth,
+            num_landmarks=case.landmarks,
+        )
+
+    def plain_step() -> None:
+        leaf = image.detach().requires_grad_()
+        plain(leaf).square().mean().backward()
+
+    calls = {
+        "operator and filter": discard(NonlocalFilter(ALPHA, **case.options()), image),
+        "plain operations": discard(plain, image),
+        "training step": _step(case),
+        "training step, plain autograd": plain_step,
+    }
+    timings = take_turns(calls, threads=case.used_threads, seconds=plan.seconds, least=plan.least)
+    yield record("autograd", case, timings)
 
 
 def sizes(plan: Plan) -> Iterator[Record]:
@@ -300,6 +243,7 @@ SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
     "imports": imports,
     "slow": slow_peers,
     "dense": dense,
+    "autograd": autograd,
     "sizes": sizes,
     "landmarks": landmarks,
     "patches": patches,

@@ -1,0 +1,110 @@
+"""How large and how often things are measured, and what a measurement leaves behind."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from benchmarks.speed.cases import Case
+from benchmarks.speed.floor import floor_calls, floor_summary
+from benchmarks.speed.probe import rounding_error
+from benchmarks.speed.timing import Call, Timing, take_turns
+
+# What one case showed, as JSON can hold it: suite, label, case, timings by name, and where they apply the floor, the
+# rounding error, the peak memory and notes about peers that were left out.
+Record = dict[str, Any]
+# A whole run: its machine, whether it was quick, and under "results" its records.
+Results = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How large and how often.
+
+    Attributes:
+        side: of the main image.
+        landmarks: of the main operator.
+        sizes: height and width of the series over pixels.
+        doublings: of the series that takes turns, each twice the pixels of the one before.
+        counts: m of the series over landmarks.
+        counts_side: side of the image of that series, and of those over patches and number types.
+        growth: m of the series that takes turns.
+        patches: sizes.
+        crops: number, side and m of the batches.
+        dense_side: of the image that the dense filter can do.
+        seconds: that a group of calls takes turns, after the least number of rounds.
+        least: rounds.
+        processes: that measure what an import takes.
+        probes: cases whose memory is measured.
+        threads: counts; none is one, and all.
+        device: of torch.
+    """
+
+    side: int = 1024
+    landmarks: int = 100
+    sizes: tuple[tuple[int, int], ...] = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2048, 2048))
+    doublings: tuple[tuple[int, int], ...] = ((512, 512), (512, 1024), (1024, 1024), (1024, 2048), (2048, 2048))
+    counts: tuple[int, ...] = (25, 50, 100, 200, 400)
+    counts_side: int = 512
+    growth: tuple[int, ...] = (50, 100, 200)
+    patches: tuple[int, ...] = (1, 3, 5, 7, 11)
+    crops: tuple[int, int, int] = (16, 128, 64)
+    dense_side: int = 256
+    seconds: float = 6.0
+    least: int = 3
+    processes: int = 7
+    probes: int = 5
+    threads: tuple[int, ...] = ()
+    device: str = "cpu"
+
+    def case(self, **changes: Any) -> Case:
+        """The main case, or one that differs from it."""
+        main = Case(height=self.side, width=self.side, landmarks=self.landmarks, device=self.device)
+        return replace(main, **changes)
+
+
+QUICK = Plan(
+    side=64,
+    landmarks=12,
+    sizes=((32, 32), (64, 64)),
+    doublings=((32, 32), (32, 64)),
+    counts=(8, 16),
+    counts_side=48,
+    growth=(8, 16),
+    patches=(1, 3),
+    crops=(4, 16, 8),
+    dense_side=32,
+    seconds=0.0,
+    least=1,
+    processes=1,
+    probes=2,
+)
+
+
+def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) -> Record:
+    """What one case showed."""
+    floor = {"floor": floor_summary(timings)} if any(": " in name for name in timings) else {}
+    return {
+        "suite": suite,
+        "label": case.label(),
+        "case": case.to_json(),
+        "timings": {name: timing.to_json() for name, timing in timings.items()},
+        **floor,
+        **facts,
+    }
+
+
+def measured(
+    suite: str, plan: Plan, case: Case, calls: Mapping[str, Call], *, error: bool = False, **facts: Any
+) -> Record:
+    """Let ``calls`` take turns with the floor of the case."""
+    timings = take_turns(
+        {**calls, **floor_calls(case)}, threads=case.used_threads, seconds=plan.seconds, least=plan.least
+    )
+    if error:
+        facts["error"] = rounding_error(case, case.image())
+    return record(suite, case, timings, **facts)
+
+
+def records_of(results: Results, suite: str) -> list[Record]:
+    """The records of one suite, in the order in which they were measured."""
+    return [found for found in results["results"] if found["suite"] == suite]
