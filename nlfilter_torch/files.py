@@ -71,7 +71,8 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0) -> Photograph
     Args:
         path: A PNG, JPEG, TIFF or WebP file, told by its content: grey or RGB, with or without alpha, of 8 or 16 bits
             or (TIFF) floats. Of a TIFF with several pages, and of a JPEG with several pictures, the first.
-        bytes_per_pixel: Memory that is going to be needed for each pixel, checked before anything is decoded.
+        bytes_per_pixel: Memory that is going to be needed for each pixel in float32, checked before anything is
+            decoded; twice as much for a file of 64-bit floats, which are not cut to 32.
 
     Returns:
         The photograph, turned upright.
@@ -256,7 +257,9 @@ def _to_plain_mode(image: Image.Image, path: Path) -> Image.Image:
 def _read_tiff(path: Path, head: bytes, bytes_per_pixel: int) -> tuple[Pixels, int, bytes | None, bytes | None]:
     """(H, W, S) channels, orientation, profile and EXIF of the first page of a TIFF file."""
     try:
-        return tiff.read(path, lambda width, height: check_memory(path, width, height, bytes_per_pixel))
+        return tiff.read(
+            path, lambda width, height, double: check_memory(path, width, height, bytes_per_pixel * (1 + double))
+        )
     except tiff.UnhandledTiff as error:
         raise ValueError(f"{path} {error}") from error
     except MemoryError:

@@ -28,10 +28,12 @@ def is_tiff(head: bytes) -> bool:
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-def read(path: Path, check_size: Callable[[int, int], None]) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
+def read(
+    path: Path, check_size: Callable[[int, int, bool], None]
+) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
     """(H, W, S) channels as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
 
-    ``check_size(width, height)`` is called before the pixels are decoded.
+    ``check_size(width, height, double)`` is called before the pixels are decoded; ``double``: they have 64 bits.
     """
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
@@ -46,7 +48,7 @@ def read(path: Path, check_size: Callable[[int, int], None]) -> tuple[NDArray[An
             raise UnhandledTiff(
                 f"has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats"
             )
-        check_size(page.imagewidth, page.imagelength)
+        check_size(page.imagewidth, page.imagelength, page.dtype.itemsize == 8)
         channels = np.asarray(page.asarray())
         if page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)

@@ -239,7 +239,7 @@ def test_outputs_that_cannot_be(photo: Path, tmp_path: Path, capsys: pytest.Capt
 def test_too_large_for_memory(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = psutil.virtual_memory()._replace(available=4_000_000)
+    free = psutil.virtual_memory()._replace(available=60 * 90 * 4 * (100 + 2 * 25 + 40) - 1)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     sentence = refused(capsys, "detail", photo, tmp_path / "out.png")
     assert "has 90x60 pixels and needs about 0.0 GB of memory, but 0.0 GB is free; use fewer landmarks" in sentence

@@ -1,5 +1,6 @@
 """Image files: every type and depth keeps its exact values, its alpha, EXIF and profile; bad ones get one sentence."""
 
+import contextlib
 import io
 import itertools
 import os
@@ -292,6 +293,15 @@ def test_too_large_is_refused_before_decoding(tmp_path: Path, suffix: str, monke
     read_photograph(path, bytes_per_pixel=999)
     with pytest.raises(MemoryError, match=r"has 7x5 pixels and needs about 0\.0 GB of memory"):
         read_photograph(path, bytes_per_pixel=1000)
+
+
+def test_floats_of_64_bits_need_twice_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = psutil.virtual_memory()._replace(available=35 * 1000)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    for depth, fits in (("float32", True), ("float64", False)):
+        write_photograph(photograph(stored_values(3, depth)), tmp_path / "in.tif")
+        with contextlib.nullcontext() if fits else pytest.raises(MemoryError, match="use fewer landmarks"):
+            read_photograph(tmp_path / "in.tif", bytes_per_pixel=600)
 
 
 def test_a_decompression_bomb_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

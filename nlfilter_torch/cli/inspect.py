@@ -61,7 +61,7 @@ def inspect(
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
-        photograph = read_photograph(source, bytes_per_pixel=2 * options.working_bytes(landmarks, patch_size))
+        photograph = read_photograph(source, bytes_per_pixel=options.working_bytes(landmarks, patch_size, factors=5))
         guide = reduce_channels(photograph.pixels, "luminance")
         begin("Comparing patches")
         operator = options.build_operator(
