@@ -189,9 +189,9 @@ def diffusion_distance(psi: Array, point: Array) -> Array:
 
 
 def diffusion_mask(s: Array, v: Array, region: Array, time: float, width: float) -> Array:
-    """M_t (n,): exp(-D_t^2 / width^2) to the average map of a region (n,). Eq. 17."""
+    """M_t (n,): exp(-D_t^2 / width) to the average map of a region (n,). Eq. 17, whose width is 1."""
     psi = diffusion_map(s, v, time)
-    return np.exp(-diffusion_distance(psi, region @ psi / region.sum()) / width**2)
+    return np.exp(-diffusion_distance(psi, region @ psi / region.sum()) / width)
 
 
 def segment_mask(s: Array, v: Array, regions: Array, time: float, steps: int = 100) -> Array:

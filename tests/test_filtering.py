@@ -1,0 +1,305 @@
+"""Responses, sliders, layers and captured energy: against the dense paper, and against each other."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nlfilter_torch import (
+    captured_energy,
+    detail_layers,
+    nonlocal_operator,
+    polynomial_filter,
+    polynomial_response,
+    spectral_filter,
+)
+from tests import reference
+from tests.images import photograph
+from tests.problems import build, guides, noise, options, picture
+
+ALPHA = (3.0, 0.5, 4.0, 1.05)
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+sliders = st.lists(st.floats(-5, 20, width=32), min_size=2, max_size=6)
+
+
+def double(values: object) -> torch.Tensor:
+    return torch.as_tensor(values, dtype=torch.float64)
+
+
+# --- the response, eq. 14
+
+
+@given(alpha=sliders, eigenvalues=st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_response_is_the_reference_response(alpha: list[float], eigenvalues: list[float]) -> None:
+    found = polynomial_response(double(eigenvalues), double(alpha))
+    np.testing.assert_allclose(found, reference.response(np.array(eigenvalues), np.array(alpha)), atol=1e-12)
+
+
+@given(alpha=sliders)
+def test_response_has_the_ends_of_the_paper(alpha: list[float]) -> None:
+    ends = polynomial_response(torch.tensor([0.0, 1.0], dtype=torch.float64), double(alpha))
+    torch.testing.assert_close(ends, double([alpha[0], alpha[-1]]), atol=0, rtol=0)
+
+
+def test_response_of_ones_is_one_and_of_the_low_pass_is_the_eigenvalue() -> None:
+    eigenvalues = torch.linspace(0, 1, 50)
+    torch.testing.assert_close(polynomial_response(eigenvalues, torch.ones(4)), torch.ones(50))
+    torch.testing.assert_close(polynomial_response(eigenvalues, torch.tensor([0.0, 1, 1, 1])), eigenvalues)
+
+
+def test_response_takes_sliders_for_every_image() -> None:
+    eigenvalues, alpha = noise(3, 7), noise(3, 4, seed=1)
+    expected = torch.stack([polynomial_response(eigenvalues[i], alpha[i]) for i in range(3)])
+    torch.testing.assert_close(polynomial_response(eigenvalues, alpha), expected)
+
+
+# --- layers, eq. 11
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 5])
+def test_layers_are_the_reference_layers(order: int) -> None:
+    image, y = photograph("astronaut", 20, 24), photograph("coffee", 20, 24)
+    operator = nonlocal_operator(
+        torch.from_numpy(image.copy())[None, None], photometric_bandwidth=20 / 255, num_landmarks=480
+    )
+    found = detail_layers(operator, torch.from_numpy(y.copy())[None, None], order=order)
+    assert found.shape == (1, order + 1, 1, 20, 24)
+    expected = reference.layers(reference.filter_matrix(image, 5, 20 / 255), y.ravel(), order)
+    np.testing.assert_allclose(found.flatten(2)[0, :, :], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@given(guide=guides(), chosen=options, channels=st.integers(1, 4), order=st.integers(1, 5))
+def test_layers_sum_to_the_image(
+    guide: torch.Tensor, chosen: dict[str, object], channels: int, order: int, dtype: torch.dtype
+) -> None:
+    operator = build(guide.to(dtype), **chosen)
+    image = noise(guide.shape[0], channels, *guide.shape[2:], seed=1, dtype=dtype)
+    parts = detail_layers(operator, image, order=order)
+    assert parts.shape == (guide.shape[0], order + 1, *image.shape[1:])
+    torch.testing.assert_close(parts.sum(1), image, atol=1e-5 if dtype == torch.float32 else 1e-12, rtol=0)
+
+
+def test_detail_layers_have_no_mean_and_the_smooth_one_has_it_all() -> None:
+    image = picture("chelsea", 30, 40)
+    parts = detail_layers(build(image, photometric_bandwidth=0.1, num_landmarks=60), image)
+    torch.testing.assert_close(parts[:, :-1].mean((3, 4)), torch.zeros(1, 3, 1, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(parts[:, -1].mean((2, 3)), image.mean((2, 3)))
+
+
+# --- sliders, eq. 12 and 13
+
+
+@pytest.mark.parametrize("residual", [None, 0.0, 1.0])
+def test_sliders_are_those_of_the_dense_paper(residual: float | None) -> None:
+    """With every pixel a landmark V is complete, so the residual has nothing to weigh."""
+    image, y = photograph("astronaut", 20, 24), photograph("coffee", 20, 24)
+    operator = nonlocal_operator(
+        torch.from_numpy(image.copy())[None, None], photometric_bandwidth=20 / 255, num_landmarks=480
+    )
+    found = polynomial_filter(operator, torch.from_numpy(y.copy())[None, None], double(ALPHA), residual=residual)
+    w = reference.filter_matrix(image, 5, 20 / 255)
+    np.testing.assert_allclose(found.ravel(), reference.edited(w, y.ravel(), np.array(ALPHA)), atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@given(guide=guides(), chosen=options, channels=st.integers(1, 3), order=st.integers(1, 5))
+def test_ones_give_the_image_back(
+    guide: torch.Tensor, chosen: dict[str, object], channels: int, order: int, dtype: torch.dtype
+) -> None:
+    operator = build(guide.to(dtype), **chosen)
+    image = noise(guide.shape[0], channels, *guide.shape[2:], seed=1, dtype=dtype)
+    for residual in (None, 1.0):
+        found = polynomial_filter(operator, image, torch.ones(order + 1), residual=residual)
+        torch.testing.assert_close(found, image, atol=1e-5, rtol=0)
+
+
+@given(alpha=sliders)
+def test_sliders_weigh_the_layers(alpha: list[float]) -> None:
+    guide, image = noise(2, 1, 9, 11), noise(2, 3, 9, 11, seed=1)
+    operator = build(guide, photometric_bandwidth=0.3, num_landmarks=20)
+    parts = detail_layers(operator, image, order=len(alpha) - 1)
+    expected = (double(alpha).view(1, -1, 1, 1, 1) * parts).sum(1)
+    torch.testing.assert_close(polynomial_filter(operator, image, double(alpha)), expected, atol=1e-12, rtol=0)
+
+
+def test_filter_is_linear_in_image_and_sliders() -> None:
+    operator = build(noise(1, 1, 9, 11), photometric_bandwidth=0.3, num_landmarks=20)
+    y, z = noise(1, 2, 9, 11, seed=1), noise(1, 2, 9, 11, seed=2)
+    a, b = double(ALPHA), double([1.0, 2.0, -1.0, 0.5])
+    for residual in (None, 0.0, 0.7):
+        apart = polynomial_filter(operator, y, a, residual=residual) - 2 * polynomial_filter(
+            operator, z, a, residual=residual
+        )
+        together = polynomial_filter(operator, y - 2 * z, a, residual=residual)
+        torch.testing.assert_close(together, apart, atol=1e-11, rtol=0)
+    torch.testing.assert_close(
+        polynomial_filter(operator, y, a + b), polynomial_filter(operator, y, a) + polynomial_filter(operator, y, b)
+    )
+
+
+def test_without_residual_it_is_eq_13_on_the_eigenvectors() -> None:
+    image = picture("camera", 24, 30)
+    operator = build(image, photometric_bandwidth=0.4, completion="none", num_landmarks=50)
+    spectrum = operator.spectrum()
+    found = polynomial_filter(operator, image, double(ALPHA), residual=0.0)
+    v = spectrum.eigenvectors.flatten(2)[0].numpy().T
+    expected = reference.polynomial_filter(spectrum.eigenvalues[0].numpy(), v, image.numpy().ravel(), np.array(ALPHA))
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+def test_residual_is_the_weight_of_what_the_eigenvectors_miss(completion: str) -> None:
+    image = picture("camera", 24, 30)
+    operator = build(image, photometric_bandwidth=0.3, completion=completion, num_landmarks=30, landmarks="uniform")
+    missed = image - spectral_filter(operator.spectrum(), image, torch.ones_like)
+    assert missed.abs().max() > 1e-3
+    by_default = polynomial_filter(operator, image, double(ALPHA))
+    for weight in (0.0, 1.0, ALPHA[0]):
+        found = polynomial_filter(operator, image, double(ALPHA), residual=weight)
+        torch.testing.assert_close(found, by_default + (weight - ALPHA[0]) * missed, atol=1e-9, rtol=0)
+
+
+def test_residual_may_be_a_parameter() -> None:
+    image = picture("camera", 12, 15)
+    operator = build(image, photometric_bandwidth=0.3, num_landmarks=10)
+    weight = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    polynomial_filter(operator, image, double(ALPHA), residual=weight).square().sum().backward()
+    assert weight.grad is not None
+    assert weight.grad.abs() > 0
+
+
+def test_sliders_for_every_image_and_every_pixel() -> None:
+    guide, image = noise(3, 1, 9, 11), noise(3, 2, 9, 11, seed=1)
+    operator = build(guide, photometric_bandwidth=0.3, num_landmarks=20)
+    alpha = noise(3, 4, seed=2)
+    found = polynomial_filter(operator, image, alpha)
+    for i in range(3):
+        expected = polynomial_filter(operator, image, alpha[i])[i]
+        torch.testing.assert_close(found[i], expected, atol=1e-12, rtol=0)
+    spread = alpha[:, :, None, None].expand(3, 4, 9, 11)
+    torch.testing.assert_close(polynomial_filter(operator, image, spread), found, atol=1e-12, rtol=0)
+    mask = (noise(3, 1, 9, 11, seed=3) > 0.5).double()
+    blended = polynomial_filter(operator, image, 1 + mask * (spread - 1))
+    torch.testing.assert_close(blended, image + mask * (found - image), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_images_keep_their_dtype(dtype: torch.dtype) -> None:
+    operator = build(noise(1, 1, 9, 11, dtype=torch.float32), photometric_bandwidth=0.3, num_landmarks=20)
+    image = noise(1, 3, 9, 11, seed=1, dtype=dtype)
+    alpha = torch.tensor(ALPHA)
+    for found in (
+        polynomial_filter(operator, image, alpha),
+        polynomial_filter(operator, image, alpha, residual=0.5),
+        detail_layers(operator, image),
+        spectral_filter(operator.spectrum(), image, torch.sqrt),
+    ):
+        assert found.dtype == dtype
+        assert found.isfinite().all()
+    exact = polynomial_filter(operator, image.float(), alpha)
+    tolerance = 4 * torch.finfo(dtype).eps if dtype.itemsize == 2 else 1e-5
+    found = polynomial_filter(operator, image, alpha).float()
+    torch.testing.assert_close(found, exact, atol=tolerance, rtol=tolerance)
+
+
+def test_batch_is_its_images() -> None:
+    guide = torch.cat([picture(name, 30, 36) for name in ("astronaut", "camera", "moon")])
+    image, alpha = noise(3, 2, 30, 36), double(ALPHA)
+    together = build(guide, num_landmarks=40)
+    for i in range(3):
+        alone = build(guide[i : i + 1], num_landmarks=40)
+        for residual in (None, 0.0):
+            torch.testing.assert_close(
+                polynomial_filter(together, image, alpha, residual=residual)[i : i + 1],
+                polynomial_filter(alone, image[i : i + 1], alpha, residual=residual),
+                atol=1e-7,
+                rtol=0,
+            )
+
+
+# --- any response, eq. 10
+
+
+@pytest.mark.parametrize("power", [0.1, 0.5, 1.0, 3.0])
+def test_spectral_filter_is_v_f_v(power: float) -> None:
+    image = picture("coffee", 24, 30)
+    spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=50).spectrum()
+    found = spectral_filter(spectrum, image, lambda s: s**power)
+    s, v = spectrum.eigenvalues[0].numpy(), spectrum.eigenvectors.flatten(2)[0].numpy().T
+    np.testing.assert_allclose(
+        found.ravel(), reference.spectral_function(s, v, s**power, image.numpy().ravel()), atol=1e-6
+    )
+
+
+def test_spectral_filter_against_the_dense_paper() -> None:
+    image, y = photograph("astronaut", 24, 24), photograph("coffee", 24, 24)
+    operator = nonlocal_operator(
+        torch.from_numpy(image.copy())[None, None], photometric_bandwidth=20 / 255, num_landmarks=576
+    )
+    s, v = reference.eigenpairs(reference.filter_matrix(image, 5, 20 / 255))
+    for f in (lambda s: s, lambda s: (1 - s) * s**0.5, lambda s: s**3):
+        found = spectral_filter(operator.spectrum(), torch.from_numpy(y.copy())[None, None], f)
+        np.testing.assert_allclose(found.ravel(), reference.spectral_function(s, v, f(s), y.ravel()), atol=3e-3)
+
+
+def test_a_response_of_one_projects() -> None:
+    image = picture("coffee", 24, 30)
+    spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=30, landmarks="uniform").spectrum()
+    once = spectral_filter(spectrum, image, torch.ones_like)
+    torch.testing.assert_close(spectral_filter(spectrum, once, torch.ones_like), once, atol=1e-8, rtol=0)
+    whole = spectral_filter(spectrum, image, torch.ones_like, residual=1.0)
+    torch.testing.assert_close(whole, image, atol=1e-8, rtol=0)
+
+
+def test_parameters_of_a_response_learn() -> None:
+    image = picture("coffee", 12, 15)
+    spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=10).spectrum()
+    power = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    spectral_filter(spectrum, image, lambda s: s**power).square().sum().backward()
+    assert power.grad is not None
+    assert power.grad < 0  # a larger power passes less
+
+
+@pytest.mark.parametrize("name", ["astronaut", "constant"])
+def test_gradients_reach_the_guide_and_are_finite(name: str) -> None:
+    guide = picture("astronaut", 10, 12) if name == "astronaut" else torch.full((1, 1, 10, 12), 0.5).double()
+    guide = guide.clone().requires_grad_()
+    image = noise(1, 2, 10, 12)
+    operator = build(guide, photometric_bandwidth=0.3, num_landmarks=15)
+    weights = noise(1, 2, 10, 12, seed=5)
+    for filtered in (
+        polynomial_filter(operator, image, double(ALPHA)),
+        polynomial_filter(operator, image, double(ALPHA), residual=0.3),
+        spectral_filter(operator.spectrum(), image, lambda s: s**0.5),
+    ):
+        (gradient,) = torch.autograd.grad((filtered * weights).sum(), guide, retain_graph=True)
+        assert gradient.isfinite().all()
+        assert name == "constant" or gradient.abs().max() > 0
+
+
+# --- captured energy, eq. 19
+
+
+def test_captured_energy_is_the_reference_beta() -> None:
+    image = picture("coffee", 24, 30)
+    spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=20, landmarks="uniform").spectrum()
+    v = spectrum.eigenvectors.flatten(2)[0].numpy().T
+    found = captured_energy(spectrum, image)
+    assert found.shape == (1,)
+    assert found.item() == pytest.approx(reference.captured_energy(v, image.numpy().ravel()), abs=1e-9)
+    assert 0.5 < found.item() < 1
+
+
+@given(guide=guides(), chosen=options)
+def test_captured_energy_is_a_share(guide: torch.Tensor, chosen: dict[str, object]) -> None:
+    energy = captured_energy(build(guide, **chosen).spectrum(), guide)
+    assert energy.shape == (guide.shape[0],)
+    assert (energy >= 0).all()
+    assert (energy <= 1 + 1e-6).all()
+
+
+def test_all_of_a_black_image_is_captured() -> None:
+    spectrum = build(noise(2, 1, 8, 9), num_landmarks=10).spectrum()
+    torch.testing.assert_close(captured_energy(spectrum, torch.zeros(2, 1, 8, 9)), torch.ones(2, dtype=torch.float64))

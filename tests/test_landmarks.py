@@ -1,0 +1,124 @@
+"""Features to landmarks: three samplings, their determinism, and images that hold few distinct patches."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nlfilter_torch.landmarks import choose_landmarks
+from nlfilter_torch.nystrom import nystrom_factor, whitener
+from tests.images import hard_images, photograph
+
+HEIGHT, WIDTH = 20, 30
+SAMPLINGS = ("kmeans", "uniform", "random")
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def cloud(batch: int = 1, pixels: int = HEIGHT * WIDTH, seed: int = 0) -> torch.Tensor:
+    """Features (B, 4, N) in float64."""
+    return torch.randn(batch, 4, pixels, generator=seeded(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@given(count=st.integers(1, 60))
+def test_there_are_as_many_as_asked_for(sampling: str, count: int) -> None:
+    landmarks = choose_landmarks(cloud(2, 60), (6, 10), count, sampling, seeded())
+    assert landmarks.shape == (2, 4, count)
+    assert landmarks.isfinite().all()
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_as_many_as_pixels_are_the_pixels(sampling: str) -> None:
+    x = cloud()
+    landmarks = choose_landmarks(x, (HEIGHT, WIDTH), HEIGHT * WIDTH, sampling, seeded())
+    assert (landmarks.sort(dim=2).values == x.sort(dim=2).values).all()
+
+
+@pytest.mark.parametrize("sampling", ["uniform", "random"])
+@given(height=st.integers(1, 12), width=st.integers(1, 12), data=st.data())
+def test_sampled_landmarks_are_distinct_pixels(sampling: str, height: int, width: int, data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, height * width))
+    numbers = torch.arange(height * width, dtype=torch.float64).view(1, 1, -1)
+    chosen = choose_landmarks(numbers, (height, width), count, sampling, seeded())[0, 0]
+    assert chosen.unique().numel() == count
+    assert (chosen == chosen.round()).all()
+
+
+@pytest.mark.parametrize(("height", "width", "count"), [(100, 100, 100), (60, 90, 54), (1, 64, 16), (64, 1, 16)])
+def test_uniform_landmarks_lie_evenly(height: int, width: int, count: int) -> None:
+    numbers = torch.arange(height * width, dtype=torch.float64).view(1, 1, -1)
+    chosen = choose_landmarks(numbers, (height, width), count, "uniform", None)[0, 0].long()
+    points = torch.stack([chosen // width, chosen % width], dim=1).double()
+    apart = torch.cdist(points, points).fill_diagonal_(float("inf")).min(1).values
+    spacing = (height * width / count) ** 0.5 if min(height, width) > 1 else height * width / count
+    assert apart.min() >= 0.6 * spacing
+    margin = torch.tensor([height, width]) - 1 - points.amax(0)
+    assert ((points.amin(0) - margin).abs() <= spacing).all()
+
+
+def test_kmeans_landmarks_are_nearer_to_the_pixels_than_sampled_ones() -> None:
+    x = cloud()
+
+    def spread(sampling: str) -> float:
+        landmarks = choose_landmarks(x, (HEIGHT, WIDTH), 40, sampling, seeded())
+        return torch.cdist(x[0].T, landmarks[0].T).min(1).values.square().mean().item()
+
+    assert spread("kmeans") < 0.85 * min(spread("uniform"), spread("random"))
+
+
+def test_kmeans_landmarks_are_means_of_their_pixels() -> None:
+    x = torch.cat([cloud(seed=1)[..., :300] - 20, cloud(seed=2)[..., :300] + 20], dim=2)
+    landmarks = choose_landmarks(x, (HEIGHT, WIDTH), 2, "kmeans", seeded())[0].sort(dim=1).values
+    expected = torch.stack([x[0, :, :300].mean(1), x[0, :, 300:].mean(1)], dim=1)
+    torch.testing.assert_close(landmarks, expected, atol=0.5, rtol=0)  # k-means looks at a part of the pixels
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_generator_decides(sampling: str) -> None:
+    x = cloud()
+    first, again = (choose_landmarks(x, (HEIGHT, WIDTH), 20, sampling, seeded(5)) for _ in range(2))
+    assert (first == again).all()
+    other = choose_landmarks(x, (HEIGHT, WIDTH), 20, sampling, seeded(6))
+    assert sampling == "uniform" or not torch.equal(first, other)
+    default = [choose_landmarks(x, (HEIGHT, WIDTH), 20, sampling, None) for _ in range(2)]
+    assert torch.equal(*default)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_batch_chooses_what_each_image_chooses(sampling: str) -> None:
+    x = cloud(3)
+    together = choose_landmarks(x, (HEIGHT, WIDTH), 20, sampling, seeded())
+    alone = [choose_landmarks(x[i : i + 1], (HEIGHT, WIDTH), 20, sampling, seeded()) for i in range(3)]
+    torch.testing.assert_close(together, torch.cat(alone), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", list(hard_images()))
+def test_few_distinct_features_leave_the_landmarks_finite_and_usable(name: str, dtype: torch.dtype) -> None:
+    image = torch.from_numpy(hard_images()[name]).to(dtype)
+    x = image.reshape(1, 1, -1) * 100
+    landmarks = choose_landmarks(x, tuple(image.shape), min(50, x.shape[2] - 1), "kmeans", seeded())
+    assert landmarks.isfinite().all()
+    assert landmarks.min() >= x.min() - 1e-3
+    assert landmarks.max() <= x.max() + 1e-3
+    factor, diagonal = nystrom_factor(x, landmarks, whitener(landmarks), "diagonal")
+    assert factor.isfinite().all()
+    assert diagonal.isfinite().all()
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_landmarks_pass_gradients_to_the_features(sampling: str) -> None:
+    x = cloud().requires_grad_()
+    choose_landmarks(x, (HEIGHT, WIDTH), 20, sampling, seeded()).sum().backward()
+    assert x.grad is not None
+    # Every landmark is a mean of features, so the gradients of each coordinate sum to the number of landmarks.
+    torch.testing.assert_close(x.grad.sum(2), torch.full((1, 4), 20.0, dtype=torch.float64))
+
+
+def test_kmeans_does_not_mind_an_offset() -> None:
+    x = torch.from_numpy(photograph("camera", 20, 30).copy()).float().view(1, 1, -1) * 10
+    near, far = (choose_landmarks(x + shift, (20, 30), 20, "kmeans", seeded()) - shift for shift in (0.0, 256.0))
+    torch.testing.assert_close(near, far, atol=1e-3, rtol=0)

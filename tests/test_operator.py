@@ -1,0 +1,367 @@
+"""The operator: against the dense filter, and the invariants that hold for every image."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks import accuracy
+from nlfilter_torch import nonlocal_operator
+from tests import reference
+from tests.images import photograph
+from tests.problems import SAMPLINGS, build, guides, noise, options, picture, seeded
+
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+
+
+# --- against the dense filter
+
+
+@pytest.mark.parametrize("bandwidth", list(accuracy.LIMITS))
+@pytest.mark.parametrize("name", accuracy.PICTURES)
+def test_filtered_photographs_are_near_the_dense_filter(name: str, bandwidth: int) -> None:
+    errors = accuracy.measure(name, bandwidth)
+    print(errors)
+    assert errors.default <= accuracy.LIMITS[bandwidth]
+    assert errors.default <= errors.paper / 2
+    assert errors.default <= errors.plain / 2
+
+
+@pytest.mark.parametrize("h_x", [None, 6.0])
+@pytest.mark.parametrize("bandwidth", [5, 10, 20, 40])
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+def test_with_every_pixel_a_landmark_it_is_the_dense_filter(bandwidth: int, completion: str, h_x: float | None) -> None:
+    image = photograph("astronaut", 24, 24)
+    operator = nonlocal_operator(
+        torch.from_numpy(image.copy())[None, None],
+        photometric_bandwidth=bandwidth / 255,
+        spatial_bandwidth=h_x,
+        num_landmarks=image.size,
+        completion=completion,
+    )
+    expected = reference.filter_matrix(image, 5, bandwidth / 255, h_x)
+    np.testing.assert_allclose(operator.to_dense()[0], expected, atol=1e-4)
+    y = photograph("coffee", 24, 24)
+    filtered = operator @ torch.from_numpy(y.copy())[None, None]
+    np.testing.assert_allclose(filtered.ravel(), expected @ y.ravel(), atol=1e-4)
+
+
+def test_with_every_pixel_a_landmark_it_is_the_dense_filter_in_single_precision() -> None:
+    image = photograph("astronaut", 24, 24)
+    operator = nonlocal_operator(
+        torch.from_numpy(image.copy()).float()[None, None], photometric_bandwidth=20 / 255, num_landmarks=image.size
+    )
+    expected = reference.filter_matrix(photograph("astronaut", 24, 24), 5, 20 / 255)
+    np.testing.assert_allclose(operator.to_dense()[0], expected, atol=1e-4)
+
+
+def test_colour_guide_against_the_dense_filter() -> None:
+    guide = np.stack([photograph(name, 20, 22) for name in ("astronaut", "coffee", "chelsea")])
+    operator = nonlocal_operator(
+        torch.from_numpy(guide)[None], photometric_bandwidth=0.2, num_landmarks=440, guide_channels="all", patch_size=3
+    )
+    np.testing.assert_allclose(operator.to_dense()[0], reference.filter_matrix(guide, 3, 0.2), atol=1e-4)
+
+
+@pytest.mark.parametrize("bandwidth", [20, 60])
+def test_plain_uniform_is_the_papers_method(bandwidth: int) -> None:
+    image, h_y = photograph("chelsea", 30, 40), bandwidth / 255
+    operator = nonlocal_operator(
+        torch.from_numpy(image.copy())[None, None],
+        photometric_bandwidth=h_y,
+        num_landmarks=50,
+        landmarks="uniform",
+        completion="none",
+    )
+    s, v = reference.nystrom_eigenpairs(reference.features(image, 5, h_y), reference.uniform_samples(30, 40, 50))
+    filtered = (operator @ torch.from_numpy(image.copy())[None, None]).ravel()
+    # The jitter of the library and the cut of small eigenvalues of the paper leave a grey level between them.
+    np.testing.assert_allclose(filtered, reference.spectral_function(s, v, s, image.ravel()), atol=1 / 255)
+
+
+# --- what holds for every image
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@given(guide=guides(), chosen=options)
+def test_operator_is_symmetric_stochastic_and_a_contraction(
+    guide: torch.Tensor, chosen: dict[str, object], dtype: torch.dtype
+) -> None:
+    operator = build(guide.to(dtype), **chosen)
+    dense = operator.to_dense()
+    batch, _, height, width = guide.shape
+    assert dense.shape == (batch, height * width, height * width)
+    assert dense.isfinite().all()
+    torch.testing.assert_close(dense, dense.mT, atol=1e-6, rtol=0)
+    torch.testing.assert_close(operator.row_sums(), torch.ones(batch, 1, height, width, dtype=dtype), atol=1e-4, rtol=0)
+    eigenvalues = torch.linalg.eigvalsh(dense.double())
+    assert eigenvalues.min() >= -1e-5
+    assert eigenvalues.max() <= 1.0001
+
+
+@given(guide=guides(), chosen=options, channels=st.integers(1, 4))
+def test_product_is_that_of_the_dense_matrix_and_keeps_the_mean(
+    guide: torch.Tensor, chosen: dict[str, object], channels: int
+) -> None:
+    operator = build(guide, **chosen)
+    image = noise(guide.shape[0], channels, *guide.shape[2:], seed=1)
+    filtered = operator @ image
+    dense = (operator.to_dense() @ image.flatten(2).mT).mT.reshape(image.shape)
+    torch.testing.assert_close(filtered, dense, atol=1e-10, rtol=0)
+    torch.testing.assert_close(operator.matmul(image), filtered, atol=0, rtol=0)
+    torch.testing.assert_close(filtered.mean((2, 3)), image.mean((2, 3)), atol=1e-6, rtol=0)
+
+
+@given(seed=st.integers(0, 99), order=st.permutations(list(range(30))))
+def test_shuffled_pixels_give_a_shuffled_operator(seed: int, order: list[int]) -> None:
+    """Without patches and coordinates an image is a set of pixels."""
+    guide = noise(1, 2, 5, 6, seed=seed)
+    shuffled = guide.flatten(2)[:, :, order].unflatten(2, (5, 6))
+    kwargs = {"patch_size": 1, "photometric_bandwidth": 0.3, "num_landmarks": 30}
+    dense, other = build(guide, **kwargs).to_dense(), build(shuffled, **kwargs).to_dense()
+    torch.testing.assert_close(other, dense[:, order][:, :, order], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("dimensions", [(-1,), (-2,), (-1, -2)])
+@given(seed=st.integers(0, 99), height=st.integers(1, 7), width=st.integers(1, 7), h_x=st.sampled_from([None, 2.0]))
+def test_a_flipped_guide_gives_a_flipped_filter(
+    seed: int, height: int, width: int, h_x: float | None, dimensions: tuple[int, ...]
+) -> None:
+    guide, image = noise(1, 1, height, width, seed=seed), noise(1, 2, height, width, seed=seed + 100)
+    kwargs = {"num_landmarks": height * width, "photometric_bandwidth": 0.3, "spatial_bandwidth": h_x}
+    straight = build(guide, **kwargs) @ image
+    flipped = build(guide.flip(dimensions), **kwargs) @ image.flip(dimensions)
+    torch.testing.assert_close(flipped.flip(dimensions), straight, atol=1e-5, rtol=0)
+
+
+@given(seed=st.integers(0, 99), height=st.integers(1, 7), width=st.integers(1, 7), h_x=st.sampled_from([None, 2.0]))
+def test_a_transposed_guide_gives_a_transposed_filter(seed: int, height: int, width: int, h_x: float | None) -> None:
+    guide, image = noise(1, 1, height, width, seed=seed), noise(1, 2, height, width, seed=seed + 100)
+    kwargs = {"num_landmarks": height * width, "photometric_bandwidth": 0.3, "spatial_bandwidth": h_x}
+    straight, turned = build(guide, **kwargs) @ image, build(guide.mT, **kwargs) @ image.mT
+    torch.testing.assert_close(turned.mT, straight, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("landmarks", SAMPLINGS)
+@given(offset=st.sampled_from([-0.25, 0.5, 64.0]), scale=st.sampled_from([0.25, 8.0]))
+def test_only_differences_in_units_of_the_bandwidth_count(landmarks: str, offset: float, scale: float) -> None:
+    guide = (noise(1, 2, 9, 8) * 4096).round() / 4096  # exact under these offsets and scales
+    kwargs = {"num_landmarks": 20, "landmarks": landmarks}
+    dense = build(guide, photometric_bandwidth=0.2, **kwargs).to_dense()
+    other = build(guide * scale + offset, photometric_bandwidth=0.2 * scale, **kwargs).to_dense()
+    torch.testing.assert_close(other, dense, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("landmarks", SAMPLINGS)
+def test_the_order_of_the_channels_does_not_count(landmarks: str) -> None:
+    guide = noise(1, 3, 9, 8)
+    kwargs = {"num_landmarks": 20, "landmarks": landmarks, "guide_channels": "all", "photometric_bandwidth": 0.2}
+    dense, other = build(guide, **kwargs).to_dense(), build(guide[:, [2, 0, 1]], **kwargs).to_dense()
+    torch.testing.assert_close(other, dense, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize("landmarks", SAMPLINGS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_batch_gives_what_single_calls_give(landmarks: str, completion: str, dtype: torch.dtype) -> None:
+    guide = torch.cat([picture(name, 40, 48, dtype) for name in ("astronaut", "camera", "moon")])
+    image = noise(3, 2, 40, 48, dtype=dtype)
+    kwargs = {"num_landmarks": 60, "landmarks": landmarks, "completion": completion, "photometric_bandwidth": 0.5}
+    together = build(guide, **kwargs) @ image
+    alone = torch.cat([build(guide[i : i + 1], **kwargs) @ image[i : i + 1] for i in range(3)])
+    torch.testing.assert_close(together, alone, atol=2e-5 if dtype == torch.float32 else 1e-10, rtol=0)
+
+
+def test_a_batch_estimates_what_single_calls_estimate() -> None:
+    guide = torch.cat([picture(name, 40, 48) for name in ("astronaut", "moon")])
+    operator = build(guide)
+    alone = [build(guide[i : i + 1]) for i in range(2)]
+    together = operator.diagnostics().photometric_bandwidth
+    assert together == pytest.approx([o.diagnostics().photometric_bandwidth[0] for o in alone])
+    torch.testing.assert_close(operator.row_sums(), torch.cat([o.row_sums() for o in alone]), atol=1e-9, rtol=0)
+
+
+def test_one_guide_serves_a_batch_of_images_and_the_other_way_round() -> None:
+    operator, image = build(noise(1, 1, 8, 9), num_landmarks=20), noise(3, 2, 8, 9)
+    torch.testing.assert_close(operator @ image, torch.cat([operator @ image[i : i + 1] for i in range(3)]))
+    several = build(noise(3, 1, 8, 9), num_landmarks=20)
+    torch.testing.assert_close(several @ image[:1], several @ image[:1].expand(3, -1, -1, -1))
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("guide_dtype", FLOATS)
+def test_images_keep_their_dtype(dtype: torch.dtype, guide_dtype: torch.dtype) -> None:
+    operator = build(noise(1, 1, 8, 9, dtype=guide_dtype), num_landmarks=20)
+    assert operator.factor.dtype == (torch.float64 if guide_dtype == torch.float64 else torch.float32)
+    image = noise(1, 3, 8, 9, dtype=dtype)
+    filtered = operator @ image
+    assert filtered.dtype == dtype
+    exact = build(noise(1, 1, 8, 9, dtype=guide_dtype).double(), num_landmarks=20) @ image.double()
+    tolerance = 2 * torch.finfo(dtype).eps if dtype.itemsize == 2 else 1e-4
+    torch.testing.assert_close(filtered.double(), exact, atol=tolerance, rtol=0)
+
+
+def test_autocast_changes_nothing() -> None:
+    guide, image = noise(1, 1, 12, 13, dtype=torch.float32), noise(1, 3, 12, 13, dtype=torch.float32)
+    plain = build(guide, num_landmarks=30) @ image
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = build(guide, num_landmarks=30) @ image
+    torch.testing.assert_close(inside, plain, atol=0, rtol=0)
+
+
+def test_strides_do_not_matter() -> None:
+    guide, image = noise(1, 2, 12, 13), noise(1, 3, 12, 13)
+    plain = build(guide, num_landmarks=30) @ image
+
+    def strided(x: torch.Tensor) -> torch.Tensor:
+        y = x.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0)
+        assert not y.is_contiguous()
+        return y
+
+    torch.testing.assert_close(build(strided(guide), num_landmarks=30) @ strided(image), plain, atol=1e-12, rtol=0)
+    channels_last = image.contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(build(guide, num_landmarks=30) @ channels_last, plain, atol=1e-12, rtol=0)
+    wide = noise(1, 2, 12, 26)
+    torch.testing.assert_close(
+        build(wide[..., ::2], num_landmarks=30).to_dense(), build(wide[..., ::2].clone(), num_landmarks=30).to_dense()
+    )
+
+
+@pytest.mark.parametrize("landmarks", SAMPLINGS)
+def test_a_generator_decides_and_none_means_always_the_same(landmarks: str) -> None:
+    guide = noise(1, 1, 20, 20)
+
+    def factor(generator: torch.Generator | None) -> torch.Tensor:
+        return nonlocal_operator(guide, num_landmarks=30, landmarks=landmarks, generator=generator).factor
+
+    assert torch.equal(factor(seeded(3)), factor(seeded(3)))
+    assert torch.equal(factor(None), factor(None))
+    assert landmarks == "uniform" or not torch.equal(factor(seeded(3)), factor(seeded(4)))
+
+
+@pytest.mark.parametrize("landmarks", SAMPLINGS)
+def test_the_global_random_state_is_left_alone(landmarks: str) -> None:
+    before, numpy_before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    operator = nonlocal_operator(noise(1, 3, 20, 20), num_landmarks=30, landmarks=landmarks)
+    operator.spectrum()
+    operator.diagnostics()
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
+
+
+def test_arguments_are_not_written_to() -> None:
+    guide, image = noise(1, 1, 12, 13), noise(1, 3, 12, 13)
+    guide_before, image_before = guide.clone(), image.clone()
+    operator = build(guide, num_landmarks=30)
+    _ = operator @ image
+    operator.spectrum()
+    assert torch.equal(guide, guide_before)
+    assert torch.equal(image, image_before)
+
+
+def test_a_wide_kernel_averages_and_a_narrow_one_leaves_alone() -> None:
+    image = noise(1, 1, 12, 13)
+    averaged = build(image, photometric_bandwidth=1e4, num_landmarks=20) @ image
+    torch.testing.assert_close(averaged, image.mean().expand_as(image), atol=1e-3, rtol=0)
+    untouched = build(image, photometric_bandwidth=1e-4, num_landmarks=20) @ image
+    torch.testing.assert_close(untouched, image, atol=1e-4, rtol=0)
+
+
+def test_custom_patch_weights_are_scaled_to_unit_sum() -> None:
+    guide = noise(1, 1, 12, 13)
+    box = torch.ones(3, 3, dtype=torch.float64)
+    one, other = (build(guide, patch_weights=w, num_landmarks=156).to_dense() for w in (box, 7 * box))
+    torch.testing.assert_close(one, other)
+    only_centre = torch.zeros(3, 3, dtype=torch.float64)
+    only_centre[1, 1] = 1
+    torch.testing.assert_close(
+        build(guide, patch_weights=only_centre, num_landmarks=156).to_dense(),
+        build(guide, patch_size=1, num_landmarks=156).to_dense(),
+    )
+
+
+@pytest.mark.parametrize("bandwidth", ["photometric_bandwidth", "spatial_bandwidth"])
+def test_bandwidths_may_be_tensors_one_per_image(bandwidth: str) -> None:
+    guide = noise(2, 1, 8, 9)
+    values = torch.tensor([0.3, 2.0], dtype=torch.float64)
+    together = build(guide, num_landmarks=72, **{bandwidth: values}).to_dense()
+    for i in range(2):
+        alone = build(guide[i : i + 1], num_landmarks=72, **{bandwidth: values[i].item()}).to_dense()
+        torch.testing.assert_close(together[i : i + 1], alone, atol=1e-6, rtol=0)
+
+
+def test_completion_does_not_depend_on_the_size_of_a_block() -> None:
+    guide = picture("camera", 100, 90)  # three blocks of pixels
+    whole, part = build(guide, num_landmarks=40), build(guide[..., :50, :], num_landmarks=40)
+    for operator in (whole, part):
+        norms = operator.factor.square().sum(1) + operator.diagonal
+        torch.testing.assert_close(norms, torch.ones_like(norms), atol=1e-9, rtol=0)
+
+
+# --- diagnostics and warnings
+
+
+def test_diagnostics_are_measured() -> None:
+    guide = picture("chelsea", 30, 40)
+    operator = build(guide, num_landmarks=50, photometric_bandwidth=20 / 255)
+    figures = operator.diagnostics()
+    w = operator.to_dense()
+    assert figures.pixels == 1200
+    assert figures.num_landmarks == 50
+    assert figures.photometric_bandwidth == [pytest.approx(20 / 255)]
+    assert figures.row_sum_residual == [pytest.approx((w.sum(2) - 1).abs().max().item(), abs=1e-10)]
+    assert figures.diagonal_share[0] == pytest.approx((operator.scaling**2 * operator.diagonal).mean().item())
+    spectrum = operator.spectrum()
+    v = spectrum.eigenvectors.flatten(2)
+    assert figures.rank == [v.shape[1]]
+    residual = (v @ w - spectrum.eigenvalues.unsqueeze(2) * v).norm(dim=2).max().item()
+    assert figures.eigenvector_residual == [pytest.approx(residual, abs=1e-8)]
+    gram = v @ v.mT - torch.eye(v.shape[1], dtype=torch.float64)
+    assert figures.orthogonality == [pytest.approx(gram.abs().max().item(), abs=1e-8)]
+
+
+def test_diagnostics_tell_where_the_plain_method_breaks() -> None:
+    guide = picture("astronaut", 72, 72, torch.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plain = build(guide, photometric_bandwidth=5 / 255, landmarks="uniform", completion="none").diagnostics()
+    completed = build(guide, photometric_bandwidth=5 / 255).diagnostics()
+    print(plain, completed)
+    assert plain.smallest_row_sum[0] < 0.1
+    assert completed.smallest_row_sum[0] >= 0.5
+    assert completed.row_sum_residual[0] <= 1e-4
+
+
+def test_more_landmarks_than_pixels_are_reduced_with_a_warning() -> None:
+    guide = noise(1, 1, 4, 5)
+    with pytest.warns(UserWarning, match="num_landmarks must be at most the number of pixels, 20, got 100"):
+        operator = nonlocal_operator(guide)
+    torch.testing.assert_close(operator.to_dense(), build(guide, num_landmarks=20).to_dense())
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (1, 9), (9, 1), (2, 2), (3, 4)])
+@pytest.mark.parametrize("patch_size", [1, 5, 11])
+def test_images_smaller_than_the_patch(size: tuple[int, int], patch_size: int) -> None:
+    guide = noise(1, 1, *size)
+    operator = build(guide, patch_size=patch_size, photometric_bandwidth=0.2)
+    expected = reference.filter_matrix(guide[0].numpy(), patch_size, 0.2)
+    np.testing.assert_allclose(operator.to_dense()[0], expected, atol=1e-4)
+    assert operator.spectrum().eigenvalues[0, 0].item() == pytest.approx(1, abs=1e-6)
+
+
+# --- gradients, in short
+
+
+def test_backward_gives_finite_gradients_to_everything() -> None:
+    guide, image = noise(2, 1, 12, 13).requires_grad_(), noise(2, 3, 12, 13, seed=1).requires_grad_()
+    h_y = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    h_x = torch.tensor(5.0, dtype=torch.float64, requires_grad=True)
+    operator = build(guide, photometric_bandwidth=h_y, spatial_bandwidth=h_x, num_landmarks=20)
+    (operator @ image).square().sum().backward()
+    for tensor in (guide, image, h_y, h_x):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+        assert tensor.grad.abs().max() > 0

@@ -1,0 +1,91 @@
+"""Balancing: the scaling that gives W unit row sums, its reported residual, and its implicit gradient."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nlfilter_torch.sinkhorn import balance
+from tests import reference
+
+
+def problem(
+    batch: int, marks: int, pixels: int, *, seed: int = 0, dtype: torch.dtype = torch.float64
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A positive factor (B, M, N) with columns of norm below 1, and the diagonal that completes it."""
+    generator = torch.Generator().manual_seed(seed)
+    factor = torch.rand(batch, marks, pixels, generator=generator, dtype=torch.float64)
+    factor = factor / factor.norm(dim=1, keepdim=True) * torch.rand(batch, 1, pixels, generator=generator).double()
+    return factor.to(dtype), (1 - factor.square().sum(1)).to(dtype)
+
+
+def row_sums(factor: torch.Tensor, diagonal: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    factor, diagonal, d = factor.double(), diagonal.double(), d.double()
+    return d * ((factor.mT @ (factor @ d.unsqueeze(2))).squeeze(2) + diagonal * d)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 5e-5), (torch.float64, 1e-10)])
+@pytest.mark.parametrize("pixels", [1, 2, 300, 20000, 70000])
+def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float) -> None:
+    factor, diagonal = problem(2, 6, pixels, dtype=dtype)
+    result = balance(factor, diagonal)
+    assert (result.scaling > 0).all()
+    assert (row_sums(factor, diagonal, result.scaling) - 1).abs().max() <= tolerance
+
+
+def test_scaling_is_the_reference_scaling() -> None:
+    factor, diagonal = problem(1, 5, 80)
+    kernel = (factor.mT @ factor + torch.diag_embed(diagonal))[0].numpy()
+    d = balance(factor, diagonal).scaling[0].numpy()
+    np.testing.assert_allclose(d[:, None] * kernel * d, reference.balanced(kernel), atol=1e-11)
+
+
+@given(scale=st.floats(1e-2, 1e2))
+def test_a_kernel_times_c_is_scaled_by_its_root(scale: float) -> None:
+    factor, diagonal = problem(1, 5, 80)
+    d = balance(factor, diagonal).scaling
+    scaled = balance(factor * scale**0.5, diagonal * scale).scaling
+    torch.testing.assert_close(scaled, d / scale**0.5, rtol=1e-9, atol=0)
+
+
+def test_the_residual_is_that_of_the_scaling() -> None:
+    factor, diagonal = problem(3, 6, 500)
+    result = balance(factor, diagonal, tolerance=1e-3)
+    measured = (row_sums(factor, diagonal, result.scaling) - 1).abs().amax(1)
+    torch.testing.assert_close(result.residual, measured, atol=1e-12, rtol=0)
+    assert result.residual.max() <= 1e-3
+    assert 1 <= result.steps < balance(factor, diagonal).steps
+
+
+def test_identity_is_balanced_already() -> None:
+    result = balance(torch.zeros(1, 3, 50), torch.ones(1, 50))
+    torch.testing.assert_close(result.scaling, torch.ones(1, 50))
+
+
+def test_a_batch_is_its_images() -> None:
+    factor, diagonal = problem(3, 6, 500)
+    together = balance(factor, diagonal).scaling
+    alone = torch.cat([balance(factor[i : i + 1], diagonal[i : i + 1]).scaling for i in range(3)])
+    torch.testing.assert_close(together, alone, rtol=1e-10, atol=0)
+
+
+def test_row_sums_that_stay_off_are_told() -> None:
+    factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])  # a negative affinity, which plain Nystrom produces
+    with pytest.warns(UserWarning, match=r"balancing left row sums off by up to .*completion='diagonal'"):
+        result = balance(factor, torch.zeros(1, 4))
+    assert result.scaling.isfinite().all()
+    assert (result.scaling > 0).all()
+
+
+def test_implicit_gradient_is_the_unrolled_one() -> None:
+    factor, diagonal = (t.requires_grad_() for t in problem(2, 4, 40))
+    weights = torch.randn(2, 40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    implicit = torch.autograd.grad((balance(factor, diagonal).scaling * weights).sum(), (factor, diagonal))
+
+    d = torch.ones(2, 40, dtype=torch.float64)
+    for _ in range(60):
+        d = d * (d * ((factor.mT @ (factor @ d.unsqueeze(2))).squeeze(2) + diagonal * d)) ** (-2 / 3)
+    unrolled = torch.autograd.grad((d * weights).sum(), (factor, diagonal))
+    for found, expected in zip(implicit, unrolled, strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-8)
