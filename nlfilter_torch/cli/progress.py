@@ -14,8 +14,11 @@ def steps(total: int) -> Iterator[Callable[[str], None]]:
     Nothing is drawn where the stream is no terminal, and the bar is gone when the work is done.
     """
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda name: None
+        return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("", total=total, completed=-1)
 
         def begin(name: str) -> None:
