@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from nlfilter_torch.differentiation import once_differentiable
 
 # Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of
 # cancellation are both near 1e-10 then. Below FLOOR the comparison is absolute, since zero eigenvalues are only zero to
@@ -86,13 +87,13 @@ class SymmetricMatrix:
 class _SpectralFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, values: Tensor, vectors: Tensor, differences: Tensor) -> Tensor:
-        ctx.save_for_backward(vectors, differences)
+        ctx.save_for_backward(vectors, differences, matrix)
         return (vectors * values.unsqueeze(-2)) @ vectors.mT
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        vectors, differences = ctx.saved_tensors
+        vectors, differences, _ = ctx.saved_tensors
         inner = vectors.mT @ ((grad + grad.mT) / 2) @ vectors
         grad_matrix = vectors @ (differences * inner) @ vectors.mT
         return grad_matrix, inner.diagonal(dim1=-2, dim2=-1), None, None

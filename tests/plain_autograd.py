@@ -4,6 +4,8 @@ The way that one would write it without this package: nothing blocked, nothing r
 compare gradients with it, and ``benchmarks/gradients.py`` time and memory.
 """
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
@@ -80,6 +82,6 @@ def plain_filter(
     smooth = [y]
     for _ in range(alpha.shape[-1] - 1):
         smooth.append(scaled @ (scaled.mT @ smooth[-1]) + remainder * smooth[-1])
-    layers = [fine - coarse for fine, coarse in zip(smooth[:-1], smooth[1:], strict=True)] + smooth[-1:]
+    layers = [fine - coarse for fine, coarse in pairwise(smooth)] + smooth[-1:]
     filtered = sum(alpha[..., i : i + 1, None] * layer for i, layer in enumerate(layers))
     return filtered.mT.unflatten(2, size)

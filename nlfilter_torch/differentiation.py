@@ -1,0 +1,91 @@
+"""What the hand-written derivatives share: gradients that nobody needs in full, and a refusal of second derivatives."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
+
+Gradients = tuple[Tensor | None, ...]
+
+
+class OuterProduct(Tensor):
+    """``left @ right`` as a gradient of the factor, not formed before somebody looks.
+
+    Products with W and the balancing change the loss by matrices (B, M, N) of a small rank. Autograd adds them up, here
+    by putting their parts side by side, and the backward pass of the factor forms the sum block by block: three copies
+    of the factor are never made. Any other operation sees an ordinary tensor.
+
+    Attributes:
+        left: (B, M, r).
+        right: (B, r, N).
+    """
+
+    left: Tensor
+    right: Tensor
+
+    @staticmethod
+    def __new__(cls, left: Tensor, right: Tensor) -> "OuterProduct":
+        """A tensor with the shape of the product and no memory of its own."""
+        shape = (left.shape[0], left.shape[1], right.shape[2])
+        product: OuterProduct = Tensor._make_wrapper_subclass(cls, shape, dtype=left.dtype, device=left.device)
+        product.left, product.right = left, right
+        return product
+
+    def formed(self) -> Tensor:
+        """The product as an ordinary tensor, (B, M, N)."""
+        return torch.bmm(self.left, self.right)
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
+        if func is torch.ops.aten.detach.default:
+            return args[0]
+        if func is torch.ops.aten.add.Tensor and not kwargs and all(isinstance(a, OuterProduct) for a in args):
+            left = torch.cat([a.left for a in args], dim=2)
+            return OuterProduct(left, torch.cat([a.right for a in args], dim=1))
+        args, kwargs = tree_map_only(OuterProduct, OuterProduct.formed, (args, kwargs or {}))
+        return func(*args, **kwargs)
+
+
+def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:
+    """The columns ``block`` of a gradient (B, M, N), formed or not, in ``out`` (B, M, n)."""
+    if isinstance(gradient, OuterProduct):
+        return torch.bmm(gradient.left, gradient.right[:, :, block], out=out)
+    return out.copy_(gradient[:, :, block])
+
+
+def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
+    """Let a ``backward`` of an autograd Function refuse to be differentiated itself.
+
+    The decorator of this name in torch does so only where the incoming gradient depends on something. Elsewhere it
+    passes what it returns for a constant, and a second derivative would be wrong without a word.
+    """
+
+    @functools.wraps(backward)
+    def wrapper(ctx: Any, *gradients: Tensor) -> Gradients:
+        with torch.no_grad():
+            found = backward(ctx, *gradients)
+        if not torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return found
+        formed = [g.formed() if isinstance(g, OuterProduct) else g for g in found if g is not None]
+        # Hung on what the gradients depend on: autograd visits only what lies on the way to the tensors in question.
+        causes = [t for t in (*ctx.saved_tensors, *gradients) if t is not None and t.requires_grad]
+        refused = iter(_Refusal.apply(len(formed), *formed, *causes))  # type: ignore[no-untyped-call]
+        return tuple(None if g is None else next(refused) for g in found)
+
+    return wrapper
+
+
+class _Refusal(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, count: int, *tensors: Tensor) -> Gradients:
+        return tensors[:count]
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> Gradients:
+        raise RuntimeError(
+            "the filter must not be differentiated twice with respect to its guide, bandwidths or patch weights; "
+            "detach them, which leaves second derivatives in the image and in alpha"
+        )
