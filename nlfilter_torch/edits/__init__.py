@@ -1,0 +1,1 @@
+"""Edits of photographs, each a function of tensors. Paper: Sec. V."""

@@ -1,0 +1,66 @@
+"""Luminance and chroma, put together within the gamut, and strokes of one colour told from those of another."""
+
+import torch
+from torch import Tensor
+
+MAX_COLOURS = 16
+ALIKE = 0.05  # strokes whose chroma differs by less, in units of RGB, are one colour
+
+
+def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Luminance (B, 1, H, W) and chroma ``image - luminance`` (B, 3, H, W), a multiple of YCbCr's, of an RGB image."""
+    from kornia.color import rgb_to_grayscale  # kornia takes half a second to import: only who needs it waits
+
+    luminance = rgb_to_grayscale(image)
+    return luminance, image - luminance
+
+
+def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:
+    """RGB (B, 3, H, W) of that luminance, chroma scaled down where a channel would leave [0, 1].
+
+    Clipping the channels would change luminance instead, which the eye sees first.
+    """
+    # Room towards white where a channel goes up, towards black where it goes down.
+    room = torch.where(chroma > 0, 1 - luminance, luminance).clamp(min=0.0)
+    scale = (room / chroma.abs().clamp(min=1e-6)).amin(1, keepdim=True).clamp(max=1.0)
+    return luminance + scale * chroma
+
+
+def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tell the colours of strokes apart.
+
+    Args:
+        chroma: (B, 3, H, W), read where painted.
+        weights: (B, 1, H, W), above 0 where painted.
+
+    Returns:
+        Regions (B, K, H, W), the weights divided among the K colours; their mean chroma (B, K, 3); and which of them
+        count, (B, K) bool, since an image of fewer colours than others repeats its first one. At most 16 colours:
+        further ones join the nearest. Differentiable in chroma and weights with the grouping held.
+    """
+    with torch.no_grad():
+        labels = torch.stack([_label(c.flatten(1), w.flatten() > 0) for c, w in zip(chroma, weights, strict=True)])
+        numbers = torch.arange(int(labels.max()) + 1, device=labels.device)
+        counts = numbers <= labels.amax(1, keepdim=True)  # (B, K)
+        members = labels.unsqueeze(1) == torch.where(counts, numbers, 0).unsqueeze(2)  # (B, K, N)
+    regions = members * weights.flatten(2)
+    means = regions @ chroma.flatten(2).mT / regions.sum(2, keepdim=True)
+    return regions.unflatten(2, chroma.shape[-2:]), means, counts
+
+
+def _label(chroma: Tensor, painted: Tensor) -> Tensor:
+    """Number (N,) of the colour of every painted pixel of chroma (3, N), -1 for the others."""
+    labels = torch.full_like(painted, -1, dtype=torch.long)
+    open_pixels = painted.clone()
+    leaders: list[Tensor] = []
+    while bool(open_pixels.any()) and len(leaders) < MAX_COLOURS:
+        leader = chroma[:, open_pixels.nonzero()[0]]  # (3, 1)
+        near = open_pixels & ((chroma - leader).norm(dim=0) < ALIKE)
+        labels[near] = len(leaders)
+        open_pixels &= ~near
+        leaders.append(leader)
+    if bool(open_pixels.any()):
+        distance = (chroma[:, open_pixels].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
+        labels[open_pixels] = distance.argmin(1)
+    return labels
+

@@ -1,0 +1,106 @@
+"""Strokes of colour that reach everything of the same colour. Paper: Sec. V-A, Figs. 14, 15."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.checks import check_image, check_same_size
+from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.operator import nonlocal_operator
+from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.strokes import check_painted, propagate_strokes
+
+LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
+FAINT, FULL = 0.25, 0.7  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
+SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
+
+
+@full_precision
+def recolor(
+    image: Tensor,
+    strokes: Tensor,
+    stroke_mask: Tensor,
+    *,
+    keep: Tensor | None = None,
+    reach: float | Tensor = 0.8,
+    photometric_bandwidth: float | Tensor = 0.15,
+    patch_size: int = 3,
+    **options: Any,
+) -> Tensor:
+    """Give the colour of strokes to everything that looks like the spots they are painted on.
+
+    Paper: Sec. V-A, with the regression of :func:`propagate_strokes` in place of k-means: it is soft, and any number of
+    spots with any number of colours divide the image among them. Hue and saturation count before lightness, in CIE Lab.
+
+    Args:
+        image: (B, 3, H, W), RGB in [0, 1].
+        strokes: (B, 3, H, W), RGB; their hue and saturation count, their lightness does not. Strokes of up to 16
+            colours are told apart and reach their own likes.
+        stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
+        keep: (B, 1, H, W) in [0, 1], above 0 on spots whose likes are to stay as they are; None is none. Strokes paint
+            over it.
+        reach: in [0, 1), of :func:`propagate_strokes`; larger takes in what is less alike.
+        photometric_bandwidth: in hundredths of Lab: 0.15 is 15 units.
+        patch_size: of the patches that are compared.
+        **options: further ones of :func:`nonlocal_operator`, such as ``spatial_bandwidth``, ``num_landmarks`` or
+            ``generator``.
+
+    Returns:
+        (B, 3, H, W), of the luminance of ``image``, and equal to it where a pixel resembles no stroke. Differentiable
+        in image, strokes, mask and parameters, with the grouping of colours held.
+
+    Raises:
+        TypeError, ValueError: if a tensor has another size, leaves its range, or nothing is painted.
+
+    Example:
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2
+        >>> image[:, 0, :, 12:] += 0.6  # the right half is reddish
+        >>> strokes, painted = torch.zeros(1, 3, 24, 24), torch.zeros(1, 1, 24, 24)
+        >>> strokes[:, 2], painted[..., 8:12, 16:20] = 1.0, 1.0  # blue, in its midst
+        >>> blue = recolor(image, strokes, painted, num_landmarks=50)
+        >>> torch.equal(blue[..., :8], image[..., :8]), bool((blue[:, 2] > blue[:, 0])[..., 14:].all())
+        (True, True)
+    """
+    check_image(image, "image", channels=3)
+    batch, size = image.shape[0], (image.shape[-2], image.shape[-1])
+    named = [(strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)]
+    for tensor, name, channels in [*named, *([(keep, "keep", 1)] if keep is not None else [])]:
+        check_image(tensor, name, channels=channels, batch=batch)
+        check_same_size(tensor, size, name, "image")
+    check_painted(stroke_mask)
+
+    pixels = image.to(working_dtype(image))
+    spectrum = nonlocal_operator(
+        colour_guide(pixels),
+        photometric_bandwidth=photometric_bandwidth,
+        patch_size=patch_size,
+        guide_channels="all",
+        **options,
+    ).spectrum()
+    luminance, chroma = split_luminance(pixels)
+    painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
+    wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
+    regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
+    known = painted if keep is None else torch.maximum(painted, keep.to(pixels))
+    labels = regions / painted.clamp(min=1e-6)  # 1 on the strokes of a colour, 0 on those of others and on what is kept
+    likeness = propagate_strokes(spectrum, labels, known, strength=0.0, reach=reach)
+    shares = ((likeness - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
+    shares = shares * shares * (3 - 2 * shares) * counts[..., None, None]  # no edge where the colour sets in
+    shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
+
+    # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative saturation.
+    old = (regions.flatten(2) @ chroma.flatten(2).mT) / regions.sum((2, 3)).unsqueeze(2)  # (B, K, 3)
+    along = torch.einsum("bkc,bchw->bkhw", old, chroma) + SATURATION**2
+    relative = along / (old.square().sum(2) + SATURATION**2)[..., None, None]
+    painted_chroma = torch.einsum("bkhw,bkc->bchw", shares * relative.clamp(0.0, 1.5), colours)
+    chroma = chroma * (1 - shares.sum(1, keepdim=True)) + painted_chroma
+    untouched = (shares.sum(1, keepdim=True) == 0).expand_as(pixels)
+    return torch.where(untouched, pixels, merge_luminance(luminance, chroma)).to(image.dtype)
+
+
+def colour_guide(image: Tensor) -> Tensor:
+    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour."""
+    from kornia.color import rgb_to_lab  # kornia takes half a second to import: only who needs it waits
+
+    return rgb_to_lab(image.clamp(0.0, 1.0)) / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
