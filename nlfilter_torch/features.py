@@ -74,4 +74,4 @@ def pad_border(image: Tensor, margin: int) -> Tensor:
 
 def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
     """A bandwidth as a tensor of shape (1,) or (B,) in the dtype and on the device of ``like``."""
-    return torch.as_tensor(value).to(like).reshape(-1)
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
+EXPLAINED = 1e-4  # a residual of the unit diagonal below which a point counts as explained
 SUBSET = 16384  # features that k-means looks at; more of them move the centroids by less than their sampling error
 ITERATIONS = 10
 
@@ -39,12 +40,16 @@ def choose_landmarks(
         chosen = torch.randperm(pixels, generator=generator, device=generator.device)[:count]
         return features[:, :, chosen.to(features.device)]
     subset = features[:, :, _stratified(pixels, max(count, _subset_size(pixels, count)), generator).to(features.device)]
-    return cluster_means(subset, _lloyd(subset.detach(), count), subset[:, :, :count])
+    points = subset.detach()
+    points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
+    start = _pivots(points, count, generator).unsqueeze(1)  # (B, 1, M)
+    assignment = _lloyd(points, points.gather(2, start.expand(-1, points.shape[1], -1)))
+    return cluster_means(subset, assignment, subset.gather(2, start.expand(-1, subset.shape[1], -1)))
 
 
 def _subset_size(pixels: int, count: int) -> int:
     """Small images give k-means a part of their pixels only, so that a batch of them costs what one large one costs."""
-    return min(SUBSET, max(pixels // 8, min(pixels, 32 * count)))
+    return min(SUBSET, max(pixels // 8, min(pixels, 64 * count)))
 
 
 def _grid(size: tuple[int, int], count: int) -> Tensor:
@@ -69,10 +74,38 @@ def _stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
     return indices[torch.randperm(count, generator=generator, device=device)]
 
 
-def _lloyd(points: Tensor, count: int) -> Tensor:
-    """Assignment (B, S) of points (B, D, S) to ``count`` clusters after Lloyd's iterations from the first points."""
-    points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
-    start = points[:, :, :count]
+def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Indices (B, count) of points (B, D, S) to start k-means from: the pivots of a random Cholesky decomposition.
+
+    Each is drawn by what the ones before leave unexplained of the kernel's unit diagonal (Chen, Epperly, Tropp and
+    Webber, 2022). Patches that are rare but unlike all others get a landmark, which a uniform draw would miss, and
+    k-means would never move one there. The fourth power is greedier than the residual itself: at h_y = 40/255 the
+    error of W y on the small astronaut of benchmarks.accuracy is 0.6 grey levels with it, 0.85 without, 1.0 without any
+    such start.
+    """
+    batch, _, size = points.shape
+    draws = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points)
+    norms = points.square().sum(1)  # (B, S)
+    residual = torch.ones_like(norms)
+    columns = points.new_zeros(batch, count, size)
+    pivots = []
+    for step, draw in enumerate(draws.unbind()):
+        cumulative = residual.clamp(min=EXPLAINED).pow(4).cumsum(1)
+        pivot = torch.searchsorted(cumulative, draw * cumulative[:, -1:]).clamp_(max=size - 1)  # (B, 1)
+        at = points.gather(2, pivot.unsqueeze(1).expand(-1, points.shape[1], -1))  # (B, D, 1)
+        exponent = (2 * at.mT @ points).squeeze(1) - norms - norms.gather(1, pivot)
+        before = columns[:, :step]
+        known = before.gather(2, pivot.unsqueeze(1).expand(-1, step, -1))  # (B, step, 1)
+        column = exponent.clamp(-60.0, 0.0).exp() - (known.mT @ before).squeeze(1)
+        column = column * column.gather(1, pivot).clamp(min=EXPLAINED).rsqrt()
+        residual = residual - column.square()
+        columns[:, step] = column
+        pivots.append(pivot)
+    return torch.cat(pivots, dim=1)
+
+
+def _lloyd(points: Tensor, start: Tensor) -> Tensor:
+    """Assignment (B, S) of points (B, D, S) to clusters, by Lloyd from the centres ``start`` (B, D, M)."""
     assignment = assign(points, start)
     for _ in range(ITERATIONS):
         assignment = assign(points, cluster_means(points, assignment, start))
