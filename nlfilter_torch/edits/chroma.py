@@ -63,4 +63,3 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
         distance = (chroma[:, open_pixels].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
         labels[open_pixels] = distance.argmin(1)
     return labels
-

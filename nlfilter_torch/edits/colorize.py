@@ -1,0 +1,107 @@
+"""A grey photograph and a few strokes of colour to a colour photograph. Paper: Sec. V-B, Fig. 16."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.checks import check_choice, check_image, check_same_size
+from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.masks import segment_mask
+from nlfilter_torch.operator import nonlocal_operator
+from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.strokes import check_painted, check_share, propagate_strokes
+
+# Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
+# than 0.3 dB.
+LOCALITY = 0.375  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
+NARROW = {"photometric": 3.0, "spatial": 1 / 3, "landmarks": 1.5}  # the second operator, as multiples of the first
+
+
+@full_precision
+def colorize(
+    grey: Tensor,
+    strokes: Tensor,
+    stroke_mask: Tensor,
+    *,
+    method: Literal["regression", "kmeans"] = "regression",
+    strength: float | Tensor = 1.0,
+    time: float | Tensor = 1.0,
+    photometric_bandwidth: float | Tensor = 40 / 255,
+    spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = 5,
+    num_landmarks: int = 100,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Colour a grey image from strokes; its luminance stays as it is.
+
+    Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first far, then
+    what is left of it near the strokes; ``"kmeans"`` is the paper's way: the image is cut into as many pieces as there
+    are colours, by :func:`segment_mask`.
+
+    Args:
+        grey: (B, 1, H, W) in [0, 1].
+        strokes: (B, 3, H, W), RGB; their chroma counts, their luminance does not.
+        stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted. Grey paint keeps its likes grey.
+        method: ``"regression"`` or ``"kmeans"``.
+        strength: in [0, 1]: at 1 every pixel takes colour, at 0 what resembles no stroke stays grey. For the
+            regression.
+        time: diffusion time t > 0 of the pieces. For k-means.
+        photometric_bandwidth: in units of the image; how much grey levels may differ under one colour.
+        spatial_bandwidth: in pixels; None is 0.375 of the short side.
+        patch_size: of the patches that are compared.
+        num_landmarks: M of the operator.
+        generator: source of randomness for the landmarks; None draws the same for every call.
+
+    Returns:
+        RGB (B, 3, H, W) in [0, 1] where ``grey`` is; a colour too strong for its luminance is weakened. Differentiable
+        in image, strokes, mask and bandwidths under ``"regression"``, in the strokes only under ``"kmeans"``.
+
+    Raises:
+        TypeError, ValueError: if a tensor has another size, leaves its range, or nothing is painted.
+
+    Example:
+        >>> grey = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.1
+        >>> grey[..., 12:] += 0.6
+        >>> strokes, painted = torch.zeros(1, 3, 24, 24), torch.zeros(1, 1, 24, 24)
+        >>> strokes[:, 2, :4, :4], strokes[:, 0, :4, -4:] = 0.8, 0.8  # dark is blue, bright is red
+        >>> painted[..., :4, :4] = painted[..., :4, -4:] = 1
+        >>> colour = colorize(grey, strokes, painted, num_landmarks=50)
+        >>> bool((colour[:, 2] > colour[:, 0])[..., :10].all()), bool((colour[:, 0] > colour[:, 2])[..., 14:].all())
+        (True, True)
+    """
+    check_image(grey, "grey", channels=1)
+    check_choice(method, "method", ("regression", "kmeans"))
+    batch, size = grey.shape[0], (grey.shape[-2], grey.shape[-1])
+    for tensor, name, channels in ((strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)):
+        check_image(tensor, name, channels=channels, batch=batch)
+        check_same_size(tensor, size, name, "grey image")
+    check_painted(stroke_mask)
+    check_share(strength, "strength")
+
+    luminance = grey.to(working_dtype(grey))
+    bandwidth = LOCALITY * min(size) if spatial_bandwidth is None else spatial_bandwidth
+
+    def spectrum(reach: float, tolerance: float, patch: int, landmarks: float) -> Spectrum:
+        return nonlocal_operator(
+            luminance,
+            patch_size=patch,
+            photometric_bandwidth=tolerance * photometric_bandwidth,
+            spatial_bandwidth=reach * bandwidth,
+            num_landmarks=min(round(landmarks * num_landmarks), luminance[0].numel()),
+            generator=generator,
+        ).spectrum()
+
+    painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)
+    wanted = split_luminance(strokes.to(luminance).expand(batch, -1, -1, -1))[1]
+    far = spectrum(1.0, 1.0, patch_size, 1.0)
+    if method == "kmeans":
+        regions, colours, _ = group_colours(wanted, painted)
+        pieces = segment_mask(far, regions, time=time)
+        chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
+    else:
+        chroma = propagate_strokes(far, wanted, painted, strength=strength, smoothness=2.0)
+        near = spectrum(NARROW["spatial"], NARROW["photometric"], min(patch_size, 3), NARROW["landmarks"])
+        chroma = chroma + propagate_strokes(near, wanted - chroma, painted, strength=0.0, reach=0.5, smoothness=4.0)
+    return merge_luminance(luminance, chroma).to(grey.dtype)
