@@ -28,6 +28,7 @@ COARSE_TOLERANCE = 1e-3  # to less than the sampling error of the part
 SOLVE_STEPS = {torch.float32: 10, torch.float64: 21}  # 2 * 5.8^-steps is below the rounding of the dtype
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
 SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
+LARGEST_SCALING = 1e12  # of a pixel that the plain method links to nothing; its square is finite in float32
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, 
             residual = torch.maximum(residual, (sums - 1).abs().amax(1))
             # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
             step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
-            torch.mul(d, step.exp(), out=following[:, block])
+            torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
             next_total += rows @ following[:, block].unsqueeze(2)
         previous, worst = worst, residual.max().item() if watched else worst
         stalled = worst < ALARM and worst > previous / 2  # at the level of rounding
