@@ -49,6 +49,11 @@ class OuterProduct(Tensor):
         return func(*args, **kwargs)
 
 
+def outer_product(left: Tensor, right: Tensor) -> Tensor:
+    """``left @ right``, left unformed where a backward pass of this package may be the only one to look."""
+    return torch.bmm(left, right) if torch.compiler.is_compiling() else OuterProduct(left, right)
+
+
 def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:
     """The columns ``block`` of a gradient (B, M, N), formed or not, in ``out`` (B, M, n)."""
     if isinstance(gradient, OuterProduct):

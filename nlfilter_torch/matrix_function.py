@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nlfilter_torch.compilation import uncompiled
 from nlfilter_torch.differentiation import once_differentiable
 
 # Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of
@@ -43,6 +44,7 @@ class SymmetricMatrix:
         eigenvalues, vectors = torch.linalg.eigh(matrix.detach())
         return SymmetricMatrix(matrix, eigenvalues.flip(-1).clamp(min=0.0), vectors.flip(-1))
 
+    @uncompiled
     def apply(self, function: Callable[[Tensor], Tensor], support: Tensor) -> Tensor:
         """f(A) restricted to the eigenvalues in ``support``.
 

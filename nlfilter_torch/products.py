@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import moment
-from nlfilter_torch.differentiation import OuterProduct, once_differentiable
+from nlfilter_torch.differentiation import once_differentiable, outer_product
 
 
 def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tensor, order: int) -> Tensor:
@@ -100,5 +100,5 @@ class _Powers(torch.autograd.Function):
             left += [moments[i - 1], total]
             right += [d * adjoint, d * before]
             adjoint = d * affinity + r * adjoint
-        grad_factor = OuterProduct(torch.cat(left, dim=2), torch.cat(right, dim=1))
+        grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
         return grad_factor, grad_scaling, grad_remainder, adjoint, None
