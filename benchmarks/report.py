@@ -1,7 +1,7 @@
 """Tables and plots from the JSON of :mod:`benchmarks.speed`: ``python -m benchmarks.report FILE.json``.
 
-Writes ``speed.md`` and two plots into a folder; with ``--readme`` it also puts the table of claims and peers between
-the two marker comments of that file, so that no figure there is ever typed.
+Writes ``speed.md`` and two plots into a folder, and a copy of the JSON where that is another folder; with ``--readme`` it
+also puts the table of claims and peers between the two marker comments of that file, so that no figure is ever typed.
 """
 
 import argparse
@@ -107,13 +107,14 @@ def other_tables(results: Results) -> list[str]:
     for suite, title in (
         ("growth in pixels", "Twice the pixels, taking turns"),
         ("growth in landmarks", "More landmarks, taking turns"),
+        ("pictures", "Other photographs, enlarged or reduced, taking turns"),
         ("batches", "A batch of crops and one image of as many pixels, taking turns"),
         ("dense", "Beside the dense filter, on an image that it can do"),
         ("autograd", "Beside the same filter in plain autograd"),
         ("imports", "Imports, in fresh processes that take turns"),
     ):
         rows = [
-            [record["label"] if suite != "imports" else "", name, seconds(timing["median"]), seconds(timing["iqr"])]
+            [_case_name(record), name, seconds(timing["median"]), seconds(timing["iqr"])]
             for record in records_of(results, suite)
             for name, timing in record["timings"].items()
         ]
@@ -133,6 +134,15 @@ def other_tables(results: Results) -> list[str]:
         header = ["case", "work", "factor, MiB", "added at the peak, MiB", "factors"]
         parts.append("## Peak memory of fresh processes\n\n" + table(header, rows))
     return parts
+
+
+def _case_name(record: Record) -> str:
+    """What tells a record from the others of its suite."""
+    if record["suite"] == "imports":
+        return "a fresh process"
+    if record["suite"] == "pictures":
+        return f"{record['case']['picture']}, {record['steps']} balancing steps"
+    return record["label"]
 
 
 def machine_lines(results: Results) -> str:
@@ -207,6 +217,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     results = json.loads(options.file.read_text())
     folder = options.folder or options.file.parent
+    if folder.resolve() != options.file.parent.resolve():
+        write(folder / "speed.json", options.file.read_bytes())
     text = report(results)
     write(folder / "speed.md", text.encode())
     if records_of(results, "sizes") or records_of(results, "landmarks"):

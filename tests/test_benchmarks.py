@@ -15,7 +15,7 @@ from benchmarks.speed.floor import READS, floor_calls, floor_summary
 from benchmarks.speed.plan import QUICK
 from benchmarks.speed.timing import Timing, take_turns
 
-SUITES = ("main", "growth", "batches", "slow", "dense", "autograd", "landmarks", "dtypes")
+SUITES = ("main", "growth", "batches", "pictures", "slow", "dense", "autograd", "landmarks", "dtypes")
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ def skimage_nlm(patch: int, distance: int) -> Callable[[Case], Call]:
     def prepare(case: Case) -> Call:
         from skimage.restoration import denoise_nl_means
 
-        image = case.image()[0, 0].numpy()
+        image = case.image()[0, 0].cpu().numpy()
         return lambda: denoise_nl_means(image, patch_size=patch, patch_distance=distance, h=0.04, fast_mode=True)
 
     return prepare
@@ -54,7 +54,7 @@ def opencv_nlm(case: Case) -> Call:
     import cv2
 
     cv2.setNumThreads(case.used_threads)
-    image = (case.image()[0, 0].numpy() * 255).round().astype(np.uint8)
+    image = (case.image()[0, 0].cpu().numpy() * 255).round().astype(np.uint8)
     return lambda: cv2.fastNlMeansDenoising(image, None, 10, 7, 21)
 
 

@@ -31,7 +31,9 @@ class Plan:
         patches: sizes.
         crops: number, side and m of the batches.
         dense_side: of the image that the dense filter can do.
+        pictures: that the main operator is built from, too.
         seconds: that a group of calls takes turns, after the least number of rounds.
+        claimed_seconds: the same for the groups that the claims rest on.
         least: rounds.
         processes: that measure what an import takes.
         probes: cases whose memory is measured.
@@ -49,7 +51,9 @@ class Plan:
     patches: tuple[int, ...] = (1, 3, 5, 7, 11)
     crops: tuple[int, int, int] = (16, 128, 64)
     dense_side: int = 256
-    seconds: float = 6.0
+    pictures: tuple[str, ...] = ("retina", "astronaut", "camera", "coffee", "hubble_deep_field")
+    seconds: float = 4.0
+    claimed_seconds: float = 30.0
     least: int = 3
     processes: int = 7
     probes: int = 5
@@ -73,7 +77,9 @@ QUICK = Plan(
     patches=(1, 3),
     crops=(4, 16, 8),
     dense_side=32,
+    pictures=("retina", "camera"),
     seconds=0.0,
+    claimed_seconds=0.0,
     least=1,
     processes=1,
     probes=2,
@@ -94,12 +100,10 @@ def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) 
 
 
 def measured(
-    suite: str, plan: Plan, case: Case, calls: Mapping[str, Call], *, error: bool = False, **facts: Any
+    suite: str, case: Case, calls: Mapping[str, Call], *, seconds: float, least: int, error: bool = False, **facts: Any
 ) -> Record:
     """Let ``calls`` take turns with the floor of the case."""
-    timings = take_turns(
-        {**calls, **floor_calls(case)}, threads=case.used_threads, seconds=plan.seconds, least=plan.least
-    )
+    timings = take_turns({**calls, **floor_calls(case)}, threads=case.used_threads, seconds=seconds, least=least)
     if error:
         facts["error"] = rounding_error(case, case.image())
     return record(suite, case, timings, **facts)

@@ -69,6 +69,13 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
     return {"rms": difference.square().mean().sqrt().item(), "max": difference.abs().max().item()}
 
 
+def held(case: Case) -> tuple[float, float]:
+    """MiB in use now and at most so far: of the process on the CPU, of torch's allocator on an accelerator."""
+    if case.device == "cpu":
+        return resident("VmRSS"), resident("VmHWM")
+    return torch.cuda.memory_allocated() / MIB, torch.cuda.max_memory_allocated() / MIB
+
+
 def main() -> None:
     """Measure one case in this process."""
     work, given = sys.argv[1], json.loads(sys.argv[2])
@@ -79,9 +86,9 @@ def main() -> None:
 
     image = case.image()
     forget_peak()
-    before = resident("VmRSS")
+    before, _ = held(case)
     WORKS[work](case, image)
-    peak = resident("VmHWM")
+    _, peak = held(case)
     print(json.dumps({"added_mib": peak - before, "process_mib": peak, "factor_mib": case.factor_bytes / MIB}))
 
 

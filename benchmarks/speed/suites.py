@@ -69,9 +69,10 @@ def main_case(plan: Plan) -> Iterator[Record]:
     others, missing = peers.prepare_all(peers.QUICK_PEERS, case)
     yield measured(
         "main",
-        plan,
         case,
         calls | others,
+        seconds=plan.claimed_seconds,
+        least=plan.least,
         error=True,
         missing=missing,
         does={peer.name: peer.does for peer in peers.QUICK_PEERS},
@@ -133,32 +134,36 @@ def autograd(plan: Plan) -> Iterator[Record]:
     yield record("autograd", case, timings)
 
 
+def _measured(suite: str, plan: Plan, case: Case, calls: dict[str, Call]) -> Record:
+    return measured(suite, case, calls, seconds=plan.seconds, least=plan.least, error=True)
+
+
 def sizes(plan: Plan) -> Iterator[Record]:
     """Time, backward and error over the number of pixels."""
     for height, width in plan.sizes:
         case = plan.case(height=height, width=width)
-        yield measured("sizes", plan, case, filter_calls(case, backward=case.pixels <= 1 << 20), error=True)
+        yield _measured("sizes", plan, case, filter_calls(case, backward=case.pixels <= 1 << 20))
 
 
 def landmarks(plan: Plan) -> Iterator[Record]:
     """The same over the number of landmarks."""
     for count in plan.counts:
         case = plan.case(height=plan.counts_side, width=plan.counts_side, landmarks=count)
-        yield measured("landmarks", plan, case, filter_calls(case, backward=True), error=True)
+        yield _measured("landmarks", plan, case, filter_calls(case, backward=True))
 
 
 def patches(plan: Plan) -> Iterator[Record]:
     """The same over the size of the patches."""
     for size in plan.patches:
         case = plan.case(height=plan.counts_side, width=plan.counts_side, patch_size=size)
-        yield measured("patches", plan, case, filter_calls(case, backward=True), error=True)
+        yield _measured("patches", plan, case, filter_calls(case, backward=True))
 
 
 def dtypes(plan: Plan) -> Iterator[Record]:
     """The same over number types; half precision is computed in float32."""
     for dtype in ("float32", "float64", "bfloat16"):
         case = plan.case(height=plan.counts_side, width=plan.counts_side, dtype=dtype)
-        yield measured("dtypes", plan, case, filter_calls(case, backward=True), error=True)
+        yield _measured("dtypes", plan, case, filter_calls(case, backward=True))
 
 
 def threads(plan: Plan) -> Iterator[Record]:
@@ -166,7 +171,8 @@ def threads(plan: Plan) -> Iterator[Record]:
     counts = plan.threads or tuple(sorted({1, torch.get_num_threads()}))
     for count in counts:
         case = plan.case(threads=count)
-        yield measured("threads", plan, case, {"operator": discard(case.operator, case.image())})
+        calls = {"operator": discard(case.operator, case.image())}
+        yield measured("threads", case, calls, seconds=plan.seconds, least=plan.least)
 
 
 def growth(plan: Plan) -> Iterator[Record]:
@@ -176,9 +182,20 @@ def growth(plan: Plan) -> Iterator[Record]:
         "growth in landmarks": [plan.case(landmarks=count) for count in plan.growth],
     }.items():
         calls = {case.label(): discard(case.operator, case.image()) for case in series}
-        timings = take_turns(calls, threads=series[0].used_threads, seconds=plan.seconds, least=plan.least)
+        timings = take_turns(calls, threads=series[0].used_threads, seconds=plan.claimed_seconds, least=plan.least)
         for case in series:
             yield record(suite, case, {"operator": timings[case.label()]})
+
+
+def pictures(plan: Plan) -> Iterator[Record]:
+    """The main operator of several photographs: only the number of balancing steps depends on what they show."""
+    series = [plan.case(picture=name) for name in plan.pictures]
+    calls = {case.picture: discard(case.operator, case.image()) for case in series}
+    timings = take_turns(calls, threads=series[0].used_threads, seconds=plan.seconds, least=plan.least)
+    for case in series:
+        operator = case.operator(case.image())
+        facts = {"steps": operator.balancing_steps, "residual": operator.residual.max().item()}
+        yield record("pictures", case, {"operator": timings[case.picture]}, **facts)
 
 
 def batches(plan: Plan) -> Iterator[Record]:
@@ -191,7 +208,9 @@ def batches(plan: Plan) -> Iterator[Record]:
     ]
     steps = {case.label(): _step(case) for case in series}
     operators = {f"{case.label()}, operator": discard(case.operator, case.image()) for case in series}
-    timings = take_turns(steps | operators, threads=series[0].used_threads, seconds=plan.seconds, least=plan.least)
+    timings = take_turns(
+        steps | operators, threads=series[0].used_threads, seconds=plan.claimed_seconds / 2, least=plan.least
+    )
     for case in series:
         pair = {"training step": timings[case.label()], "operator": timings[f"{case.label()}, operator"]}
         yield record("batches", case, pair)
@@ -239,6 +258,7 @@ SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
     "main": main_case,
     "growth": growth,
     "batches": batches,
+    "pictures": pictures,
     "memory": memory,
     "imports": imports,
     "slow": slow_peers,
