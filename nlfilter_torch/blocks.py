@@ -25,6 +25,22 @@ def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = 
         yield slice(start, min(start + step, count))
 
 
+def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Tensor]]]:
+    """The blocks of :func:`pixel_blocks`, each with ``count`` uninitialised (B, M, n) buffers that are used again.
+
+    Args:
+        factor: (B, M, N), whose shape, dtype and device the buffers take.
+        count: how many buffers.
+    """
+    batch, marks, pixels = factor.shape
+    storage: list[Tensor] = []
+    for block in pixel_blocks(pixels, batch, factor.device):
+        length = block.stop - block.start
+        if not storage or length != storage[0].shape[2]:
+            storage = [factor.new_empty(batch, marks, length) for _ in range(count)]
+        yield block, storage
+
+
 def moment(factor: Tensor, images: Tensor) -> Tensor:
     """``factor @ images^T``, the sum over all pixels to which W reduces them; gathered in float64.
 

@@ -94,6 +94,15 @@ def check_positive(value: float | Tensor, name: str) -> None:
         raise ValueError(f"{name} must be positive and finite, got {value}; pass a positive number")
 
 
+def check_bandwidth(value: float | Tensor, name: str, batch: int) -> None:
+    """Raise unless ``value`` is one positive bandwidth, or one for every image of the batch."""
+    check_positive(value, name)
+    if isinstance(value, Tensor) and value.numel() != 1 and tuple(value.shape) != (batch,):
+        raise ValueError(
+            f"{name} must be a number or have shape () or ({batch},), got {tuple(value.shape)}; reshape it"
+        )
+
+
 def check_count(value: int, name: str) -> None:
     """Raise unless ``value`` is a positive integer."""
     if isinstance(value, bool) or not isinstance(value, int):

@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.checks import check_finite, check_patch_size
+
 GuideChannels = Literal["luminance", "all"]
 Bandwidth = float | Tensor | None
 
@@ -18,6 +20,23 @@ def patch_window(patch_size: int) -> Tensor:
     profile = torch.signal.windows.gaussian(patch_size, std=patch_size / 4, dtype=torch.float64)
     window = torch.outer(profile, profile)
     return window / window.sum()
+
+
+def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
+    """The weights of the patch (p, p), of unit sum."""
+    if patch_weights is None:
+        check_patch_size(patch_size)
+        return patch_window(patch_size)
+    if patch_weights.ndim != 2 or patch_weights.shape[0] != patch_weights.shape[1] or patch_weights.shape[0] % 2 == 0:
+        raise ValueError(
+            f"patch_weights must have shape (p, p) with odd p, got {tuple(patch_weights.shape)}; crop or pad them"
+        )
+    check_finite(patch_weights, "patch_weights")
+    if patch_weights.device.type == "cpu" and not bool((patch_weights >= 0).all() & (patch_weights.sum() > 0)):
+        raise ValueError(
+            "patch_weights must be non-negative with a positive sum, got others; take their softmax or square"
+        )
+    return patch_weights / patch_weights.sum()
 
 
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
@@ -35,6 +54,7 @@ def extract_features(
     patch_weights: Tensor,
     photometric_bandwidth: float | Tensor,
     spatial_bandwidth: Bandwidth = None,
+    origin: tuple[int, int] = (0, 0),
 ) -> Tensor:
     """Features whose squared distance is the exponent of the kernel: ``K_ij = exp(-||x_i - x_j||^2)``.
 
@@ -45,6 +65,7 @@ def extract_features(
         patch_weights: (p, p), non-negative, of unit sum; differentiable.
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
         spatial_bandwidth: h_x in pixels, likewise; None leaves the coordinates out.
+        origin: coordinates (row, column) of the first pixel.
 
     Returns:
         (B, D, H*W) with D = C p^2, plus 2 with coordinates. Pixels come last: each feature is a plane.
@@ -57,8 +78,8 @@ def extract_features(
     features = (planes.permute(0, 1, 4, 5, 2, 3) * scale).flatten(1, 3).flatten(2)  # (B, C*p*p, N)
     if spatial_bandwidth is None:
         return features
-    rows = torch.arange(height, dtype=guide.dtype, device=guide.device)
-    columns = torch.arange(width, dtype=guide.dtype, device=guide.device)
+    rows = origin[0] + torch.arange(height, dtype=guide.dtype, device=guide.device)
+    columns = origin[1] + torch.arange(width, dtype=guide.dtype, device=guide.device)
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
     coordinates = grid / _per_image(spatial_bandwidth, guide).view(-1, 1, 1)
     return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from nlfilter_torch.blocks import pixel_blocks
+from nlfilter_torch.blocks import buffered_blocks
+from nlfilter_torch.differentiation import once_differentiable, write_columns
 
 Completion = Literal["diagonal", "none"]
 
@@ -51,11 +51,24 @@ def nystrom_factor(
     return factor, diagonal
 
 
-def _affinity(features: Tensor, landmarks: Tensor, centre: Tensor) -> Tensor:
-    """Affinities (B, M, n) of a block of features (B, D, n), both taken relative to ``centre`` (B, D, 1)."""
-    x, z = features - centre, landmarks - centre
-    exponent = torch.baddbmm(z.square().sum(1).unsqueeze(2), z.mT, x, beta=-1, alpha=2)
-    return exponent.sub_(x.square().sum(1).unsqueeze(1)).clamp_(SMALLEST_EXPONENT, 0.0).exp_()
+class _Affinity:
+    """Affinities of blocks of features to the landmarks, written into one buffer after the other.
+
+    A fresh tensor for every block would cost more in page faults than the exponential does.
+    """
+
+    def __init__(self, landmarks: Tensor) -> None:
+        self.centre = landmarks.mean(dim=2, keepdim=True)  # distances are formed near the origin, where they are exact
+        self.landmarks = landmarks - self.centre  # (B, D, M)
+        self.doubled = 2.0 * self.landmarks.mT
+        self.norms = self.landmarks.square().sum(1).unsqueeze(2)  # (B, M, 1)
+
+    def __call__(self, features: Tensor, out: Tensor) -> tuple[Tensor, Tensor]:
+        """The affinities (B, M, n) of features (B, D, n), in ``out``, and the features relative to the centre."""
+        centred = features - self.centre
+        torch.bmm(self.doubled, centred, out=out)
+        out.sub_(self.norms).sub_(centred.square().sum(1, keepdim=True))
+        return out.clamp_(SMALLEST_EXPONENT, 0.0).exp_(), centred
 
 
 class _NystromFactor(torch.autograd.Function):
@@ -69,15 +82,18 @@ class _NystromFactor(torch.autograd.Function):
         factor = features.new_empty(batch, landmarks.shape[2], pixels)
         diagonal = features.new_zeros(batch, pixels)
         scale = features.new_ones(batch, pixels)
-        centre = landmarks.mean(dim=2, keepdim=True)
-        for block in pixel_blocks(pixels, batch, features.device):
-            rows = factor[:, :, block]
-            torch.bmm(whitening, _affinity(features[:, :, block], landmarks, centre), out=rows)
+        affinity = _Affinity(landmarks)
+        for block, (first, second) in buffered_blocks(factor, 2):
+            kernel, _ = affinity(features[:, :, block], first)
+            columns = torch.bmm(whitening, kernel, out=second)  # into a buffer: rows of the factor are far apart
             if complete:
-                norm = rows.square().sum(1)  # (B, n)
-                scale[:, block] = norm.clamp(min=1.0).rsqrt_()
+                norm = torch.mul(columns, columns, out=first).sum(1)  # (B, n)
                 diagonal[:, block] = (1.0 - norm).clamp_(min=0.0)
-                rows.mul_(scale[:, None, block])
+                scale[:, block] = norm.clamp_(min=1.0).rsqrt_()
+                # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
+                if features.device.type != "cpu" or bool((norm < 1.0).any()):
+                    columns.mul_(scale[:, None, block])
+            factor[:, :, block] = columns
         ctx.save_for_backward(features, landmarks, whitening, factor, scale)
         ctx.complete = complete
         ctx.mark_non_differentiable(scale)
@@ -87,26 +103,22 @@ class _NystromFactor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
-        batch, _, pixels = features.shape
-        centre = landmarks.mean(dim=2, keepdim=True)
+        affinity = _Affinity(landmarks)
         grad_features = torch.empty_like(features)
         grad_landmarks = torch.zeros_like(landmarks, dtype=torch.float64)
         grad_whitening = torch.zeros_like(whitening, dtype=torch.float64)
-        for block in pixel_blocks(pixels, batch, features.device):
-            affinity = _affinity(features[:, :, block], landmarks, centre)
-            rows, grad = factor[:, :, block], grad_factor[:, :, block]
+        for block, (first, second, third) in buffered_blocks(factor, 3):
+            kernel, centred = affinity(features[:, :, block], first)
+            grad = write_columns(grad_factor, block, second)
             if ctx.complete:
-                # Scaled columns u / |u| lose the gradient along themselves; the others pass it on, and that of 1 -
-                # |u|^2.
+                # Columns scaled to u / |u| lose the gradient along themselves; the others gain that of 1 - |u|^2.
                 shrink = scale[:, None, block]
-                along = torch.where(
-                    shrink < 1.0, (rows * grad).sum(1, keepdim=True), 2.0 * grad_diagonal[:, None, block]
-                )
-                grad = (grad - rows * along) * shrink
-            grad_whitening += grad @ affinity.mT
+                along = torch.mul(factor[:, :, block], grad, out=third).sum(1, keepdim=True)
+                along = torch.where(shrink < 1.0, along, 2.0 * grad_diagonal[:, None, block])
+                grad.sub_(torch.mul(factor[:, :, block], along, out=third)).mul_(shrink)
+            grad_whitening += grad @ kernel.mT
             # K_im = exp(-|x_i - z_m|^2): its derivative is -2 (x_i - z_m) K_im in x_i and the opposite in z_m.
-            pull = (whitening.mT @ grad).mul_(affinity)  # (B, M, n)
-            x, z = features[:, :, block] - centre, landmarks - centre
-            grad_features[:, :, block] = 2.0 * (z @ pull - x * pull.sum(1, keepdim=True))
-            grad_landmarks += 2.0 * (x @ pull.mT - z * pull.sum(2).unsqueeze(1))
+            pull = torch.bmm(whitening.mT, grad, out=third).mul_(kernel)  # (B, M, n)
+            grad_features[:, :, block] = 2.0 * (affinity.landmarks @ pull - centred * pull.sum(1, keepdim=True))
+            grad_landmarks += 2.0 * (centred @ pull.mT - affinity.landmarks * pull.sum(2).unsqueeze(1))
         return grad_features, grad_landmarks.to(landmarks), grad_whitening.to(whitening), None

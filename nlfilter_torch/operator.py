@@ -10,13 +10,16 @@ from torch import Tensor
 from nlfilter_torch.bandwidth import estimate_bandwidth
 from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import (
+    check_bandwidth,
     check_choice,
     check_count,
     check_image,
     check_positive,
     check_same_size,
 )
-from nlfilter_torch.features import GuideChannels, extract_features, patch_window, reduce_channels
+from nlfilter_torch.compilation import uncompiled
+from nlfilter_torch.features import GuideChannels, extract_features, reduce_channels, unit_window
+from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.nystrom import Completion, nystrom_factor, whitener
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -70,20 +73,18 @@ class NonlocalOperator:
         diagonal: c, (B, N), what the landmarks miss of the kernel's unit diagonal; zeros without completion.
         scaling: d, (B, N), positive.
         size: (H, W).
-        photometric_bandwidth: h_y that was used, (B,) or (1,).
+        kernel: the recipe of factor and diagonal, for the pixels of other guides.
         residual: largest deviation of a row sum from 1 when balancing stopped, (B,).
         balancing_steps: sweeps over the factor that balancing took.
-        completion: ``"diagonal"`` or ``"none"``.
     """
 
     factor: Tensor
     diagonal: Tensor
     scaling: Tensor
     size: tuple[int, int]
-    photometric_bandwidth: Tensor
+    kernel: Kernel
     residual: Tensor
     balancing_steps: int
-    completion: Completion
 
     def matmul(self, image: Tensor) -> Tensor:
         """``W y``, also written ``operator @ image``. Paper: eq. (2).
@@ -132,6 +133,7 @@ class NonlocalOperator:
         kernel = self.factor.mT @ self.factor + torch.diag_embed(self.diagonal)
         return self.scaling.unsqueeze(2) * kernel * self.scaling.unsqueeze(1)
 
+    @uncompiled
     @full_precision
     def spectrum(self, rank: int | None = None) -> Spectrum:
         """Leading eigenvalues and eigenvectors. Paper: eq. (3), (4).
@@ -144,7 +146,7 @@ class NonlocalOperator:
         """
         if rank is not None:
             check_count(rank, "rank")
-        diagonal = self.diagonal if self.completion == "diagonal" else None
+        diagonal = self.diagonal if self.kernel.completion == "diagonal" else None
         return compute_spectrum(self.factor, self.scaling, diagonal, self.size, rank)
 
     @full_precision
@@ -160,7 +162,7 @@ class NonlocalOperator:
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
         total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1)).to(self.factor)
         kernel_sums = (total.mT @ self.factor).squeeze(1) + self.diagonal
-        bandwidth = self.photometric_bandwidth.expand(self.factor.shape[0])
+        bandwidth = torch.as_tensor(self.kernel.photometric_bandwidth).reshape(-1).expand(self.factor.shape[0])
         return Diagnostics(
             pixels=self.factor.shape[2],
             num_landmarks=self.factor.shape[1],
@@ -176,6 +178,7 @@ class NonlocalOperator:
         )
 
 
+@uncompiled
 @full_precision
 def nonlocal_operator(
     guide: Tensor,
@@ -238,8 +241,15 @@ def nonlocal_operator(
         check_positive(tolerance, "tolerance")
     height, width = guide.shape[-2:]
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-    weights = patch_window(patch_size) if patch_weights is None else patch_weights
-    bandwidth = estimate_bandwidth(guide) if isinstance(photometric_bandwidth, str) else photometric_bandwidth
+    weights = unit_window(patch_size, patch_weights).to(guide)
+    if isinstance(photometric_bandwidth, str):
+        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
+        bandwidth: float | Tensor = estimate_bandwidth(guide)
+    else:
+        bandwidth = photometric_bandwidth
+        check_bandwidth(bandwidth, "photometric_bandwidth", guide.shape[0])
+    if spatial_bandwidth is not None:
+        check_bandwidth(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
     if num_landmarks > height * width:
         warnings.warn(
             f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; "
@@ -252,15 +262,15 @@ def nonlocal_operator(
         guide, patch_weights=weights, photometric_bandwidth=bandwidth, spatial_bandwidth=spatial_bandwidth
     )
     points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator)
-    factor, diagonal = nystrom_factor(features, points, whitener(points), completion)
+    kernel = Kernel(weights, bandwidth, spatial_bandwidth, guide_channels, points, whitener(points), completion)
+    factor, diagonal = nystrom_factor(features, points, kernel.whitening, completion)
     balancing = balance(factor, diagonal, tolerance=tolerance)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,
         scaling=balancing.scaling,
         size=(height, width),
-        photometric_bandwidth=torch.as_tensor(bandwidth, dtype=guide.dtype).detach().reshape(-1),
+        kernel=kernel,
         residual=balancing.residual,
         balancing_steps=balancing.steps,
-        completion=completion,
     )

@@ -14,17 +14,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+from nlfilter_torch.differentiation import once_differentiable, outer_product
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 MAX_STEPS = 40
 ACCELERATOR_STEPS = 12  # on an accelerator a look at the residual would stop the queue: a fixed number of steps instead
 ALARM = 1e-3  # a residual that balancing ends above is worth a warning
-COARSE = 1 << 16  # an image with more pixels starts from the balancing of every STRIDE-th,
-STRIDE = 16
-COARSE_TOLERANCE = 1e-3  # to less than the sampling error of the part
 SOLVE_STEPS = {torch.float32: 10, torch.float64: 21}  # 2 * 5.8^-steps is below the rounding of the dtype
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
 SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
@@ -77,16 +74,9 @@ def _chebyshev(low: float, high: float) -> Iterator[tuple[float, float]]:
 
 
 def _start(factor: Tensor, diagonal: Tensor) -> Tensor:
-    """A first guess of d (B, N): from the balancing of a part of the pixels, or (K 1)^(-1/2)."""
-    pixels = factor.shape[2]
-    if pixels <= COARSE:
-        affinity = (factor.sum(2, keepdim=True).mT @ factor).squeeze(1) + diagonal
-        return affinity.clamp(min=SMALLEST_AFFINITY).rsqrt()
-    part = factor[:, :, ::STRIDE].contiguous()
-    scaling, _, _ = _solve(part, diagonal[:, ::STRIDE], COARSE_TOLERANCE)
-    return scaling_from_moment(
-        factor, diagonal, moment(part, scaling.unsqueeze(1)).to(factor) * (pixels / part.shape[2])
-    )
+    """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
+    total = moment(factor, torch.ones_like(diagonal).unsqueeze(1)).to(factor)
+    return ((total.mT @ factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
 
 
 def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
@@ -155,5 +145,5 @@ class _Balance(torch.autograd.Function):
                 total += rows @ (d * x).unsqueeze(2)
         a = scaling * solution
         totals = torch.cat([moment(factor, scaling.unsqueeze(1)), total], dim=2).to(factor)  # (B, M, 2)
-        grad_factor = -(totals @ torch.stack([a, scaling], dim=1))
+        grad_factor = outer_product(totals, torch.stack([-a, -scaling], dim=1))
         return grad_factor, -a * scaling, None

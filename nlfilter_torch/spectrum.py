@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from nlfilter_torch.blocks import moment, pixel_blocks
+from nlfilter_torch.blocks import buffered_blocks, moment
+from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
 
 # Directions of G below this are rounding: float32 eigenvectors from above it are orthonormal to 1e-3.
@@ -141,25 +141,28 @@ class _WeightedGram(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, factor: Tensor, weights: Tensor) -> Tensor:
-        batch, marks, pixels = factor.shape
+        batch, marks, _ = factor.shape
         count = weights.shape[1]
-        total = factor.new_zeros(batch, count * marks, marks, dtype=torch.float64)
-        for block in pixel_blocks(pixels, batch, factor.device):
-            rows = factor[:, :, block]
-            weighted = (rows.unsqueeze(1) * weights[:, :, None, block]).flatten(1, 2)  # (B, J*M, n)
-            total += weighted @ rows.mT
+        total = factor.new_zeros(batch, count, marks, marks, dtype=torch.float64)
+        for block, (first, *others) in buffered_blocks(factor, 1 + count):
+            rows = first.copy_(factor[:, :, block])
+            for j, weighted in enumerate(others):
+                total[:, j] += torch.mul(rows, weights[:, j : j + 1, block], out=weighted) @ rows.mT
         ctx.save_for_backward(factor, weights)
-        return total.unflatten(1, (count, marks))
+        return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
         factor, weights = ctx.saved_tensors
         grad_factor, grad_weights = torch.empty_like(factor), torch.empty_like(weights)
-        symmetric = (grad + grad.mT).flatten(1, 2).to(factor)  # (B, J*M, M)
-        for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device):
-            rows = factor[:, :, block]
-            pulled = (symmetric @ rows).unflatten(1, (weights.shape[1], -1))  # (B, J, M, n)
-            grad_factor[:, :, block] = (pulled * weights[:, :, None, block]).sum(1)
-            grad_weights[:, :, block] = (pulled * rows.unsqueeze(1)).sum(2) / 2
+        symmetric = (grad + grad.mT).to(factor)  # (B, J, M, M)
+        for block, (rows, pulled, product, total) in buffered_blocks(factor, 4):
+            rows.copy_(factor[:, :, block])
+            total.zero_()
+            for j in range(weights.shape[1]):
+                torch.bmm(symmetric[:, j], rows, out=pulled)
+                grad_weights[:, j, block] = torch.mul(pulled, rows, out=product).sum(1) / 2
+                total += pulled.mul_(weights[:, j : j + 1, block])
+            grad_factor[:, :, block] = total
         return grad_factor, grad_weights
