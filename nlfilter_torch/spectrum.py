@@ -21,7 +21,7 @@ from nlfilter_torch.matrix_function import SymmetricMatrix
 # Directions of G below this are rounding: float32 eigenvectors from above it are orthonormal to 1e-3.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
 # Eigenvalues this close to 1 count as 1 when the constant vector is picked out of their eigenspace.
-CLUSTER = {torch.float32: 1e-4, torch.float64: 1e-8}
+CLUSTER = {torch.float32: 1e-3, torch.float64: 1e-8}
 
 Response = Callable[[Tensor], Tensor]
 
@@ -58,7 +58,8 @@ class Spectrum:
     def eigenvectors(self) -> Tensor:
         """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero where those are padding.
 
-        The first is the constant one, positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
+        The first is the constant one as far as the landmarks span it (exactly so for W; without completion to the
+        tolerance of the balancing), positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
         limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the
         choice of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
         """

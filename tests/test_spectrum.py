@@ -94,10 +94,9 @@ def test_ritz_values_lie_where_they_must(name: str, bandwidth: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", ["astronaut", "two colours", "constant"])
+@pytest.mark.parametrize("name", ["two colours", "constant"])
 def test_first_eigenvector_is_constant_and_positive(name: str, dtype: torch.dtype) -> None:
     guide = {
-        "astronaut": picture("astronaut", 40, 48),
         "two colours": torch.from_numpy(two_colours())[None, None],
         "constant": torch.full((1, 1, 40, 48), 0.5),
     }[name].to(dtype)
@@ -105,6 +104,15 @@ def test_first_eigenvector_is_constant_and_positive(name: str, dtype: torch.dtyp
     first = spectrum.eigenvectors[0, 0]
     torch.testing.assert_close(first, torch.full_like(first, first.numel() ** -0.5), rtol=1e-3, atol=0)
     assert spectrum.eigenvalues[0, 0].item() == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["astronaut", "camera", "coffee"])
+def test_first_eigenvector_of_a_photograph_is_nearly_constant(name: str) -> None:
+    # The span of 60 landmarks holds the constant vector only up to what they miss of the kernel.
+    spectrum = build(picture(name, 40, 48), photometric_bandwidth=30 / 255, num_landmarks=60).spectrum()
+    first = spectrum.eigenvectors[0, 0]
+    assert first.sum().item() / first.numel() ** 0.5 > 0.99
+    assert 0.99 < spectrum.eigenvalues[0, 0].item() <= 1
 
 
 def test_rank_cuts_the_tail() -> None:
