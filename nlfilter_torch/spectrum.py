@@ -99,10 +99,10 @@ class Spectrum:
         with torch.no_grad():
             ones = moment(self.factor, self.scaling.unsqueeze(1))  # F 1, (B, M, 1)
             cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
-            cluster[:, 0] = True
+            cluster[:, :1] = True
             target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
             mirror = target / target.norm(dim=1, keepdim=True).clamp(min=1e-12)
-            mirror[:, 0] -= 1.0
+            mirror[:, :1] -= 1.0
             length = mirror.square().sum(1, keepdim=True).unsqueeze(2)
             reflection = 2 * mirror.unsqueeze(2) * mirror.unsqueeze(1) / length.clamp(min=1e-12)
         return vectors - vectors @ reflection
