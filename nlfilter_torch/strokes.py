@@ -97,13 +97,13 @@ def propagate_strokes(
     return spread.unflatten(2, spectrum.size).to(strokes.dtype)
 
 
-def check_painted(stroke_mask: Tensor) -> None:
+def check_painted(stroke_mask: Tensor, name: str = "stroke_mask") -> None:
     """Raise unless every image of ``stroke_mask`` (B, 1, H, W) holds a painted pixel and all values are in [0, 1]."""
-    check_unit_range(stroke_mask, "stroke_mask")
+    check_unit_range(stroke_mask, name)
     empty = stroke_mask.detach().amax((1, 2, 3)) <= 0
     if bool(empty.any()):
         raise ValueError(
-            "stroke_mask must hold a painted pixel in every image, got none in image(s) "
+            f"{name} must hold a painted pixel in every image, got none in image(s) "
             f"{empty.nonzero().squeeze(1).tolist()}; paint at least one"
         )
 

@@ -1,0 +1,165 @@
+"""A photograph as if taken with a wide aperture: sharp where one chooses, blurred elsewhere. Paper: Sec. V-C."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.checks import check_choice, check_image, check_positive, check_same_size
+from nlfilter_torch.operator import nonlocal_operator
+from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.strokes import check_painted
+
+Aperture = Literal["disc", "gaussian"]
+
+RADIUS = 0.025  # default radius of the blur as a share of the short side
+LOCALITY = 0.2  # default spatial bandwidth, likewise
+SPECIMENS = 64  # pixels of the focus region that every other pixel is compared with
+CLOSING, SMOOTHING = 0.015, 0.04  # sizes, as shares of the short side, of the gaps in a focus map that are filled
+BLURRED, SHARP = 0.2, 0.6  # likeness below BLURRED gets the whole blur, above SHARP none
+STEPS = (0.1, 0.25, 0.5, 1.0)  # blurs that others are mixed from, as shares of the radius
+
+
+@full_precision
+def defocus(
+    image: Tensor,
+    focus_region: Tensor,
+    *,
+    radius: float | None = None,
+    aperture: Aperture = "disc",
+    photometric_bandwidth: float | Tensor = 25 / 255,
+    spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = 3,
+    **options: Any,
+) -> Tensor:
+    """Blur what is unlike, or far from, a region that stays in focus.
+
+    Paper: Sec. V-C, eq. (18), Fig. 17. The sharp part does not bleed into the blurred one: each pixel is mixed from
+    pixels that are blurred as much as itself.
+
+    Args:
+        image: (B, C, H, W) in [0, 1], C = 1 or 3.
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp; several spots may differ
+            in colour.
+        radius: of the strongest blur, in pixels; None is 2.5 % of the short side.
+        aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
+            variance.
+        photometric_bandwidth: h_y of eq. (18), in units of the image.
+        spatial_bandwidth: h_x of eq. (18), in pixels; None is 0.2 of the short side.
+        patch_size: of the patches that are compared.
+        **options: further ones of :func:`nonlocal_operator`, such as ``num_landmarks`` or ``generator``.
+
+    Returns:
+        (B, C, H, W), equal to ``image`` to rounding where it is in focus, within its range. Differentiable in image and
+        region.
+
+    Raises:
+        TypeError, ValueError: if a tensor has another size, leaves its range, or the region is empty.
+
+    Example:
+        >>> image = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(0)) * 0.2
+        >>> image[..., 20:] += 0.6
+        >>> region = torch.zeros(1, 1, 40, 40)
+        >>> region[..., 10:20, 24:34] = 1
+        >>> blurred = defocus(image, region, radius=3.0, num_landmarks=50)
+        >>> torch.equal(blurred[..., 10:20, 24:34], image[..., 10:20, 24:34])
+        True
+        >>> bool(blurred[..., :18].std() < image[..., :18].std() / 2)
+        True
+    """
+    check_image(image, "image")
+    if image.shape[1] not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
+    check_image(focus_region, "focus_region", channels=1, batch=image.shape[0])
+    check_same_size(focus_region, (image.shape[-2], image.shape[-1]), "focus_region", "image")
+    check_painted(focus_region, "focus_region")
+    check_choice(aperture, "aperture", ("disc", "gaussian"))
+    short = min(image.shape[-2:])
+    reach = RADIUS * short if radius is None else radius
+    check_positive(reach, "radius")
+
+    pixels = image.to(working_dtype(image))
+    spectrum = nonlocal_operator(
+        pixels,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=LOCALITY * short if spatial_bandwidth is None else spatial_bandwidth,
+        patch_size=patch_size,
+        guide_channels="all",
+        **options,
+    ).spectrum()
+    focus = focus_map(spectrum, pixels, focus_region.to(pixels))
+    return _blur_by(pixels, 1 - focus, float(reach), aperture).to(image.dtype)
+
+
+def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor:
+    """How much every pixel belongs to what is in focus, (B, 1, H, W) in [0, 1]; the paper's mask, for many spots.
+
+    A pixel is in focus if it correlates with any pixel of the region. Gaps are closed, and borders follow the image's.
+    """
+    from kornia.filters import guided_blur  # kornia takes half a second to import: only who needs it waits
+
+    likeness = _likeness(spectrum, focus_region)
+    share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
+    focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
+    short = min(image.shape[-2:])
+    gap = 2 * math.ceil(CLOSING * short) + 1
+    grown = torch.nn.functional.max_pool2d(focus, gap, stride=1, padding=gap // 2)
+    closed = -torch.nn.functional.max_pool2d(-grown, gap, stride=1, padding=gap // 2)
+    window = 2 * math.ceil(SMOOTHING * short) + 1
+    if window // 2 < short:  # reflection needs as many pixels
+        closed = guided_blur(image, closed, window, eps=1e-4)
+    return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
+
+
+def _likeness(spectrum: Spectrum, region: Tensor) -> Tensor:
+    """Largest correlation (B, 1, H, W) of every pixel with pixels of a region (B, 1, H, W), times their weight."""
+    factor = spectrum.factor
+    core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - 0.5 * eigenvalues)).to(factor)
+    image = core @ factor  # (B, M, N)
+    norm = (factor * image).sum(1, keepdim=True).clamp(min=1e-6).rsqrt()  # (B, 1, N)
+    weights = region.flatten(2).expand(factor.shape[0], -1, -1)
+    # Equally many specimens from every image, spread over the painted pixels in their order.
+    ranks = (weights[:, 0] > 0).long().cumsum(1)  # (B, N)
+    wanted = (torch.linspace(0, 1, SPECIMENS, device=ranks.device) * (ranks[:, -1:] - 1)).long() + 1  # (B, SPECIMENS)
+    chosen = torch.searchsorted(ranks, wanted).unsqueeze(1)  # (B, 1, SPECIMENS)
+    specimens = (factor * norm).gather(2, chosen.expand(-1, factor.shape[1], -1)) * weights.gather(2, chosen)
+    best = torch.stack([(s.mT @ image).amax(1) for s in specimens.split(16, dim=2)]).amax(0)  # (B, N)
+    return (best.unsqueeze(1) * norm).clamp(0.0, 1.0).unflatten(2, spectrum.size)
+
+
+def _blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:
+    """Blur every pixel by ``amount`` (B, 1, H, W) in [0, 1] of the radius, from pixels that are blurred themselves."""
+    result, below = image, 0.0
+    for step in STEPS:
+        # Sharper pixels take less part, so that the subject leaves no glow on what is behind it; the small share that
+        # is left to them matters only where there is nothing else.
+        weight = (amount / step).clamp(0.01, 1.0)
+        kernel = _kernel(step * radius, aperture).to(image)
+        sums = _convolve(torch.cat([image * weight, weight], dim=1), kernel)
+        blurred = sums[:, :-1] / sums[:, -1:]
+        result = torch.lerp(result, blurred, ((amount - below) / (step - below)).clamp(0.0, 1.0))
+        below = step
+    return result
+
+
+def _kernel(radius: float, aperture: Aperture) -> Tensor:
+    """A square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
+    reach = math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)  # three standard deviations
+    axis = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
+    if aperture == "disc":
+        kernel = (radius + 0.5 - squared.sqrt()).clamp(0.0, 1.0)
+    else:
+        kernel = torch.exp(-squared / (2 * (radius / 2) ** 2))
+    return kernel / kernel.sum()
+
+
+def _convolve(planes: Tensor, kernel: Tensor) -> Tensor:
+    """Convolve planes (B, C, H, W) with a symmetric kernel (k, k); nothing is outside the image."""
+    height, width = planes.shape[-2:]
+    reach = kernel.shape[0] // 2
+    size = (height + 2 * reach, width + 2 * reach)
+    product = torch.fft.rfft2(planes, s=size) * torch.fft.rfft2(kernel, s=size)
+    return torch.fft.irfft2(product, s=size)[..., reach : reach + height, reach : reach + width]
