@@ -69,6 +69,7 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) 
         image: (1, C, H, W) in [0, 1].
         region: (1, 1, H, W), above 0.5 inside.
         mask: (1, 1, H, W) in [0, 1].
+        side: Length in pixels of the longer side of each picture.
     """
     picture = _picture(image)
     weight = mask[0, 0].numpy(force=True)[..., None]
