@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
+from nlfilter_torch.precision import full_precision
+
 Gradients = tuple[Tensor | None, ...]
 
 
@@ -62,16 +64,18 @@ def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:
 
 
 def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
-    """Let a ``backward`` of an autograd Function refuse to be differentiated itself.
+    """Let a ``backward`` of an autograd Function refuse to be differentiated itself, and run in full precision.
 
-    The decorator of this name in torch does so only where the incoming gradient depends on something. Elsewhere it
+    A backward pass that is started under autocast would otherwise round its products. As to second derivatives, the
+    decorator of this name in torch refuses them only where the incoming gradient depends on something. Elsewhere it
     passes what it returns for a constant, and a second derivative would be wrong without a word.
     """
+    exact = full_precision(backward)
 
     @functools.wraps(backward)
     def wrapper(ctx: Any, *gradients: Tensor) -> Gradients:
         with torch.no_grad():
-            found = backward(ctx, *gradients)
+            found = exact(ctx, *gradients)
         if not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return found
         formed = [g.formed() if isinstance(g, OuterProduct) else g for g in found if g is not None]
