@@ -1,7 +1,7 @@
 """Tables and plots from the JSON of :mod:`benchmarks.speed`: ``python -m benchmarks.report FILE.json``.
 
-Writes ``speed.md`` and two plots into a folder, and a copy of the JSON where that is another folder; with ``--readme`` it
-also puts the table of claims and peers between the two marker comments of that file, so that no figure is ever typed.
+Writes ``speed.md`` and two plots into a folder, and a copy of the JSON where that is another folder. With ``--readme`` it
+puts claims and peers between the two marker comments of that file, so that no figure is ever typed.
 """
 
 import argparse
@@ -111,7 +111,7 @@ def other_tables(results: Results) -> list[str]:
         ("batches", "A batch of crops and one image of as many pixels, taking turns"),
         ("dense", "Beside the dense filter, on an image that it can do"),
         ("autograd", "Beside the same filter in plain autograd"),
-        ("imports", "Imports, in fresh processes that take turns"),
+        ("imports", "Imports, one after the other in fresh processes"),
     ):
         rows = [
             [_case_name(record), name, seconds(timing["median"]), seconds(timing["iqr"])]

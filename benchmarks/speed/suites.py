@@ -236,22 +236,25 @@ def memory(plan: Plan) -> Iterator[Record]:
 
 
 def imports(plan: Plan) -> Iterator[Record]:
-    """What ``import nlfilter_torch`` takes over ``import torch``, in fresh processes that take turns."""
-    seconds: dict[str, list[float]] = {"torch": [], "nlfilter_torch": []}
-    for _ in range(plan.processes + 1):
-        for name, times in seconds.items():
-            times.append(_import_seconds(name))
-    timings = {}
-    for name, times in seconds.items():
-        values = torch.tensor(times[1:], dtype=torch.float64)  # the first reads the files from the disk
-        low, middle, high = values.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
-        timings[f"import {name}"] = Timing(middle, high - low, len(values), 1)
+    """What ``import nlfilter_torch`` takes after ``import torch``, in fresh processes."""
+    runs = torch.tensor([_import_seconds() for _ in range(plan.processes + 1)], dtype=torch.float64)
+    quartiles = runs[1:].quantile(
+        torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64), dim=0
+    )  # the first reads the disk
+    timings = {
+        name: Timing(middle, high - low, plan.processes, 1)
+        for name, (low, middle, high) in zip(("torch", "nlfilter_torch"), quartiles.T.tolist(), strict=True)
+    }
     yield record("imports", plan.case(), timings)
 
 
-def _import_seconds(name: str) -> float:
-    program = f"import time; start = time.perf_counter(); import {name}; print(time.perf_counter() - start)"
-    return float(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
+def _import_seconds() -> list[float]:
+    program = (
+        "from time import perf_counter as now; a = now(); import torch; b = now(); import nlfilter_torch; c = now(); "
+        "print(b - a, c - b)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return [float(figure) for figure in done.stdout.split()]
 
 
 SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
