@@ -1,7 +1,7 @@
 """Tables and plots from the JSON of :mod:`benchmarks.speed`: ``python -m benchmarks.report FILE.json``.
 
-Writes ``speed.md`` and two plots into a folder, and a copy of the JSON where that is another folder. With ``--readme`` it
-puts claims and peers between the two marker comments of that file, so that no figure is ever typed.
+Writes ``speed.md`` and two plots into a folder, and a copy of the JSON where that is another folder. With ``--readme``
+it puts claims and peers between the two marker comments of that file, so that no figure is ever typed.
 """
 
 import argparse
