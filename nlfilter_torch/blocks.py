@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,6 +12,16 @@ CACHED = 4096
 SWEPT = 16384
 # An accelerator wants long blocks; this one bounds the memory of intermediate results at about 1 GB for M = 100.
 ACCELERATED = 1 << 21
+
+
+def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
+    """Uninitialised tensor in the dtype and on the device of ``like``, from memory that is quick to touch first.
+
+    On Linux numpy asks for huge pages where torch does not: a fresh 400 MB costs 50 ms instead of 200.
+    """
+    if like.device.type != "cpu" or like.dtype not in (torch.float32, torch.float64):
+        return like.new_empty(shape)
+    return torch.from_numpy(np.empty(shape, np.float64 if like.dtype == torch.float64 else np.float32))
 
 
 def block_length(batch: int, device: torch.device, length: int) -> int:

@@ -1,12 +1,16 @@
 """Guide image to features: weighted patches and coordinates, scaled by the bandwidths. Paper: eq. (1), (18)."""
 
-from typing import Literal
+from collections.abc import Iterator
+from itertools import product
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.blocks import large_empty
 from nlfilter_torch.checks import check_finite, check_patch_size
+from nlfilter_torch.differentiation import Gradients, once_differentiable
 
 GuideChannels = Literal["luminance", "all"]
 Bandwidth = float | Tensor | None
@@ -72,10 +76,9 @@ def extract_features(
     """
     batch, channels, height, width = guide.shape
     size = patch_weights.shape[0]
-    planes = pad_border(guide, size // 2).unfold(2, size, 1).unfold(3, size, 1)  # (B, C, H, W, p, p), a view
-    scale = patch_weights.to(guide).div(channels).sqrt().view(1, 1, size, size, 1, 1)
-    scale = scale / _per_image(photometric_bandwidth, guide).view(-1, 1, 1, 1, 1, 1)
-    features = (planes.permute(0, 1, 4, 5, 2, 3) * scale).flatten(1, 3).flatten(2)  # (B, C*p*p, N)
+    scale = patch_weights.to(guide).div(channels).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
+    padded = pad_border(guide, size // 2)
+    features: Tensor = _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
     if spatial_bandwidth is None:
         return features
     rows = origin[0] + torch.arange(height, dtype=guide.dtype, device=guide.device)
@@ -83,6 +86,40 @@ def extract_features(
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
     coordinates = grid / _per_image(spatial_bandwidth, guide).view(-1, 1, 1)
     return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
+
+
+class _ScaledPatches(torch.autograd.Function):
+    """Every offset of the patch as a plane of its own: a shifted copy of the image times the weight of that offset."""
+
+    @staticmethod
+    def forward(ctx: Any, padded: Tensor, scale: Tensor) -> Tensor:
+        ctx.save_for_backward(padded, scale)
+        height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
+        batch, channels = padded.shape[:2]
+        features = large_empty((batch, channels * scale[0].numel(), height, width), padded)
+        for plane, (channel, y, x) in enumerate(_offsets(channels, scale)):
+            shifted = padded[:, channel, y : y + height, x : x + width]
+            torch.mul(shifted, scale[:, y, x, None, None], out=features[:, plane])
+        return features.flatten(2)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Gradients:
+        padded, scale = ctx.saved_tensors
+        height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
+        grad_padded, grad_scale = torch.zeros_like(padded), torch.zeros_like(scale)
+        planes = grad.unflatten(2, (height, width))
+        for plane, (channel, y, x) in enumerate(_offsets(padded.shape[1], scale)):
+            window = (slice(None), channel, slice(y, y + height), slice(x, x + width))
+            grad_padded[window] += planes[:, plane] * scale[:, y, x, None, None]
+            moved = (planes[:, plane] * padded[window]).sum((1, 2))  # (B,)
+            grad_scale[:, y, x] += moved if scale.shape[0] == moved.shape[0] else moved.sum()
+        return grad_padded, grad_scale
+
+
+def _offsets(channels: int, scale: Tensor) -> Iterator[tuple[int, int, int]]:
+    """Channel, row and column of every plane of the features."""
+    return product(range(channels), range(scale.shape[1]), range(scale.shape[2]))
 
 
 def pad_border(image: Tensor, margin: int) -> Tensor:

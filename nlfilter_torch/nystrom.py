@@ -10,13 +10,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import buffered_blocks
+from nlfilter_torch.blocks import buffered_blocks, large_empty
 from nlfilter_torch.differentiation import once_differentiable, write_columns
 
 Completion = Literal["diagonal", "none"]
 
 JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, which float32 can bear
-SMALLEST_EXPONENT = -60.0  # exp(-60) is nothing beside 1; smaller ones become denormal floats, six times slower
+# exp(-40) is nothing beside 1; smaller ones become denormal floats, six times slower, and their squares vanish in float32,
+# which would leave an image of pixels that resemble no landmark without a single eigenvector.
+SMALLEST_EXPONENT = -40.0
 
 
 def whitener(landmarks: Tensor) -> Tensor:
@@ -79,7 +81,7 @@ class _NystromFactor(torch.autograd.Function):
         ctx: Any, features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
         batch, _, pixels = features.shape
-        factor = features.new_empty(batch, landmarks.shape[2], pixels)
+        factor = large_empty((batch, landmarks.shape[2], pixels), features)
         diagonal = features.new_zeros(batch, pixels)
         scale = features.new_ones(batch, pixels)
         affinity = _Affinity(landmarks)
@@ -104,7 +106,7 @@ class _NystromFactor(torch.autograd.Function):
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
         affinity = _Affinity(landmarks)
-        grad_features = torch.empty_like(features)
+        grad_features = large_empty(features.shape, features)
         grad_landmarks = torch.zeros_like(landmarks, dtype=torch.float64)
         grad_whitening = torch.zeros_like(whitening, dtype=torch.float64)
         for block, (first, second, third) in buffered_blocks(factor, 3):
