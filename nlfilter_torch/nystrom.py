@@ -16,8 +16,8 @@ from nlfilter_torch.differentiation import once_differentiable, write_columns
 Completion = Literal["diagonal", "none"]
 
 JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, which float32 can bear
-# exp(-40) is nothing beside 1; smaller ones become denormal floats, six times slower, and their squares vanish in float32,
-# which would leave an image of pixels that resemble no landmark without a single eigenvector.
+# exp(-40) is nothing beside 1; smaller ones become denormal floats, six times slower, and their squares vanish in
+# float32, which would leave pixels that resemble no landmark without a single eigenvector.
 SMALLEST_EXPONENT = -40.0
 
 
