@@ -4,6 +4,8 @@ Functions inside the package trust what they are given; only public functions ca
 """
 
 import math
+import sys
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -127,3 +129,11 @@ def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None
             f"alpha must have at least two entries, got {entries}; give one per layer, such as (1, 1, 1, 1)"
         )
     check_finite(alpha, "alpha")
+
+
+def warn(message: str) -> None:
+    """Warn at the line that called this package, however many wrappers and modules lie between."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("nlfilter_torch", "torch"):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)

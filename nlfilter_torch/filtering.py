@@ -171,6 +171,7 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
     """
+    check_image(image, "image")
     explained = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
     energy = image.to(spectrum.factor).square().sum((1, 2, 3))
     inner = (explained * image.to(spectrum.factor)).sum((1, 2, 3))  # y^T V V^T y = |V^T y|^2

@@ -1,6 +1,5 @@
 """Guide to operator: the filter W as an object. Paper: Sec. II."""
 
-import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +15,7 @@ from nlfilter_torch.checks import (
     check_image,
     check_positive,
     check_same_size,
+    warn,
 )
 from nlfilter_torch.compilation import uncompiled
 from nlfilter_torch.features import GuideChannels, extract_features, reduce_channels, unit_window
@@ -251,10 +251,9 @@ def nonlocal_operator(
     if spatial_bandwidth is not None:
         check_bandwidth(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
     if num_landmarks > height * width:
-        warnings.warn(
+        warn(
             f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; "
-            "using every pixel",
-            stacklevel=3,
+            "using every pixel"
         )
         num_landmarks = height * width
 

@@ -6,7 +6,6 @@ converges. The same interval makes the implicit gradient cheap: ten steps of the
 b``.
 """
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -54,10 +54,9 @@ def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None)
     """
     scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance or TOLERANCE[factor.dtype])  # type: ignore[no-untyped-call]
     if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
-        warnings.warn(
+        warn(
             f"balancing left row sums off by up to {residual.max().item():.1e}; "
-            "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'",
-            stacklevel=3,
+            "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
         )
     return Balancing(scaling, residual, int(steps))
 

@@ -1,0 +1,246 @@
+"""Bad input to the filter: an error is one sentence with the argument, what it must be, what it was, and the remedy."""
+
+import re
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nlfilter_torch import (
+    NonlocalFilter,
+    captured_energy,
+    detail_layers,
+    diffusion_map,
+    diffusion_mask,
+    estimate_bandwidth,
+    nonlocal_operator,
+    polynomial_filter,
+    polynomial_response,
+    segment_mask,
+    spectral_filter,
+)
+from tests.problems import noise
+
+GUIDE = noise(2, 1, 8, 9)
+OPERATOR = nonlocal_operator(GUIDE, num_landmarks=20)
+SPECTRUM = OPERATOR.spectrum()
+IMAGE = noise(2, 3, 8, 9)
+EMPTY = torch.zeros(2, 1, 8, 9)
+PAINTED = EMPTY.index_fill(3, torch.tensor([2]), 1.0)
+NAN, INFINITY = float("nan"), float("inf")
+
+
+def raises(call: Callable[[], object], error: type[Exception], message: str) -> None:
+    """``<argument> must <requirement>, got <value>; <remedy>``, on one line, which begins with ``message``."""
+    with pytest.raises(error) as caught:
+        call()
+    found = str(caught.value)
+    assert found.startswith(message), found
+    assert re.fullmatch(r"\w+ must .+, got .+; .+", found), found
+    assert not re.search(r"\n|[^.]\.$", found), found
+
+
+# --- images
+
+FLOATS = "must be of a floating-point dtype with values in [0, 1], got"
+BAD_IMAGES: dict[str, tuple[Any, type[Exception], str]] = {
+    "array": (np.zeros((2, 1, 8, 9)), TypeError, "must be a torch.Tensor, got ndarray"),
+    "list": ([[0.0]], TypeError, "must be a torch.Tensor, got list"),
+    "integers": (EMPTY.to(torch.uint8), TypeError, f"{FLOATS} torch.uint8; divide"),
+    "bools": (EMPTY.bool(), TypeError, f"{FLOATS} torch.bool"),
+    "complex": (EMPTY.to(torch.complex64), TypeError, f"{FLOATS} torch.complex64"),
+    "rank 3": (EMPTY[0], ValueError, "must have shape (B, C, H, W), got (1, 8, 9); add"),
+    "rank 5": (EMPTY[None], ValueError, "must have shape (B, C, H, W), got (1, 2, 1, 8, 9)"),
+    "no row": (EMPTY[:, :, :0], ValueError, "must hold at least one pixel, got shape (2, 1, 0, 9)"),
+    "no channel": (EMPTY[:, :0], ValueError, "must hold at least one pixel, got shape (2, 0, 8, 9)"),
+    "no image": (EMPTY[:0], ValueError, "must hold at least one pixel, got shape (0, 1, 8, 9)"),
+    "NaN": (EMPTY + NAN, ValueError, "must be finite, got 144 NaN or infinite value(s)"),
+    "infinity": (INFINITY * PAINTED.where(PAINTED > 0, 1), ValueError, "must be finite, got 144 NaN or infinite"),
+    "one NaN": (EMPTY.index_fill(3, torch.tensor([4]), NAN), ValueError, "must be finite, got 16 NaN or infinite"),
+}
+
+TAKE_AN_IMAGE: dict[str, tuple[str, Callable[[torch.Tensor], object]]] = {
+    "nonlocal_operator": ("guide", nonlocal_operator),
+    "estimate_bandwidth": ("guide", estimate_bandwidth),
+    "NonlocalFilter": ("guide", lambda x: NonlocalFilter(num_landmarks=20)(IMAGE, guide=x)),
+    "matmul": ("image", lambda x: OPERATOR @ x),
+    "detail_layers": ("image", lambda x: detail_layers(OPERATOR, x)),
+    "polynomial_filter": ("image", lambda x: polynomial_filter(OPERATOR, x, torch.ones(4))),
+    "spectral_filter": ("image", lambda x: spectral_filter(SPECTRUM, x, torch.sqrt)),
+    "captured_energy": ("image", lambda x: captured_energy(SPECTRUM, x)),
+    "diffusion_mask": ("region", lambda x: diffusion_mask(SPECTRUM, x)),
+    "segment_mask": ("regions", lambda x: segment_mask(SPECTRUM, x)),
+    "mask of a layer": ("mask", lambda x: NonlocalFilter(num_landmarks=20)(IMAGE, mask=x)),
+}
+
+
+@pytest.mark.parametrize("bad", list(BAD_IMAGES))
+@pytest.mark.parametrize("function", list(TAKE_AN_IMAGE))
+def test_bad_images(function: str, bad: str) -> None:
+    name, call = TAKE_AN_IMAGE[function]
+    value, error, message = BAD_IMAGES[bad]
+    raises(lambda: call(value), error, f"{name} {message}")
+
+
+@pytest.mark.parametrize("function", [name for name, (argument, _) in TAKE_AN_IMAGE.items() if argument != "guide"])
+def test_images_of_another_size_or_batch(function: str) -> None:
+    name, call = TAKE_AN_IMAGE[function]
+    raises(lambda: call(noise(2, 1, 9, 8)), ValueError, f"{name} must have the height and width of the ")
+    raises(lambda: call(noise(3, 1, 8, 9)), ValueError, f"{name} must have ")
+
+
+# --- options of the operator
+
+POSITIVE = "must be positive and finite, got"
+NUMBER = "must be a number or a tensor, got"
+INT = "must be an int, got"
+ODD = "must be odd and at least 1, got"
+SQUARE = "must have shape (p, p) with odd p, got"
+BAD_OPTIONS: list[tuple[str, Any, type[Exception], str]] = [
+    ("patch_size", 4, ValueError, f"{ODD} 4; try 5"),
+    ("patch_size", 0, ValueError, f"{ODD} 0; try 1"),
+    ("patch_size", -3, ValueError, f"{ODD} -3; try 3"),
+    ("patch_size", 5.0, TypeError, f"{INT} float"),
+    ("patch_size", True, TypeError, f"{INT} bool"),
+    ("photometric_bandwidth", 0.0, ValueError, f"{POSITIVE} 0.0"),
+    ("photometric_bandwidth", -1, ValueError, f"{POSITIVE} -1"),
+    ("photometric_bandwidth", NAN, ValueError, f"{POSITIVE} nan"),
+    ("photometric_bandwidth", INFINITY, ValueError, f"{POSITIVE} inf"),
+    ("photometric_bandwidth", "wide", ValueError, "must be "),
+    ("photometric_bandwidth", None, TypeError, f"{NUMBER} NoneType"),
+    ("photometric_bandwidth", True, TypeError, f"{NUMBER} bool"),
+    ("photometric_bandwidth", torch.tensor([0.5, -0.5]), ValueError, f"{POSITIVE} [0.5, -0.5]"),
+    ("photometric_bandwidth", torch.ones(3), ValueError, "must be a number or have shape () or (2,), got (3,)"),
+    ("spatial_bandwidth", 0, ValueError, f"{POSITIVE} 0"),
+    ("spatial_bandwidth", "auto", TypeError, f"{NUMBER} str"),
+    ("spatial_bandwidth", torch.ones(2, 1), ValueError, "must be a number or have shape () or (2,), got (2, 1)"),
+    ("num_landmarks", 0, ValueError, "must be at least 1, got 0"),
+    ("num_landmarks", 20.0, TypeError, f"{INT} float"),
+    ("num_landmarks", True, TypeError, f"{INT} bool"),
+    ("landmarks", "k-means", ValueError, "must be one of 'kmeans', 'uniform', 'random', got 'k-means'"),
+    ("completion", None, ValueError, "must be one of 'diagonal', 'none', got None"),
+    ("guide_channels", "rgb", ValueError, "must be one of 'luminance', 'all', got 'rgb'"),
+    ("tolerance", 0.0, ValueError, f"{POSITIVE} 0.0"),
+    ("patch_weights", torch.ones(3, 5), ValueError, f"{SQUARE} (3, 5)"),
+    ("patch_weights", torch.ones(4, 4), ValueError, f"{SQUARE} (4, 4)"),
+    ("patch_weights", torch.ones(9), ValueError, f"{SQUARE} (9,)"),
+    ("patch_weights", -torch.ones(3, 3), ValueError, "must be non-negative with a positive sum, got"),
+    ("patch_weights", torch.zeros(3, 3), ValueError, "must be non-negative with a positive sum, got"),
+    ("patch_weights", torch.ones(3, 3) * NAN, ValueError, "must be finite, got 9 NaN"),
+]
+
+
+@pytest.mark.parametrize(("option", "value", "error", "message"), BAD_OPTIONS)
+def test_bad_options_of_the_operator(option: str, value: Any, error: type[Exception], message: str) -> None:
+    options = {"num_landmarks": 20, option: value}
+    raises(lambda: nonlocal_operator(GUIDE, **options), error, f"{option} {message}")
+
+
+def test_bad_channels_of_the_estimate() -> None:
+    raises(lambda: estimate_bandwidth(GUIDE, guide_channels="rgb"), ValueError, "guide_channels must be one of 'lum")
+
+
+@pytest.mark.parametrize(
+    ("rank", "error", "message"), [(0, ValueError, "at least 1, got 0"), (5.0, TypeError, "an int")]
+)
+def test_bad_rank(rank: Any, error: type[Exception], message: str) -> None:
+    raises(lambda: OPERATOR.spectrum(rank), error, f"rank must be {message}")
+
+
+def test_dense_matrix_of_a_large_image_is_refused() -> None:
+    operator = nonlocal_operator(noise(1, 1, 129, 128), num_landmarks=5, photometric_bandwidth=0.5)
+    with pytest.raises(ValueError, match=r"must have at most 16384 pixels to be dense, got 16512; use a smaller image"):
+        operator.to_dense()
+
+
+# --- sliders and layers
+
+TWO = "must have at least two entries, got 1"
+BAD_SLIDERS: list[tuple[Any, type[Exception], str]] = [
+    ([1.0, 1.0], TypeError, "must be a torch.Tensor, got list; convert"),
+    (torch.tensor([1, 1]), TypeError, "must be of a floating-point dtype, got torch.int64"),
+    (torch.ones(1), ValueError, TWO),
+    (torch.ones(2, 1), ValueError, TWO),
+    (torch.ones(2, 1, 8, 9), ValueError, TWO),
+    (torch.tensor(1.0), ValueError, "must have shape (k+1,) or (B, k+1) or (B, k+1, H, W), got ()"),
+    (torch.ones(2, 4, 9), ValueError, "must have shape (k+1,) or (B, k+1) or (B, k+1, H, W), got (2, 4, 9)"),
+    (torch.tensor([1.0, NAN]), ValueError, "must be finite, got 1 NaN"),
+    (torch.ones(3, 4), ValueError, "must have the batch size of the layers, 2, got 3"),
+    (torch.ones(2, 4, 9, 8), ValueError, "must have the height and width of the image, 8x9, got 9x8"),
+]
+
+
+@pytest.mark.parametrize(("alpha", "error", "message"), BAD_SLIDERS)
+def test_bad_sliders(alpha: Any, error: type[Exception], message: str) -> None:
+    raises(lambda: polynomial_filter(OPERATOR, IMAGE, alpha), error, f"alpha {message}")
+
+
+def test_bad_sliders_of_a_response() -> None:
+    raises(lambda: polynomial_response(torch.ones(3), torch.ones(1)), ValueError, f"alpha {TWO}")
+    per_pixel = torch.ones(2, 4, 8, 9)
+    message = "alpha must have shape (k+1,) or (B, k+1), got (2, 4, 8, 9)"
+    raises(lambda: polynomial_response(torch.ones(3), per_pixel), ValueError, message)
+
+
+def test_bad_order() -> None:
+    raises(lambda: detail_layers(OPERATOR, IMAGE, order=0), ValueError, "order must be at least 1, got 0")
+    raises(lambda: detail_layers(OPERATOR, IMAGE, order=2.0), TypeError, "order must be an int, got float")
+
+
+# --- masks
+
+BAD_MASKS: list[tuple[Callable[[], object], type[Exception], str]] = [
+    (lambda: diffusion_map(SPECTRUM, time=0.0), ValueError, f"time {POSITIVE} 0.0"),
+    (lambda: diffusion_mask(SPECTRUM, PAINTED, time=-1.0), ValueError, f"time {POSITIVE} -1.0"),
+    (lambda: segment_mask(SPECTRUM, PAINTED, time=NAN), ValueError, f"time {POSITIVE} nan"),
+    (lambda: diffusion_mask(SPECTRUM, PAINTED, width=0.0), ValueError, f"width {POSITIVE} 0.0"),
+    (lambda: diffusion_mask(SPECTRUM, PAINTED, width="4"), TypeError, f"width {NUMBER} str"),
+    (lambda: diffusion_mask(SPECTRUM, -PAINTED), ValueError, "region must be non-negative, got -1"),
+    (lambda: diffusion_mask(SPECTRUM, EMPTY), ValueError, "region must each hold a pixel of positive weight, got an"),
+    (
+        lambda: segment_mask(SPECTRUM, torch.cat([PAINTED, EMPTY], dim=1)),
+        ValueError,
+        "regions must each hold a pixel of positive weight, got an empty one",
+    ),
+    (
+        lambda: diffusion_mask(SPECTRUM, PAINTED, negative=PAINTED.expand(-1, 3, -1, -1)),
+        ValueError,
+        "negative must have 1 channel or the region's 1, got 3",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), BAD_MASKS)
+def test_bad_arguments_of_masks(call: Callable[[], object], error: type[Exception], message: str) -> None:
+    raises(call, error, message)
+
+
+# --- what an error or a warning leaves behind
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_landmarks": 100},
+        {"num_landmarks": 20, "photometric_bandwidth": 1 / 255, "landmarks": "uniform", "completion": "none"},
+    ],
+    ids=["too many landmarks", "no balance"],
+)
+def test_warnings_point_at_the_caller(options: dict[str, Any]) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        nonlocal_operator(GUIDE, **options)
+    assert [w.filename for w in caught] == [__file__]
+
+
+def test_nothing_is_changed_by_an_error() -> None:
+    state, image = torch.get_rng_state(), IMAGE.clone()
+    raises(lambda: polynomial_filter(OPERATOR, image, torch.ones(1)), ValueError, "alpha")
+    raises(lambda: nonlocal_operator(GUIDE, patch_size=2), ValueError, "patch_size")
+    assert torch.equal(image, IMAGE)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.is_grad_enabled()
+    assert not torch.is_autocast_enabled("cpu")
