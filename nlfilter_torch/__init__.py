@@ -4,9 +4,16 @@ Talebi and Milanfar, "Nonlocal Image Editing", IEEE Transactions on Image Proces
 """
 
 from nlfilter_torch.bandwidth import estimate_bandwidth
+from nlfilter_torch.edits.abstract import abstract
+from nlfilter_torch.edits.colorize import colorize
+from nlfilter_torch.edits.defocus import defocus
+from nlfilter_torch.edits.denoise import denoise, estimate_noise
+from nlfilter_torch.edits.enhance import enhance
+from nlfilter_torch.edits.recolor import recolor
+from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.filtering import captured_energy, detail_layers, polynomial_filter, spectral_filter
 from nlfilter_torch.fitting import fit_alpha
-from nlfilter_torch.masks import diffusion_map, diffusion_mask, segment_mask
+from nlfilter_torch.masks import compose_alpha, diffusion_map, diffusion_mask, segment_mask
 from nlfilter_torch.modules import (
     DiffusionMask,
     NonlocalAffinity,
@@ -17,6 +24,7 @@ from nlfilter_torch.modules import (
 from nlfilter_torch.operator import Diagnostics, NonlocalOperator, nonlocal_operator
 from nlfilter_torch.response import polynomial_response
 from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.strokes import propagate_strokes
 
 __version__ = "0.1.0"
 
@@ -29,15 +37,25 @@ __all__ = [
     "PolynomialSliders",
     "SegmentMask",
     "Spectrum",
+    "abstract",
+    "adjust_tone",
     "captured_energy",
+    "colorize",
+    "compose_alpha",
+    "defocus",
+    "denoise",
     "detail_layers",
     "diffusion_map",
     "diffusion_mask",
+    "enhance",
     "estimate_bandwidth",
+    "estimate_noise",
     "fit_alpha",
     "nonlocal_operator",
     "polynomial_filter",
     "polynomial_response",
+    "propagate_strokes",
+    "recolor",
     "segment_mask",
     "spectral_filter",
 ]

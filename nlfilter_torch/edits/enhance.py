@@ -1,0 +1,77 @@
+"""Detail sliders for the whole image, or for all that looks like the regions painted on it. Paper: Figs. 12, 13."""
+
+from typing import Any
+
+from torch import Tensor
+
+from nlfilter_torch.checks import check_image
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.filtering import polynomial_filter
+from nlfilter_torch.masks import compose_alpha, diffusion_mask
+from nlfilter_torch.operator import nonlocal_operator
+from nlfilter_torch.precision import full_precision, working_dtype
+
+SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter
+
+
+@full_precision
+def enhance(
+    image: Tensor,
+    alpha: Tensor,
+    regions: Tensor | None = None,
+    *,
+    negative: Tensor | None = None,
+    residual: float | Tensor | None = None,
+    time: float | Tensor = 1.0,
+    width: float | Tensor = 4.0,
+    mask_bandwidth: float | Tensor = 25 / 255,
+    **options: Any,
+) -> Tensor:
+    """Move the detail sliders of a photograph, each region's own sliders for all that looks like it.
+
+    Paper: eq. (12), (13) inside the masks of eq. (17). The filter compares luminance, the masks compare colours.
+
+    Args:
+        image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
+        alpha: sliders, fine to coarse: (k+1,) or (B, k+1) without regions, one row per region, (K, k+1) or (B, K, k+1),
+            with them; (k+1,) is for all regions.
+        regions: (B, K, H, W), non-negative weights of the pixels of K regions; None edits the whole image.
+        negative: (B, 1 or K, H, W), weights of pixels whose likes are left out, see :func:`diffusion_mask`.
+        residual: weight of what the eigenvectors do not explain, see :func:`polynomial_filter`; with regions it holds
+            for the whole image, and None or 1 leave the rest of it untouched.
+        time: diffusion time of the masks; larger reaches further.
+        width: squared diffusion distance at which a mask has fallen to 1/e.
+        mask_bandwidth: photometric bandwidth of the masks.
+        **options: of :func:`nonlocal_operator`, for the filter; ``num_landmarks``, ``spatial_bandwidth`` and
+            ``generator`` hold for the masks as well.
+
+    Returns:
+        (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image, sliders and regions.
+
+    Raises:
+        TypeError, ValueError: if sizes differ, a region is empty, or ``alpha`` does not fit the regions.
+
+    Example:
+        >>> import torch
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> region = torch.zeros(1, 1, 24, 24)
+        >>> region[..., :6, :6] = 1
+        >>> enhance(image, torch.tensor([3.0, 3.0, 4.0, 1.05]), region, num_landmarks=50).shape
+        torch.Size([1, 3, 24, 24])
+    """
+    check_image(image, "image")
+    pixels = image.to(working_dtype(image))
+    if regions is not None:
+        shared = {
+            name: options[name] for name in ("num_landmarks", "spatial_bandwidth", "generator") if name in options
+        }
+        by_colour = nonlocal_operator(pixels, photometric_bandwidth=mask_bandwidth, guide_channels="all", **shared)
+        masks = diffusion_mask(by_colour.spectrum(), regions.to(pixels), time=time, width=width, negative=negative)
+        rows = alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha
+        alpha = compose_alpha(masks, rows)
+    elif negative is not None:
+        raise ValueError("negative must come with regions, got it alone; paint what is to be edited, too")
+    operator = nonlocal_operator(reduce_channels(pixels, "luminance"), **options)
+    edited = edit_luminance(pixels, lambda planes: polynomial_filter(operator, planes, alpha, residual=residual))
+    return edited.to(image.dtype)
