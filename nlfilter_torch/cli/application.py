@@ -9,12 +9,14 @@ import typer
 from nlfilter_torch import __version__
 from nlfilter_torch.cli.demo import demo
 from nlfilter_torch.cli.detail import detail
+from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.inspect import inspect
 
 NAME = "nlfilter-torch"
 
 app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 app.command()(detail)
+app.command()(fit)
 app.command()(inspect)
 app.command()(demo)
 

@@ -1,8 +1,9 @@
 """``nlfilter-torch detail``: raise or lower the details of a photograph, scale by scale."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,6 +15,7 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.files import Depth, check_output, read_photograph, write_photograph
 from nlfilter_torch.filtering import polynomial_filter
+from nlfilter_torch.presets import Preset
 
 
 class FileDepth(StrEnum):
@@ -54,6 +56,28 @@ OutputDepth = Annotated[
 ]
 
 
+def use_preset(context: typer.Context, path: Path | None) -> Path | None:
+    """Let the file's entries take the place of the options' defaults."""
+    if path is not None:
+        if not path.is_file():
+            raise ValueError(f"--preset {path} does not exist or is no file; make one with nlfilter-torch fit")
+        entries = asdict(Preset.from_json(path.read_text(encoding="utf-8", errors="replace"), str(path)))
+        alpha = ",".join(map(str, entries.pop("alpha")))
+        context.default_map = {"alpha": alpha, **{k: v for k, v in entries.items() if v is not None}}
+    return path
+
+
+PresetFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        callback=use_preset,
+        is_eager=True,
+        help="What `nlfilter-torch fit` found, in place of the defaults here; options that are given count for more.",
+    ),
+]
+
+
 def detail(
     source: options.Source,
     target: Target,
@@ -67,6 +91,7 @@ def detail(
     landmarks: options.Landmarks = 100,
     sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
+    preset: PresetFile = None,
 ) -> None:
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
 
@@ -77,6 +102,8 @@ def detail(
     Sharpen a little, spare the grain: `nlfilter-torch detail in.jpg out.jpg --alpha 1.5,1.5,1.5,1 --residual 1`
 
     Smooth skin or noise away: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
+
+    Edit like another photograph: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
     """
     sliders = options.parse_alpha(alpha)
     if residual is not None and not math.isfinite(residual):
