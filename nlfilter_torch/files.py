@@ -149,9 +149,7 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
     Call it before long work, so that the sentence comes at once.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; add a file name to it")
-    _check_parent(path)
+    check_file(path)
     kind = SUFFIXES.get(path.suffix.lower())
     if kind is None:
         raise ValueError(f"{path} must end in .png, .jpg, .webp or .tif, got {path.suffix!r}; choose one of these")
@@ -164,6 +162,14 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
     if photograph.alpha is not None and kind == "JPEG":
         raise ValueError(f"{path} cannot hold this picture: JPEG has no alpha channel; write a PNG, TIFF or WebP file")
     return kind
+
+
+def check_file(path: str | Path) -> None:
+    """Raise ValueError unless a file can be made at ``path``."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; add a file name to it")
+    _check_parent(path)
 
 
 def check_folder(folder: str | Path) -> None:

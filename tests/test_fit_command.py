@@ -123,6 +123,13 @@ def test_a_preset_that_is_none_is_told(
     assert not Path("out.png").exists()
 
 
+def test_a_preset_is_written_over(before: Path) -> None:
+    preset = before.with_name("look.json")
+    preset.write_text("an older one")
+    assert fit(before, edit(before), preset) == 0
+    assert Preset.from_json(preset.read_text(), "look.json").alpha == pytest.approx(ALPHA, rel=0.02)
+
+
 def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small, clipped, preset = (before.with_name(name) for name in ("small.png", "clipped.png", "look.json"))
     pixels = read_photograph(before).pixels
@@ -135,6 +142,7 @@ def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixtu
         (before, clipped, preset): "must have pixels that are not clipped",
         (before, before.with_name("none.png"), preset): "none.png does not exist",
         (before, clipped, folder): "does not exist; make it first",
+        (before, clipped, before.parent): "is a folder; add a file name to it",
     }
     for arguments, message in cases.items():
         assert fit(*arguments) == 2

@@ -11,7 +11,7 @@ from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import WHITE, Photograph, check_folder, open_beside, read_photograph
+from nlfilter_torch.files import WHITE, Photograph, check_file, open_beside, read_photograph
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.fitting import fit_alpha
 from nlfilter_torch.presets import Preset
@@ -44,7 +44,7 @@ def fit(
 
     `nlfilter-torch detail other.jpg out.jpg --preset look.json`
     """
-    check_folder(preset)
+    check_file(preset)
     grey_levels = options.parse_bandwidth(bandwidth)
     with steps(3) as begin:
         begin("Reading")
