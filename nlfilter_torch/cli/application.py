@@ -7,15 +7,27 @@ from typing import Annotated, TextIO
 import typer
 
 from nlfilter_torch import __version__
+from nlfilter_torch.cli.abstract import abstract
+from nlfilter_torch.cli.colorize import colorize
+from nlfilter_torch.cli.defocus import defocus
 from nlfilter_torch.cli.demo import demo
+from nlfilter_torch.cli.denoise import denoise
 from nlfilter_torch.cli.detail import detail
 from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.inspect import inspect
+from nlfilter_torch.cli.recolor import recolor
+from nlfilter_torch.cli.tone import tone
 
 NAME = "nlfilter-torch"
 
 app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 app.command()(detail)
+app.command()(tone)
+app.command()(denoise)
+app.command()(recolor)
+app.command()(colorize)
+app.command()(defocus)
+app.command()(abstract)
 app.command()(fit)
 app.command()(inspect)
 app.command()(demo)

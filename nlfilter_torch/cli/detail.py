@@ -6,15 +6,18 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import typer
 from torch import Tensor
 
-from nlfilter_torch.cli import options
+from nlfilter_torch.cli import options, painting
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.edits.enhance import colour_masks
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.files import Depth, check_output, read_photograph, write_photograph
 from nlfilter_torch.filtering import polynomial_filter
+from nlfilter_torch.masks import compose_alpha
 from nlfilter_torch.presets import Preset
 
 
@@ -67,6 +70,12 @@ def use_preset(context: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
+Spread = Annotated[
+    float,
+    typer.Option(
+        metavar="TIME", help="How far the edit of a region spreads to what is less like it: 0.5 little, 5 far."
+    ),
+]
 PresetFile = Annotated[
     Path | None,
     typer.Option(
@@ -92,6 +101,9 @@ def detail(
     sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
     preset: PresetFile = None,
+    region: painting.SliderRegions = None,
+    mask: painting.MaskFile = None,
+    spread: Spread = 1.0,
 ) -> None:
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
 
@@ -103,19 +115,35 @@ def detail(
 
     Smooth skin or noise away: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
 
+    Sharpen all that looks like a spot: `nlfilter-torch detail in.jpg out.jpg --region 60,300,20,20`
+
     Edit like another photograph: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
     """
     sliders = options.parse_alpha(alpha)
     if residual is not None and not math.isfinite(residual):
         raise ValueError(f"--residual must be a finite number, such as 1, got {residual}")
+    # A mask is worked out before the filter, from coordinates as large as a factor beside its own factor.
+    needed = options.working_bytes(landmarks, patch_size, factors=2 if region or mask else 1)
     with steps(4) as begin:
         begin("Reading")
-        photograph = read_photograph(source, bytes_per_pixel=options.working_bytes(landmarks, patch_size))
+        photograph = read_photograph(source, bytes_per_pixel=needed)
         edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
         check_output(target, edited)
 
         begin("Comparing patches")
         image = photograph.pixels
+        selected = painting.slider_regions(photograph, mask, region, sliders)
+        if selected is not None:
+            regions, own = selected
+            masks = colour_masks(
+                image,
+                regions,
+                time=spread,
+                num_landmarks=landmarks,
+                spatial_bandwidth=spatial_bandwidth,
+                generator=torch.Generator().manual_seed(seed),
+            )
+            sliders = compose_alpha(masks, own)
         operator = options.build_operator(
             reduce_channels(image, "luminance"),
             bandwidth=bandwidth,

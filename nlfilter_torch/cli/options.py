@@ -34,14 +34,19 @@ def parse_alpha(text: str) -> Tensor:
     >>> parse_alpha("3, 3,4,1.05")
     tensor([3.0000, 3.0000, 4.0000, 1.0500])
     """
+    return parse_sliders(text, "--alpha")
+
+
+def parse_sliders(text: str, option: str) -> Tensor:
+    """Sliders with commas between, as an option gives them."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"--alpha must be numbers with commas between, such as 3,3,4,1.05, got {text!r}") from None
+        raise ValueError(f"{option} must be numbers with commas between, such as 3,3,4,1.05, got {text!r}") from None
     if not all(map(math.isfinite, numbers)):
-        raise ValueError(f"--alpha must be finite numbers, such as 3,3,4,1.05, got {text!r}")
+        raise ValueError(f"{option} must be finite numbers, such as 3,3,4,1.05, got {text!r}")
     if len(numbers) < 2:
-        raise ValueError(f"--alpha must have at least two numbers, such as 3,3,4,1.05, got {text!r}")
+        raise ValueError(f"{option} must have at least two numbers, such as 3,3,4,1.05, got {text!r}")
     return torch.tensor(numbers)
 
 

@@ -63,15 +63,28 @@ def enhance(
     check_image(image, "image")
     pixels = image.to(working_dtype(image))
     if regions is not None:
-        shared = {
-            name: options[name] for name in ("num_landmarks", "spatial_bandwidth", "generator") if name in options
-        }
-        by_colour = nonlocal_operator(pixels, photometric_bandwidth=mask_bandwidth, guide_channels="all", **shared)
-        masks = diffusion_mask(by_colour.spectrum(), regions.to(pixels), time=time, width=width, negative=negative)
-        rows = alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha
-        alpha = compose_alpha(masks, rows)
+        shared = {name: value for name, value in options.items() if name in SHARED}
+        masks = colour_masks(
+            pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared
+        )
+        alpha = compose_alpha(masks, alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha)
     elif negative is not None:
         raise ValueError("negative must come with regions, got it alone; paint what is to be edited, too")
     operator = nonlocal_operator(reduce_channels(pixels, "luminance"), **options)
     edited = edit_luminance(pixels, lambda planes: polynomial_filter(operator, planes, alpha, residual=residual))
     return edited.to(image.dtype)
+
+
+def colour_masks(
+    image: Tensor,
+    regions: Tensor,
+    *,
+    negative: Tensor | None = None,
+    time: float | Tensor = 1.0,
+    width: float | Tensor = 4.0,
+    mask_bandwidth: float | Tensor = 25 / 255,
+    **options: Any,
+) -> Tensor:
+    """Diffusion masks (B, K, H, W) by colour, as :func:`enhance` uses them, with its arguments."""
+    operator = nonlocal_operator(image, photometric_bandwidth=mask_bandwidth, guide_channels="all", **options)
+    return diffusion_mask(operator.spectrum(), regions.to(image), time=time, width=width, negative=negative)

@@ -1,0 +1,68 @@
+"""``nlfilter-torch colorize``: colours for a grey photograph from a few strokes."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+from torch import Tensor
+
+from nlfilter_torch.cli import editing, options, painting
+from nlfilter_torch.cli.detail import OutputDepth, Target
+from nlfilter_torch.edits.colorize import colorize as edit
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.files import Photograph
+
+
+class Method(StrEnum):
+    """How colours spread."""
+
+    regression = "regression"
+    kmeans = "kmeans"
+
+
+Spread = Annotated[
+    Method,
+    typer.Option(
+        help="Soft colours that mix between strokes, or one flat colour for each of as many pieces (k-means)."
+    ),
+]
+Strength = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        metavar="0...1",
+        help="How much colour goes to what resembles no stroke: 1 colours everything, 0 leaves it grey.",
+    ),
+]
+
+
+def colorize(
+    source: options.Source,
+    target: Target,
+    strokes: painting.StrokesFile = None,
+    region: painting.ColourRegions = None,
+    strength: Strength = 1.0,
+    method: Spread = Method.regression,
+    bandwidth: editing.Bandwidth = None,
+    spatial_bandwidth: editing.SpatialBandwidth = None,
+    depth: OutputDepth = None,
+    landmarks: options.Landmarks = 100,
+    seed: options.Seed = 0,
+) -> None:
+    """Colour a grey photograph: paint some strokes, and the colours spread over what looks alike nearby.
+
+    Brightness stays as it is. A photograph in colour is taken for a grey one: its own colours are replaced.
+
+    Example: `nlfilter-torch colorize grey.jpg out.jpg --strokes paint.png`
+
+    Without painting: `nlfilter-torch colorize grey.jpg out.jpg --region 10,10,30,30:skyblue --region 10,300,9,9:green`
+    """
+
+    def work(photograph: Photograph) -> Tensor:
+        painted, mask = painting.colour_strokes(photograph, strokes, region)
+        grey = reduce_channels(photograph.pixels, "luminance")
+        shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
+        return edit(grey, painted, mask, method=method.value, strength=strength, **shared)
+
+    editing.edit_file(source, target, depth, work, landmarks=3 * landmarks // 2)

@@ -1,0 +1,82 @@
+"""What every verb does that turns one photograph into another: read, check, edit, write."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Annotated, Any
+
+import torch
+import typer
+from torch import Tensor
+
+from nlfilter_torch.cli import options
+from nlfilter_torch.cli.detail import DEPTHS, FileDepth
+from nlfilter_torch.cli.progress import steps
+from nlfilter_torch.files import Photograph, check_output, read_photograph, write_photograph
+
+Bandwidth = Annotated[
+    float | None,
+    typer.Option(
+        "--bandwidth",
+        metavar="LEVELS",
+        help="How different two spots may be and still count as alike, in grey levels from 0 to 255. Left out: what "
+        "suits this command.",
+    ),
+]
+SpatialBandwidth = Annotated[
+    float | None,
+    typer.Option(
+        metavar="PIXELS",
+        help="How far apart two spots may be and still count as alike. Left out: what suits this command.",
+    ),
+]
+
+
+def edit_file(
+    source: str,
+    target: str,
+    depth: FileDepth | None,
+    edit: Callable[[Photograph], Tensor],
+    *,
+    landmarks: int,
+    patch_size: int = 5,
+    factors: int = 1,
+) -> None:
+    """Write ``edit`` of the photograph in one file to another, at its depth and with all that the file carries.
+
+    Args:
+        source: the file to read.
+        target: the file to write; may be the same.
+        depth: of the output, None for that of the input.
+        edit: from the photograph to new pixels (1, C, H, W).
+        landmarks: M.
+        patch_size: p.
+        factors: arrays of the factor's size that the edit holds at once.
+    """
+    with steps(3) as begin:
+        begin("Reading")
+        needed = options.working_bytes(landmarks, patch_size, factors=factors)
+        photograph = read_photograph(source, bytes_per_pixel=needed)
+        edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
+        check_output(target, edited)
+        begin("Editing")
+        pixels = edit(photograph)
+        begin("Writing")
+        if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
+            edited = replace(edited, icc=None)
+        write_photograph(edited.with_pixels(pixels), target)
+
+
+def common(bandwidth: float | None, spatial_bandwidth: float | None, landmarks: int, seed: int) -> dict[str, Any]:
+    """Keyword arguments of an edit from the options that all of them share; what is left out is left out."""
+    given: dict[str, Any] = {"num_landmarks": landmarks, "generator": torch.Generator().manual_seed(seed)}
+    if bandwidth is not None:
+        given["photometric_bandwidth"] = bandwidth / options.LEVELS
+    if spatial_bandwidth is not None:
+        given["spatial_bandwidth"] = spatial_bandwidth
+    return given
+
+
+def check_colour(photograph: Photograph, verb: str, remedy: str) -> None:
+    """Raise unless the photograph has colours."""
+    if photograph.pixels.shape[1] != 3:
+        raise ValueError(f"{verb} needs a colour photograph, got a grey one; {remedy}")

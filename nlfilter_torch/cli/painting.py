@@ -1,0 +1,204 @@
+"""What someone paints or marks on a photograph: strokes, masks and rectangles, as options of several verbs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from PIL import ImageColor
+from torch import Tensor
+
+from nlfilter_torch.cli.options import parse_sliders
+from nlfilter_torch.files import Photograph, read_photograph
+
+StrokesFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--strokes",
+        metavar="FILE",
+        help="Strokes painted over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where "
+        "nothing is painted.",
+    ),
+]
+ColourRegions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--region",
+        metavar="X,Y,W,H:COLOUR",
+        help="A rectangle of colour in place of a stroke, or on top of them: column and row of its upper left corner, "
+        "width and height in pixels, and a colour such as red or #c04020. May be given several times; later ones cover "
+        "earlier ones.",
+    ),
+]
+Keeps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--keep", metavar="X,Y,W,H", help="A rectangle whose likes stay as they are. May be given several times."
+    ),
+]
+Regions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--region",
+        metavar="X,Y,W,H",
+        help="A rectangle: column and row of its upper left corner, width and height in pixels. May be given several "
+        "times.",
+    ),
+]
+SliderRegions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--region",
+        metavar="X,Y,W,H[:SLIDERS]",
+        help="Edit only what looks like a rectangle: column and row of its upper left corner, its width and height, "
+        "and sliders of its own if they are not those of --alpha, such as 60,300,20,20:3,3,4,1. May be given several "
+        "times.",
+    ),
+]
+MaskFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--mask",
+        metavar="FILE",
+        help="A picture of the photograph's size, white where it is selected, black elsewhere.",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle within a photograph, and what was written after its colon."""
+
+    rows: slice
+    columns: slice
+    note: str | None
+
+    @staticmethod
+    def parse(text: str, option: str, size: tuple[int, int]) -> "Rectangle":
+        """Read ``X,Y,W,H`` or ``X,Y,W,H:NOTE`` for a photograph of ``size`` (height, width).
+
+        >>> Rectangle.parse("2,3,4,5:red", "--region", (20, 30))
+        Rectangle(rows=slice(3, 8, None), columns=slice(2, 6, None), note='red')
+        """
+        numbers, colon, note = text.partition(":")
+        try:
+            x, y, width, height = (int(part) for part in numbers.split(","))
+        except ValueError:
+            raise ValueError(
+                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}"
+            ) from None
+        if width < 1 or height < 1:
+            raise ValueError(f"{option} must be at least 1 pixel wide and high, got {width}x{height} in {text!r}")
+        if x < 0 or y < 0 or x + width > size[1] or y + height > size[0]:
+            raise ValueError(
+                f"{option} must lie within the photograph, which is {size[1]} pixels wide and {size[0]} high, got "
+                f"columns {x} to {x + width - 1} and rows {y} to {y + height - 1} in {text!r}; move or shrink it"
+            )
+        return Rectangle(slice(y, y + height), slice(x, x + width), note if colon else None)
+
+
+def colour_strokes(photograph: Photograph, path: Path | None, regions: list[str] | None) -> tuple[Tensor, Tensor]:
+    """Strokes (1, 3, H, W) and their mask (1, 1, H, W) from ``--strokes`` and ``--region``."""
+    size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
+    strokes, painted = torch.zeros(1, 3, *size), torch.zeros(1, 1, *size)
+    if path is None and not regions:
+        raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
+    if path is not None:
+        strokes, painted = _read_strokes(path, size)
+    for text in regions or []:
+        rectangle = Rectangle.parse(text, "--region", size)
+        if rectangle.note is None:
+            raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
+        strokes[0, :, rectangle.rows, rectangle.columns] = _colour(rectangle.note, text)[:, None, None]
+        painted[..., rectangle.rows, rectangle.columns] = 1
+    return strokes, painted
+
+
+def selection(photograph: Photograph, path: Path | None, regions: list[str] | None, *, option: str) -> Tensor | None:
+    """A mask (1, 1, H, W) from a mask file and rectangles, or None where neither is given.
+
+    Args:
+        photograph: that it is for.
+        path: of the mask.
+        regions: rectangles.
+        option: name of the option of the rectangles, for messages.
+    """
+    size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
+    if path is None and not regions:
+        return None
+    mask = torch.zeros(1, 1, *size) if path is None else _read_mask(path, size)
+    for text in regions or []:
+        rectangle = Rectangle.parse(text, option, size)
+        if rectangle.note is not None:
+            raise ValueError(f"{option} must be X,Y,W,H alone here, got {text!r}; leave out what follows the colon")
+        mask[..., rectangle.rows, rectangle.columns] = 1
+    return mask
+
+
+def slider_regions(
+    photograph: Photograph, path: Path | None, regions: list[str] | None, alpha: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """Regions (1, K, H, W) and their sliders (K, k+1) from ``--mask`` and ``--region``, or None where neither is given.
+
+    Args:
+        photograph: that they are for.
+        path: of a mask, a region with the sliders of ``--alpha``.
+        regions: rectangles, with sliders of their own or without.
+        alpha: sliders (k+1,) of ``--alpha``.
+    """
+    size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
+    masks, sliders = ([], []) if path is None else ([_read_mask(path, size)], [alpha])
+    for text in regions or []:
+        rectangle = Rectangle.parse(text, "--region", size)
+        own = alpha if rectangle.note is None else parse_sliders(rectangle.note, "--region")
+        if len(own) != len(alpha):
+            raise ValueError(
+                f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
+                "repeat or drop some"
+            )
+        masks.append(torch.zeros(1, 1, *size))
+        masks[-1][..., rectangle.rows, rectangle.columns] = 1
+        sliders.append(own)
+    return (torch.cat(masks, dim=1), torch.stack(sliders)) if masks else None
+
+
+def _read_strokes(path: Path, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    painting = read_photograph(path)
+    _check_size(path, painting, size)
+    if painting.alpha is None:
+        raise ValueError(
+            f"{path} has no transparency, so that every pixel of it would be a stroke; "
+            "paint on a transparent layer and save that"
+        )
+    painted = painting.alpha.float()
+    if not bool((painted > 0).any()):
+        raise ValueError(f"{path} is transparent everywhere; paint at least one stroke")
+    return painting.pixels.float().expand(-1, 3, -1, -1).clone(), painted.clone()
+
+
+def _read_mask(path: Path, size: tuple[int, int]) -> Tensor:
+    picture = read_photograph(path)
+    _check_size(path, picture, size)
+    mask = picture.pixels.float().mean(1, keepdim=True).clamp(0, 1)
+    if not bool((mask > 0).any()):
+        raise ValueError(f"{path} is black everywhere; paint white what is to be selected")
+    return mask
+
+
+def _check_size(path: Path, picture: Photograph, size: tuple[int, int]) -> None:
+    height, width = picture.pixels.shape[-2:]
+    if (height, width) != size:
+        raise ValueError(
+            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {width}x{height}; resize one"
+        )
+
+
+def _colour(name: str, text: str) -> Tensor:
+    try:
+        red, green, blue = ImageColor.getrgb(name)[:3]
+    except ValueError:
+        raise ValueError(
+            f"--region must end in a colour, such as red, #c04020 or rgb(192,64,32), got {name!r} in {text!r}"
+        ) from None
+    return torch.tensor([red, green, blue]) / 255

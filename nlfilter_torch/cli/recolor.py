@@ -1,0 +1,53 @@
+"""``nlfilter-torch recolor``: new colours for everything that looks like the strokes."""
+
+from typing import Annotated
+
+import typer
+from torch import Tensor
+
+from nlfilter_torch.cli import editing, options, painting
+from nlfilter_torch.cli.detail import OutputDepth, Target
+from nlfilter_torch.edits.recolor import recolor as edit
+from nlfilter_torch.files import Photograph
+
+Reach = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=0.999,
+        metavar="0...1",
+        help="How far the colour spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+    ),
+]
+
+
+def recolor(
+    source: options.Source,
+    target: Target,
+    strokes: painting.StrokesFile = None,
+    region: painting.ColourRegions = None,
+    keep: painting.Keeps = None,
+    reach: Reach = 0.8,
+    bandwidth: editing.Bandwidth = None,
+    spatial_bandwidth: editing.SpatialBandwidth = None,
+    depth: OutputDepth = None,
+    landmarks: options.Landmarks = 100,
+    seed: options.Seed = 0,
+) -> None:
+    """Give things another colour: paint a little of it on one, and all that look alike take it.
+
+    Brightness stays as it is to the last bit, and so does whatever looks like none of the strokes.
+
+    A red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
+
+    Spare the wood: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
+    """
+
+    def work(photograph: Photograph) -> Tensor:
+        editing.check_colour(photograph, "recolor", "use nlfilter-torch colorize, which colours grey ones")
+        painted, mask = painting.colour_strokes(photograph, strokes, region)
+        kept = painting.selection(photograph, None, keep, option="--keep")
+        shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
+        return edit(photograph.pixels, painted, mask, keep=kept, reach=reach, **shared)
+
+    editing.edit_file(source, target, depth, work, landmarks=landmarks)

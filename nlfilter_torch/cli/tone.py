@@ -1,0 +1,43 @@
+"""``nlfilter-torch tone``: contrast of large shapes and of the detail on them."""
+
+from typing import Annotated
+
+import typer
+from torch import Tensor
+
+from nlfilter_torch.cli import editing, options
+from nlfilter_torch.cli.detail import OutputDepth, Target
+from nlfilter_torch.edits.tone import adjust_tone
+from nlfilter_torch.files import Photograph
+
+Contrast = Annotated[
+    float,
+    typer.Option(metavar="GAIN", help="Contrast of the smooth shading: 1 leaves it, 1.4 is strong, 0.7 flattens."),
+]
+Clarity = Annotated[
+    float, typer.Option(metavar="GAIN", help="Contrast of the largest details on it: 1 leaves it, 4 is strong.")
+]
+
+
+def tone(
+    source: options.Source,
+    target: Target,
+    contrast: Contrast = 1.2,
+    clarity: Clarity = 1.0,
+    bandwidth: editing.Bandwidth = None,
+    spatial_bandwidth: editing.SpatialBandwidth = None,
+    depth: OutputDepth = None,
+    patch_size: options.PatchSize = 5,
+    landmarks: options.Landmarks = 100,
+    seed: options.Seed = 0,
+) -> None:
+    """Raise or lower contrast without a change of colour or of mean brightness.
+
+    Example: `nlfilter-torch tone in.jpg out.jpg --contrast 1.2 --clarity 2`
+    """
+
+    def work(photograph: Photograph) -> Tensor:
+        shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
+        return adjust_tone(photograph.pixels, contrast=contrast, clarity=clarity, patch_size=patch_size, **shared)
+
+    editing.edit_file(source, target, depth, work, landmarks=landmarks, patch_size=patch_size)
