@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_python_blocks_run_in_order(folder: Path) -> None:
     blocks = [block for language, block in BLOCKS if language == "python"]
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     names: dict[str, object] = {}
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
@@ -40,10 +40,10 @@ def test_python_blocks_run_in_order(folder: Path) -> None:
 
 def test_commands_run(folder: Path) -> None:
     ours = [shlex.split(command)[1:] for command in COMMANDS if command.startswith("nlfilter-torch ")]
-    assert len(ours) == 3
+    assert len(ours) == 5
     for arguments in ours:
         assert main(arguments) == 0
-    assert {"crisp.jpg", "calm.png", "looks"} <= {path.name for path in folder.iterdir()}
+    assert {"crisp.jpg", "calm.png", "looks", "look.json", "again.jpg"} <= {path.name for path in folder.iterdir()}
 
 
 def test_set_up_commands_exist() -> None:
@@ -70,6 +70,16 @@ def test_links_and_pictures_are_there() -> None:
         assert target.startswith("https://") or (ROOT / target).exists(), target
     for picture in (ROOT / "docs").glob("*.png"):
         assert picture.stat().st_size < 600_000, picture
+
+
+def test_every_claim_about_training_has_its_test() -> None:
+    table = README.split("## In training")[1].split("| test |\n|---|---|---|\n")[1].split("\n\n")[0]
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py"))
+    for row in table.splitlines():
+        tests = re.findall(r"`(test_\w+)`", row.split("|")[3])
+        assert tests, row
+        for name in tests:
+            assert f"\ndef {name}(" in sources, name
 
 
 def test_public_names_are_named() -> None:
