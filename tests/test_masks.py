@@ -2,11 +2,21 @@
 
 import numpy as np
 import pytest
+import skimage.data
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from skimage.color import rgb2hsv
 
-from nlfilter_torch import diffusion_map, diffusion_mask, nonlocal_operator, segment_mask
+from nlfilter_torch import (
+    Spectrum,
+    compose_alpha,
+    diffusion_map,
+    diffusion_mask,
+    nonlocal_operator,
+    polynomial_filter,
+    segment_mask,
+)
 from tests import reference
 from tests.images import photograph, two_colours
 from tests.problems import build, guides, noise, options, picture
@@ -146,3 +156,121 @@ def test_gradients_are_finite_where_eigenvalues_meet(name: str) -> None:
         assert tensor.grad is not None
         assert tensor.grad.isfinite().all()
         assert tensor.grad.abs().max() > 0
+
+
+# --- what the masks are for: a spot on the astronaut's suit
+
+
+def astronaut(side: int) -> torch.Tensor:
+    """The astronaut in colour, (1, 3, side, side)."""
+    whole = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / 255
+    return torch.nn.functional.avg_pool2d(whole, 512 // side)
+
+
+def suit_spot(side: int) -> torch.Tensor:
+    """A square on the suit, 20 pixels wide at 512."""
+    scale = side / 512
+    region = torch.zeros(1, 1, side, side)
+    region[..., int(300 * scale) : int(320 * scale), int(60 * scale) : int(80 * scale)] = 1
+    return region
+
+
+@pytest.fixture(scope="module")
+def by_colour() -> dict[int, Spectrum]:
+    return {
+        side: nonlocal_operator(astronaut(side), photometric_bandwidth=25 / 255, guide_channels="all").spectrum()
+        for side in (256, 512)
+    }
+
+
+@pytest.mark.slow
+def test_a_spot_on_the_suit_selects_the_suit(by_colour: dict[int, Spectrum]) -> None:
+    mask = diffusion_mask(by_colour[512], suit_spot(512), time=1.0)
+    hue, saturation, value = rgb2hsv(skimage.data.astronaut()).transpose(2, 0, 1)
+    below_collar = np.arange(512)[:, None] > 200
+    suit = torch.from_numpy((hue > 0.01) & (hue < 0.08) & (saturation > 0.6) & (value > 0.35) & below_collar)
+    assert 0.15 < suit.float().mean() < 0.25
+    assert mask[0, 0][suit].mean() >= 3 * mask[0, 0][~suit].mean()
+    assert mask.min() > 0
+    assert mask.max() <= 1
+
+
+@pytest.mark.slow
+def test_masks_grow_with_time_at_every_quantile(by_colour: dict[int, Spectrum]) -> None:
+    levels = torch.linspace(0, 1, 21)
+    masks = [diffusion_mask(by_colour[256], suit_spot(256), time=t).flatten() for t in (0.5, 1.0, 2.0, 5.0)]
+    quantiles = torch.stack([torch.quantile(mask, levels) for mask in masks])
+    assert (quantiles.diff(dim=0) >= 0).all()
+    assert (quantiles.diff(dim=0)[:, 1:-1] > 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("time", [0.5, 1.0, 2.0])
+def test_a_preview_has_the_mask_of_the_photograph(by_colour: dict[int, Spectrum], time: float) -> None:
+    small, large = (diffusion_mask(by_colour[side], suit_spot(side), time=time) for side in (256, 512))
+    assert (torch.nn.functional.avg_pool2d(large, 2) - small).abs().mean() <= 0.05
+
+
+def test_a_negative_region_takes_its_likes_out(spectrum) -> None:
+    region, other = regions(2).split(1, dim=1)
+    plain = diffusion_mask(spectrum, region)
+    held = diffusion_mask(spectrum, region, negative=other)
+    assert (held <= plain).all()
+    assert (held > 0).all()
+    near = diffusion_mask(spectrum, other) / plain  # above 1 where a pixel is closer to the negative region
+    torch.testing.assert_close(held, plain / (1 + near), atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(diffusion_mask(spectrum, region, negative=region), plain / 2)
+    both = diffusion_mask(spectrum, regions(2), negative=other)
+    torch.testing.assert_close(both[:, :1], held)
+    with pytest.raises(ValueError, match=r"negative must have 1 channel or the region's 2, got 3; give one for all"):
+        diffusion_mask(spectrum, regions(2), negative=regions(3))
+    with pytest.raises(ValueError, match=r"negative must each hold a pixel of positive weight"):
+        diffusion_mask(spectrum, region, negative=torch.zeros_like(region))
+
+
+# --- sliders for every region
+
+
+def test_sliders_of_regions_blend_their_edits() -> None:
+    image = picture("coffee", 20, 22)
+    operator = build(image, num_landmarks=60, photometric_bandwidth=0.2)
+    sliders = torch.tensor([[3.0, 2.0, 1.1], [0.0, 0.5, 1.0]], dtype=torch.float64)
+    masks = noise(1, 2, 20, 22) / 2
+    edited = polynomial_filter(operator, image, compose_alpha(masks, sliders))
+    whole = [polynomial_filter(operator, image, row) for row in sliders]
+    expected = image + sum(masks[:, k : k + 1] * (whole[k] - image) for k in range(2))
+    torch.testing.assert_close(edited, expected)
+    one = polynomial_filter(operator, image, compose_alpha(masks[:, :1], sliders[:1]))
+    torch.testing.assert_close(one, torch.lerp(image, whole[0], masks[:, :1]))
+
+
+def test_overlapping_masks_share_a_pixel() -> None:
+    alpha = compose_alpha(torch.ones(1, 2, 1, 1), torch.tensor([[3.0, 1.0], [5.0, 2.0]]))
+    torch.testing.assert_close(alpha.flatten(), torch.tensor([4.0, 1.5]))
+    per_image = compose_alpha(torch.ones(2, 1, 1, 1), torch.tensor([[[3.0, 1.0]], [[5.0, 2.0]]]))
+    torch.testing.assert_close(per_image[..., 0, 0], torch.tensor([[3.0, 1.0], [5.0, 2.0]]))
+
+
+def test_sliders_and_masks_learn() -> None:
+    masks = noise(2, 2, 3, 4).mul(0.5).requires_grad_()
+    alpha = noise(2, 2, 3, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(compose_alpha, (masks, alpha))
+
+
+@pytest.mark.parametrize(
+    ("masks", "alpha", "sentence"),
+    [
+        (torch.ones(1, 2, 3, 3), torch.ones(3), r"alpha must have shape \(2, k\+1\) or \(B, 2, k\+1\), .* got \(3,\)"),
+        (torch.ones(1, 2, 3, 3), torch.ones(3, 4), r"alpha must have shape .* got \(3, 4\); reshape it"),
+        (torch.ones(1, 2, 3, 3) * 1.5, torch.ones(2, 4), r"masks must be in \[0, 1\], got values from 1.5 to 1.5"),
+        (torch.ones(1, 2, 3, 3), torch.full((2, 4), torch.nan), "alpha must be finite, got 8 NaN"),
+    ],
+)
+def test_sliders_that_do_not_fit(masks: torch.Tensor, alpha: torch.Tensor, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        compose_alpha(masks, alpha)
+
+
+def test_sliders_are_a_tensor() -> None:
+    with pytest.raises(TypeError, match=r"alpha must be a torch.Tensor, got list; convert it with torch.tensor"):
+        compose_alpha(torch.ones(1, 1, 2, 2), [1.0, 2.0])  # type: ignore[arg-type]
