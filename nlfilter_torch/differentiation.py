@@ -52,8 +52,10 @@ class OuterProduct(Tensor):
 
 
 def outer_product(left: Tensor, right: Tensor) -> Tensor:
-    """``left @ right``, left unformed where a backward pass of this package may be the only one to look."""
-    return torch.bmm(left, right) if torch.compiler.is_compiling() else OuterProduct(left, right)
+    """``left @ right``, left unformed where its parts are smaller than it is."""
+    if left.shape[2] >= left.shape[1] or torch.compiler.is_compiling():
+        return torch.bmm(left, right)
+    return OuterProduct(left, right)
 
 
 def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:

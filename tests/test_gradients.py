@@ -18,6 +18,7 @@ from nlfilter_torch import (
     polynomial_response,
     spectral_filter,
 )
+from nlfilter_torch.differentiation import OuterProduct
 from nlfilter_torch.features import patch_window
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.strokes import propagate_strokes
@@ -352,4 +353,8 @@ def test_gradient_of_the_factor_is_an_ordinary_tensor_to_whoever_looks() -> None
     together = gradient(once + twice + operator.factor.square().sum())
     torch.testing.assert_close(together, gradient(once) + gradient(twice) + 2 * operator.factor)
     torch.testing.assert_close(gradient(once + twice), gradient(once) + gradient(twice))
+    assert isinstance(gradient(once), OuterProduct)
     assert gradient(once)[0, 0].tolist() == gradient(once).clone()[0, 0].tolist()
+    wide = weighted(operator @ noise(1, 20, *SIZE, seed=2))  # of so many channels that the whole is smaller
+    assert not isinstance(gradient(wide), OuterProduct)
+    torch.testing.assert_close(gradient(once + wide), gradient(once) + gradient(wide))
