@@ -184,7 +184,7 @@ def report(results: Results) -> str:
         if records:
             parts += [f"## {title}", series_table(records, column, key)]
     parts += other_tables(results)
-    parts += [f"Left out for lack of time: {', '.join(results['skipped'])}."] if results["skipped"] else []
+    parts += [f"Cut short or left out for lack of time: {', '.join(results['cut'])}."] if results["cut"] else []
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

@@ -1,6 +1,7 @@
 """The benchmarks run and tell the truth about what they could not measure; how fast they are is not tested."""
 
 import copy
+import itertools
 import json
 import sys
 
@@ -9,29 +10,31 @@ import pytest
 from benchmarks import report
 from benchmarks.speed import peers
 from benchmarks.speed.__main__ import main as measure
+from benchmarks.speed.__main__ import run
 from benchmarks.speed.cases import Case
 from benchmarks.speed.claims import claims
 from benchmarks.speed.floor import READS, floor_calls, floor_summary
 from benchmarks.speed.plan import QUICK
+from benchmarks.speed.suites import SUITES
 from benchmarks.speed.timing import Timing, take_turns
 
-SUITES = ("main", "growth", "batches", "pictures", "slow", "dense", "autograd", "landmarks", "dtypes")
+MEASURED = ("main", "growth", "batches", "pictures", "slow", "dense", "autograd", "landmarks", "dtypes")
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     """What a quick run writes, read back."""
     path = tmp_path_factory.mktemp("speed") / "new" / "speed.json"
-    measure(["--quick", "--only", *SUITES, "--out", str(path)])
+    measure(["--quick", "--only", *MEASURED, "--out", str(path)])
     return json.loads(path.read_text())
 
 
 @pytest.mark.slow
 def test_quick_run_measures_every_suite_it_was_asked_for(results):
     assert results["quick"]
-    assert not results["skipped"]
+    assert not results["cut"]
     ran = {record["suite"] for record in results["results"]}
-    assert ran == {*SUITES, "growth in pixels", "growth in landmarks"} - {"growth"}
+    assert ran == {*MEASURED, "growth in pixels", "growth in landmarks"} - {"growth"}
     for record in results["results"]:
         for timing in record["timings"].values():
             assert timing["median"] > 0
@@ -90,9 +93,22 @@ def test_suites_that_come_too_late_are_named(tmp_path):
     path = tmp_path / "speed.json"
     measure(["--quick", "--only", "threads", "--minutes", "0", "--out", str(path)])
     results = json.loads(path.read_text())
-    assert results["skipped"] == ["threads"]
+    assert results["cut"] == ["threads"]
     assert results["results"] == []
-    assert "Left out for lack of time: threads" in report.report(results)
+    assert "left out for lack of time: threads" in report.report(results)
+
+
+def test_a_suite_stops_between_two_cases_when_time_is_over(monkeypatch):
+    def two_cases(plan):
+        yield {"suite": "two", "label": "first", "timings": {}}
+        yield {"suite": "two", "label": "second", "timings": {}}
+
+    monkeypatch.setitem(SUITES, "two", two_cases)
+    looks = itertools.chain([True], itertools.repeat(False))  # the clock runs out during the first case
+    monkeypatch.setattr("benchmarks.speed.__main__.is_time_left", lambda start, minutes: next(looks))
+    results = run(QUICK, ["two"], minutes=1.0)
+    assert [record["label"] for record in results["results"]] == ["first"]
+    assert results["cut"] == ["two"]
 
 
 def test_claims_are_ratios_of_medians():
