@@ -21,7 +21,7 @@ LOCALITY = 0.1  # default spatial bandwidth as a share of the short side
 UNEXPLAINED = 1e-20
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
-SOFT, CRISP = 3.0, 14.0  # steepness of the steps between tones where the image is flat, and where it has an edge
+SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones where the image is flat, and where it has an edge
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, at which a step is crisp
 
 

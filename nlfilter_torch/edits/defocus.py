@@ -4,6 +4,7 @@ import math
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_image, check_positive, check_same_size
@@ -105,8 +106,9 @@ def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor
     focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
     short = min(image.shape[-2:])
     gap = 2 * math.ceil(CLOSING * short) + 1
-    grown = torch.nn.functional.max_pool2d(focus, gap, stride=1, padding=gap // 2)
-    closed = -torch.nn.functional.max_pool2d(-grown, gap, stride=1, padding=gap // 2)
+    grown = F.max_pool2d(focus, gap, stride=1, padding=gap // 2)
+    # One pixel less back than forth: a patch across a border is like neither side, and would cost the subject its rim.
+    closed = -F.max_pool2d(-grown, gap - 2, stride=1, padding=gap // 2 - 1)
     window = 2 * math.ceil(SMOOTHING * short) + 1
     if window // 2 < short:  # reflection needs as many pixels
         closed = guided_blur(image, closed, window, eps=1e-4)
@@ -135,7 +137,7 @@ def _blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -
     for step in STEPS:
         # Sharper pixels take less part, so that the subject leaves no glow on what is behind it; the small share that
         # is left to them matters only where there is nothing else.
-        weight = (amount / step).clamp(0.01, 1.0)
+        weight = (amount / step).clamp(0.1, 1.0).square()
         kernel = _kernel(step * radius, aperture).to(image)
         sums = _convolve(torch.cat([image * weight, weight], dim=1), kernel)
         blurred = sums[:, :-1] / sums[:, -1:]

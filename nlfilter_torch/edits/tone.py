@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image
+from nlfilter_torch.checks import check_count, check_image
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import polynomial_filter
@@ -48,6 +48,7 @@ def adjust_tone(
         (True, True)
     """
     check_image(image, "image")
+    check_count(order, "order")
     operator = nonlocal_operator(reduce_channels(image, "luminance"), **options)
 
     def slider(value: float | Tensor) -> Tensor:
