@@ -1,0 +1,243 @@
+"""The edits as commands: what they make of files, strokes, masks and rectangles, and what they refuse."""
+
+from pathlib import Path
+
+import pytest
+import skimage.data
+import torch
+from PIL import Image
+
+from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor
+from nlfilter_torch.cli import main
+from nlfilter_torch.cli.painting import Rectangle
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+
+HEIGHT, WIDTH = 48, 64
+LANDMARKS = ("--landmarks", "40")
+
+
+@pytest.fixture(scope="module")
+def pixels() -> torch.Tensor:
+    """(1, 3, 48, 64) in [0, 1]: a piece of the cat."""
+    return torch.from_numpy(skimage.data.chelsea()[80:128, 120:184].copy()).permute(2, 0, 1)[None].float() / 255
+
+
+@pytest.fixture
+def photo(tmp_path: Path, pixels: torch.Tensor) -> Path:
+    write_photograph(Photograph(pixels), tmp_path / "in.png")
+    return tmp_path / "in.png"
+
+
+@pytest.fixture
+def strokes(tmp_path: Path) -> Path:
+    """Green strokes on a transparent layer of the photograph's size."""
+    layer = Image.new("RGBA", (WIDTH, HEIGHT))
+    layer.paste((20, 160, 40, 255), (10, 8, 18, 14))
+    layer.save(tmp_path / "paint.png")
+    return tmp_path / "paint.png"
+
+
+def box(top: int, left: int, height: int, width: int) -> torch.Tensor:
+    mask = torch.zeros(1, 1, HEIGHT, WIDTH)
+    mask[..., top : top + height, left : left + width] = 1
+    return mask
+
+
+def seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def run(verb: str, source: Path, *arguments: object) -> torch.Tensor:
+    out = source.parent / "out.png"
+    assert main([verb, str(source), str(out), *map(str, arguments), *LANDMARKS]) == 0
+    found = read_photograph(out).pixels
+    out.unlink()
+    return found
+
+
+def is_written(found: torch.Tensor, wanted: torch.Tensor) -> bool:
+    """As close as eight bits allow."""
+    return bool((found - wanted.clamp(0, 1)).abs().max() < 0.6 / 255)
+
+
+GREEN = torch.tensor([20, 160, 40]).view(1, 3, 1, 1) / 255
+
+
+def test_recolor(photo: Path, strokes: Path, pixels: torch.Tensor) -> None:
+    mask = box(8, 10, 6, 8)
+    wanted = recolor(pixels, GREEN * mask, mask, num_landmarks=40, generator=seeded())
+    assert is_written(run("recolor", photo, "--strokes", strokes), wanted)
+    assert is_written(run("recolor", photo, "--region", "10,8,8,6:rgb(20,160,40)"), wanted)
+    assert is_written(run("recolor", photo, "--region", "10,8,8,6:red", "--region", "10,8,8,6:#14a028"), wanted)
+    keep = box(30, 40, 8, 8)
+    held = recolor(pixels, GREEN * mask, mask, keep=keep, reach=0.5, num_landmarks=40, generator=seeded())
+    assert is_written(run("recolor", photo, "--strokes", strokes, "--keep", "40,30,8,8", "--reach", 0.5), held)
+
+
+def test_colorize(photo: Path, strokes: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
+    """Grey files become colour files; a photograph in colour is taken for a grey one."""
+    grey = (pixels * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
+    write_photograph(Photograph(grey, "uint16", icc=b"a profile for grey"), tmp_path / "grey.png")
+    mask = box(8, 10, 6, 8)
+    for method in ("regression", "kmeans"):
+        wanted = colorize(grey, GREEN * mask, mask, method=method, strength=0.7, num_landmarks=40, generator=seeded())
+        arguments = ("--strokes", strokes, "--method", method, "--strength", 0.7)
+        assert (run("colorize", tmp_path / "grey.png", *arguments) - wanted).abs().max() < 1e-3
+        assert (run("colorize", photo, *arguments) - wanted).abs().max() < 1 / 255
+    assert main(["colorize", str(tmp_path / "grey.png"), str(tmp_path / "c.png"), "--strokes", str(strokes)]) == 0
+    found = read_photograph(tmp_path / "c.png")
+    assert (found.depth, found.icc) == ("uint16", None)
+
+
+def test_defocus(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
+    region = box(10, 20, 12, 16)
+    for aperture in ("disc", "gaussian"):
+        wanted = defocus(pixels, region, radius=3.0, aperture=aperture, num_landmarks=40, generator=seeded())
+        assert is_written(
+            run("defocus", photo, "--region", "20,10,16,12", "--radius", 3, "--aperture", aperture), wanted
+        )
+    write_photograph(Photograph(region), tmp_path / "mask.png")
+    assert is_written(
+        run("defocus", photo, "--mask", tmp_path / "mask.png"),
+        defocus(pixels, region, num_landmarks=40, generator=seeded()),
+    )
+
+
+def test_abstract(photo: Path, pixels: torch.Tensor) -> None:
+    wanted = abstract(
+        pixels, power=0.2, edges=0.5, edge_width=1.5, tones=6, photometric_bandwidth=40 / 255, num_landmarks=40
+    )
+    arguments = ("--power", 0.2, "--edges", 0.5, "--edge-width", 1.5, "--tones", 6, "--bandwidth", 40)
+    assert is_written(run("abstract", photo, *arguments), wanted)
+    assert is_written(run("abstract", photo, "--power", 0), pixels)
+
+
+def test_denoise(photo: Path, pixels: torch.Tensor) -> None:
+    wanted = denoise(pixels, noise_level=12 / 255, spatial_bandwidth=20.0, num_landmarks=40, generator=seeded())
+    assert is_written(run("denoise", photo, "--noise-level", 12, "--spatial-bandwidth", 20), wanted)
+    assert is_written(run("denoise", photo), denoise(pixels, num_landmarks=40, generator=seeded()))
+
+
+def test_tone(photo: Path, pixels: torch.Tensor) -> None:
+    wanted = adjust_tone(pixels, contrast=1.3, clarity=2.0, num_landmarks=40, generator=seeded())
+    assert is_written(run("tone", photo, "--contrast", 1.3, "--clarity", 2), wanted)
+
+
+def test_detail_of_regions(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
+    sliders, own = torch.tensor([4.0, 3.0, 1.0]), torch.tensor([0.0, 0.5, 1.0])
+    regions = torch.cat([box(8, 10, 6, 8), box(30, 40, 8, 8)], dim=1)
+    wanted = enhance(pixels, torch.stack([sliders, own]), regions, time=2.0, num_landmarks=40)
+    arguments = ("--alpha", "4,3,1", "--region", "10,8,8,6", "--region", "40,30,8,8:0,0.5,1", "--spread", 2)
+    assert is_written(run("detail", photo, *arguments), wanted)
+    write_photograph(Photograph(regions[:, :1]), tmp_path / "mask.png")
+    whole = run("detail", photo, "--alpha", "4,3,1")
+    part = run("detail", photo, "--alpha", "4,3,1", "--mask", tmp_path / "mask.png")
+    assert is_written(part, enhance(pixels, sliders, regions[:, :1], num_landmarks=40))
+    assert not torch.equal(part, whole)
+
+
+def test_depth_and_transparency_are_kept(tmp_path: Path, pixels: torch.Tensor) -> None:
+    alpha = pixels[:, :1].flip(-1)
+    write_photograph(Photograph(pixels, "uint16", alpha), tmp_path / "deep.png")
+    assert main(["tone", str(tmp_path / "deep.png"), str(tmp_path / "out.png"), *LANDMARKS]) == 0
+    stored, found = read_photograph(tmp_path / "deep.png"), read_photograph(tmp_path / "out.png")
+    assert found.depth == "uint16"
+    assert torch.equal(found.alpha, stored.alpha)
+    assert main(["tone", str(tmp_path / "deep.png"), str(tmp_path / "out.tif"), "--depth", "float", *LANDMARKS]) == 0
+    assert read_photograph(tmp_path / "out.tif").depth == "float32"
+
+
+@pytest.mark.parametrize("verb", ["recolor", "colorize", "defocus", "abstract", "denoise", "tone"])
+def test_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([verb, "--help"]) == 0
+    assert f"Usage: nlfilter-torch {verb}" in capsys.readouterr().out
+
+
+def test_rectangles() -> None:
+    assert Rectangle.parse("0,0,64,48", "--region", (48, 64)) == Rectangle(slice(0, 48), slice(0, 64), None)
+    assert Rectangle.parse("63,47,1,1:", "--region", (48, 64)).note == ""
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert not captured.out
+    assert len(captured.err.splitlines()) == 1
+    return captured.err.strip().removeprefix("nlfilter-torch: ")
+
+
+@pytest.mark.parametrize(
+    ("verb", "options", "sentence"),
+    [
+        ("recolor", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
+        ("colorize", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
+        ("defocus", [], "give --region X,Y,W,H or --mask FILE"),
+        (
+            "recolor",
+            ["--region", "1,2,3"],
+            "--region must be four whole numbers X,Y,W,H, such as 40,60,20,20, got '1,2,3'",
+        ),
+        ("recolor", ["--region", "1,2,3,x:red"], "--region must be four whole numbers"),
+        ("recolor", ["--region", "1,2,3,4"], "--region must end in a colour, such as 1,2,3,4:red, got '1,2,3,4'"),
+        ("recolor", ["--region", "1,2,3,4:reddish"], "--region must end in a colour, such as red, #c04020 or rgb("),
+        ("recolor", ["--region", "1,2,0,4:red"], "--region must be at least 1 pixel wide and high, got 0x4"),
+        (
+            "recolor",
+            ["--region", "60,2,5,4:red"],
+            "--region must lie within the photograph, which is 64 pixels wide and 48",
+        ),
+        ("recolor", ["--region", "-1,2,5,4:red"], "--region must lie within the photograph"),
+        ("recolor", ["--region", "1,2,5,4:red", "--keep", "99,9,9,9"], "--keep must lie within the photograph"),
+        ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H alone here, got"),
+        ("recolor", ["--region", "1,2,5,4:red", "--reach", "1"], "Invalid value for '--reach'"),
+        ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H alone here"),
+        ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "radius must be positive and finite, got 0"),
+        ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
+        ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers with commas between"),
+        ("detail", ["--region", "1,2,5,4", "--spread", "0"], "time must be positive and finite, got 0"),
+        ("abstract", ["--tones", "1"], "Invalid value for '--tones'"),
+        ("abstract", ["--edge-width", "0"], "edge_width must be positive"),
+        ("denoise", ["--noise-level", "-1"], "Invalid value for '--noise-level'"),
+        ("tone", ["--bandwidth", "0"], "photometric_bandwidth must be positive"),
+    ],
+)
+def test_wrong_options(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str, options: list[str], sentence: str
+) -> None:
+    assert refused(capsys, verb, photo, tmp_path / "out.png", *options).startswith(sentence)
+    assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
+
+
+def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.png"
+    Image.new("RGBA", (WIDTH, HEIGHT)).save(tmp_path / "clear.png")
+    Image.new("RGBA", (30, 20), (255, 0, 0, 255)).save(tmp_path / "small.png")
+    Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / "black.png")
+    Image.new("L", (WIDTH, HEIGHT), 90).save(tmp_path / "grey.png")
+    (tmp_path / "text.png").write_text("no picture")
+
+    def sentence(verb: str, source: str, *options: object) -> str:
+        return refused(capsys, verb, tmp_path / source, out, *options)
+
+    assert "small.png must be as large as the photograph, 64x48, but is 30x20; resize one" in sentence(
+        "recolor", "in.png", "--strokes", tmp_path / "small.png"
+    )
+    assert "small.png must be as large as the photograph" in sentence(
+        "defocus", "in.png", "--mask", tmp_path / "small.png"
+    )
+    assert "clear.png is transparent everywhere; paint at least one stroke" in sentence(
+        "colorize", "in.png", "--strokes", tmp_path / "clear.png"
+    )
+    assert "in.png has no transparency, so that every pixel of it would be a stroke" in sentence(
+        "colorize", "in.png", "--strokes", photo
+    )
+    assert "black.png is black everywhere; paint white" in sentence(
+        "defocus", "in.png", "--mask", tmp_path / "black.png"
+    )
+    assert "text.png is not a PNG" in sentence("recolor", "in.png", "--strokes", tmp_path / "text.png")
+    assert "none.png does not exist" in sentence("recolor", "in.png", "--strokes", tmp_path / "none.png")
+    assert "recolor needs a colour photograph, got a grey one; use nlfilter-torch colorize" in sentence(
+        "recolor", "grey.png", "--region", "1,1,5,5:red"
+    )
+    assert not out.exists()
