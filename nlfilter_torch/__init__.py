@@ -13,7 +13,7 @@ from nlfilter_torch.edits.recolor import recolor
 from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.filtering import captured_energy, detail_layers, polynomial_filter, spectral_filter
 from nlfilter_torch.fitting import fit_alpha
-from nlfilter_torch.masks import compose_alpha, diffusion_map, diffusion_mask, segment_mask
+from nlfilter_torch.masks import compose_alpha, diffusion_map, diffusion_mask, filter_regions, segment_mask
 from nlfilter_torch.modules import (
     DiffusionMask,
     NonlocalAffinity,
@@ -50,6 +50,7 @@ __all__ = [
     "enhance",
     "estimate_bandwidth",
     "estimate_noise",
+    "filter_regions",
     "fit_alpha",
     "nonlocal_operator",
     "polynomial_filter",

@@ -4,7 +4,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.checks import check_finite, check_image, check_positive, check_same_size, check_unit_range
+from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.landmarks import assign, cluster_means
+from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import Spectrum
 
@@ -185,4 +187,48 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
     check_finite(alpha, "alpha")
     shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
     change = alpha.to(masks) - 1.0
-    return 1.0 + torch.einsum("bkhw,bkl->blhw", shares, change.expand(masks.shape[0], -1, -1))
+    batch = max(masks.shape[0], change.shape[0] if change.ndim == 3 else 1)
+    return 1.0 + torch.einsum("bkhw,bkl->blhw", shares.expand(batch, -1, -1, -1), change.expand(batch, -1, -1))
+
+
+def filter_regions(
+    operator: NonlocalOperator,
+    image: Tensor,
+    masks: Tensor,
+    alpha: Tensor,
+    *,
+    residual: float | Tensor | None = None,
+) -> Tensor:
+    """Filter every region with its own sliders and leave the rest of the image as it is.
+
+    Paper: eq. (12), (13) inside masks, Figs. 12, 13. With one region it is the filtered image blended by its mask.
+
+    Args:
+        operator: W.
+        image: (B, C, H, W).
+        masks: (B, K, H, W) in [0, 1], soft or hard; where they add up to more than 1 they share the pixel.
+        alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
+        residual: of :func:`polynomial_filter`, for all regions.
+
+    Returns:
+        (B, C, H, W) in the image's dtype, equal to it where all masks are 0. Differentiable in everything.
+
+    Raises:
+        TypeError, ValueError: if ``image`` does not fit the operator, or ``masks`` and ``alpha`` do not fit the image
+            or each other.
+
+    Example:
+        >>> from nlfilter_torch import nonlocal_operator
+        >>> image = torch.rand(1, 1, 12, 12, generator=torch.Generator().manual_seed(0))
+        >>> mask = torch.zeros(1, 1, 12, 12)
+        >>> mask[..., :6] = 1
+        >>> edited = filter_regions(nonlocal_operator(image, num_landmarks=20), image, mask, torch.tensor([[3.0, 1.0]]))
+        >>> torch.equal(edited[..., 6:], image[..., 6:]), torch.equal(edited[..., :6], image[..., :6])
+        (True, False)
+    """
+    check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
+    check_same_size(masks, operator.size, "masks", "operator")
+    total = masks.sum(1, keepdim=True)
+    inside = compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha)
+    edited = polynomial_filter(operator, image, inside, residual=residual)
+    return torch.lerp(image, edited, total.clamp(max=1.0).to(image))

@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 from skimage.color import rgb2hsv
 
 from nlfilter_torch import (
+    NonlocalFilter,
     Spectrum,
     compose_alpha,
     diffusion_map,
     diffusion_mask,
+    filter_regions,
     nonlocal_operator,
     polynomial_filter,
     segment_mask,
@@ -242,6 +244,34 @@ def test_sliders_of_regions_blend_their_edits() -> None:
     torch.testing.assert_close(edited, expected)
     one = polynomial_filter(operator, image, compose_alpha(masks[:, :1], sliders[:1]))
     torch.testing.assert_close(one, torch.lerp(image, whole[0], masks[:, :1]))
+
+
+@pytest.mark.parametrize("residual", [None, 0.0, 1.0])
+def test_regions_are_filtered_each_by_its_own_sliders(residual: float | None) -> None:
+    image, sliders = picture("coffee", 20, 22), torch.tensor([[3.0, 2.0, 1.1], [0.0, 0.5, 1.0]], dtype=torch.float64)
+    operator = build(image, num_landmarks=60, photometric_bandwidth=0.2)
+    masks = torch.zeros(1, 2, 20, 22, dtype=torch.float64)
+    masks[:, 0, :8], masks[:, 1, 14:] = 1, 1
+    edited = filter_regions(operator, image, masks, sliders, residual=residual)
+    assert torch.equal(edited[:, :, 8:14], image[:, :, 8:14])
+    for rows, row in ((slice(0, 8), sliders[0]), (slice(14, 20), sliders[1])):
+        whole = polynomial_filter(operator, image, row, residual=residual)
+        torch.testing.assert_close(edited[:, :, rows], whole[:, :, rows])
+    layer = NonlocalFilter(sliders.tolist(), residual=residual, photometric_bandwidth=0.2, num_landmarks=60)
+    single = image.float()
+    found = layer(single, mask=masks.float())
+    torch.testing.assert_close(found, edited.float(), atol=1e-3, rtol=0)
+    found.square().mean().backward()
+    assert layer.sliders.alpha.grad is not None
+    assert (layer.sliders.alpha.grad != 0).all()
+    called = NonlocalFilter(residual=residual, photometric_bandwidth=0.2, num_landmarks=60)
+    torch.testing.assert_close(called(single, mask=masks.float(), alpha=sliders.float()), found)
+    one_for_all = called(single, mask=masks.float(), alpha=sliders[0].float())
+    torch.testing.assert_close(one_for_all[:, :, :8], found[:, :, :8])
+    with pytest.raises(ValueError, match="mask must have 2 channels, one for each row of sliders, got None"):
+        layer(single)
+    with pytest.raises(ValueError, match=r"alpha must have shape \(1, k\+1\)"):
+        layer(single, mask=masks[:, :1].float())
 
 
 def test_overlapping_masks_share_a_pixel() -> None:

@@ -17,7 +17,7 @@ from nlfilter_torch.edits.enhance import colour_masks
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.files import Depth, check_output, read_photograph, write_photograph
 from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.masks import compose_alpha
+from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.presets import Preset
 
 
@@ -143,7 +143,6 @@ def detail(
                 spatial_bandwidth=spatial_bandwidth,
                 generator=torch.Generator().manual_seed(seed),
             )
-            sliders = compose_alpha(masks, own)
         operator = options.build_operator(
             reduce_channels(image, "luminance"),
             bandwidth=bandwidth,
@@ -157,7 +156,9 @@ def detail(
         begin("Filtering")
 
         def edit(planes: Tensor) -> Tensor:
-            return polynomial_filter(operator, planes, sliders, residual=residual)
+            if selected is None:
+                return polynomial_filter(operator, planes, sliders, residual=residual)
+            return filter_regions(operator, planes, masks, own, residual=residual)
 
         pixels = edit_luminance(image, edit) if channels is options.Channels.luminance else edit(image)
 

@@ -8,7 +8,7 @@ from nlfilter_torch.checks import check_image
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.masks import compose_alpha, diffusion_mask
+from nlfilter_torch.masks import diffusion_mask, filter_regions
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 
@@ -38,8 +38,7 @@ def enhance(
             with them; (k+1,) is for all regions.
         regions: (B, K, H, W), non-negative weights of the pixels of K regions; None edits the whole image.
         negative: (B, 1 or K, H, W), weights of pixels whose likes are left out, see :func:`diffusion_mask`.
-        residual: weight of what the eigenvectors do not explain, see :func:`polynomial_filter`; with regions it holds
-            for the whole image, and None or 1 leave the rest of it untouched.
+        residual: weight of what the eigenvectors do not explain, see :func:`polynomial_filter`.
         time: diffusion time of the masks; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         mask_bandwidth: photometric bandwidth of the masks.
@@ -67,12 +66,17 @@ def enhance(
         masks = colour_masks(
             pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared
         )
-        alpha = compose_alpha(masks, alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha)
+        sliders = alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha
     elif negative is not None:
         raise ValueError("negative must come with regions, got it alone; paint what is to be edited, too")
     operator = nonlocal_operator(reduce_channels(pixels, "luminance"), **options)
-    edited = edit_luminance(pixels, lambda planes: polynomial_filter(operator, planes, alpha, residual=residual))
-    return edited.to(image.dtype)
+
+    def edit(planes: Tensor) -> Tensor:
+        if regions is None:
+            return polynomial_filter(operator, planes, alpha, residual=residual)
+        return filter_regions(operator, planes, masks, sliders, residual=residual)
+
+    return edit_luminance(pixels, edit).to(image.dtype)
 
 
 def colour_masks(

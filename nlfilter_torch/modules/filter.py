@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.checks import check_image, check_same_size
+from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.modules import affinity, sliders
 from nlfilter_torch.modules.affinity import NonlocalAffinity
 from nlfilter_torch.modules.learning import check_learn
@@ -20,7 +21,8 @@ class NonlocalFilter(nn.Module):
     image, hold its operator or its layers and call the parts.
 
     Args:
-        alpha: start of the sliders, fine to coarse; ones leave the image as it is.
+        alpha: start of the sliders, fine to coarse; ones leave the image as it is. For K regions K rows of them, each
+            for the mask of its number.
         residual: weight of what the eigenvectors do not explain; None is alpha_1.
         learn: what trains: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``, ``"spatial_bandwidth"`` and
             ``"patch_weights"``; see the two layers. Gradients reach image and guide in any case.
@@ -42,7 +44,7 @@ class NonlocalFilter(nn.Module):
 
     def __init__(
         self,
-        alpha: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
+        alpha: Sequence[float] | Sequence[Sequence[float]] = (1.0, 1.0, 1.0, 1.0),
         *,
         residual: float | None = None,
         learn: Collection[str] = ("alpha",),
@@ -61,16 +63,28 @@ class NonlocalFilter(nn.Module):
         Args:
             image: (B, C, H, W).
             guide: (B, C', H, W) from which the operator is built; None is the image itself.
-            mask: (B, 1, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
-            alpha: sliders of this call in place of the layer's own: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
-                pixel, such as another network finds them.
+            mask: (B, K, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
+            alpha: sliders of this call in place of the layer's own, such as another network finds them: (k+1,),
+                (B, k+1) per image or (B, k+1, H, W) per pixel; for K > 1 masks (K, k+1) or (B, K, k+1).
 
         Returns:
             (B, C, H, W) in the image's dtype.
+
+        Raises:
+            TypeError, ValueError: if a tensor does not fit, or there are sliders for K regions but not K masks.
         """
-        filtered: Tensor = self.sliders(self.affinity(image if guide is None else guide), image, alpha)
+        operator = self.affinity(image if guide is None else guide)
+        if mask is not None:
+            check_image(mask, "mask", batch=image.shape[0])
+            check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
+        rows = self.sliders.alpha if alpha is None else alpha
+        own_rows = alpha is None and rows.ndim == 2
+        if own_rows and mask is None:
+            raise ValueError(f"mask must have {len(rows)} channels, one for each row of sliders, got None; pass masks")
+        if mask is not None and (own_rows or mask.shape[1] > 1):
+            rows = rows.expand(mask.shape[1], -1) if rows.ndim == 1 else rows
+            return filter_regions(operator, image, mask, rows, residual=self.sliders.residual)
+        filtered: Tensor = self.sliders(operator, image, alpha)
         if mask is None:
             return filtered
-        check_image(mask, "mask", batch=image.shape[0])
-        check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
         return torch.lerp(image, filtered, mask.to(image))

@@ -17,14 +17,15 @@ class PolynomialSliders(nn.Module):
     """Operator and image to filtered image, a layer around :func:`polynomial_filter`.
 
     Args:
-        alpha: start of the sliders, fine to coarse; ones leave the image as it is. Paper: eq. (12).
+        alpha: start of the sliders, fine to coarse; ones leave the image as it is. Paper: eq. (12). Rows of them, one
+            for each region, are for :class:`NonlocalFilter` with masks.
         residual: weight of what the eigenvectors do not explain; None is alpha_1, and where it is to be learned the
             start is the start of alpha_1.
         learn: what trains, any of ``"alpha"`` and ``"residual"``; the others are buffers. Give none of them where a
             network finds ``alpha`` for every call.
 
     Attributes:
-        alpha: (k+1,), parameter or buffer.
+        alpha: (k+1,) or (K, k+1), parameter or buffer.
         residual: (), parameter or buffer, or None.
 
     Raises:
@@ -36,17 +37,17 @@ class PolynomialSliders(nn.Module):
 
     def __init__(
         self,
-        alpha: Sequence[float] = (1.0, 1.0, 1.0, 1.0),
+        alpha: Sequence[float] | Sequence[Sequence[float]] = (1.0, 1.0, 1.0, 1.0),
         *,
         residual: float | None = None,
         learn: Collection[str] = ("alpha",),
     ) -> None:
         super().__init__()
         names = check_learn(learn, LEARNABLE)
-        start = torch.tensor([float(a) for a in alpha])
-        check_alpha(start)
+        start = torch.tensor(alpha, dtype=torch.get_default_dtype())
+        check_alpha(start, dimensions=(1, 2))
         if residual is None and "residual" in names:
-            residual = float(start[0])
+            residual = float(start[..., 0].mean())
         weight = None if residual is None else torch.tensor(float(residual))
         for name, value in (("alpha", start), ("residual", weight)):
             if value is not None and name in names:
@@ -72,4 +73,5 @@ class PolynomialSliders(nn.Module):
     def extra_repr(self) -> str:
         """The sliders as they are now."""
         residual = None if self.residual is None else round(self.residual.item(), 4)
-        return f"alpha={[round(a, 4) for a in self.alpha.tolist()]}, residual={residual}"
+        alpha = self.alpha.double().mul(1e4).round().div(1e4).tolist()  # in double: 1.05 has no tail of digits there
+        return f"alpha={alpha}, residual={residual}"
