@@ -13,6 +13,7 @@ from nlfilter_torch.edits.recolor import recolor
 from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.filtering import captured_energy, detail_layers, polynomial_filter, spectral_filter
 from nlfilter_torch.fitting import fit_alpha
+from nlfilter_torch.frames import FittedFilter, filter_frames, fit_filter
 from nlfilter_torch.masks import compose_alpha, diffusion_map, diffusion_mask, filter_regions, segment_mask
 from nlfilter_torch.modules import (
     DiffusionMask,
@@ -31,6 +32,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Diagnostics",
     "DiffusionMask",
+    "FittedFilter",
     "NonlocalAffinity",
     "NonlocalFilter",
     "NonlocalOperator",
@@ -50,8 +52,10 @@ __all__ = [
     "enhance",
     "estimate_bandwidth",
     "estimate_noise",
+    "filter_frames",
     "filter_regions",
     "fit_alpha",
+    "fit_filter",
     "nonlocal_operator",
     "polynomial_filter",
     "polynomial_response",

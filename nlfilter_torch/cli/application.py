@@ -14,6 +14,7 @@ from nlfilter_torch.cli.demo import demo
 from nlfilter_torch.cli.denoise import denoise
 from nlfilter_torch.cli.detail import detail
 from nlfilter_torch.cli.fit import fit
+from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
 from nlfilter_torch.cli.recolor import recolor
 from nlfilter_torch.cli.tone import tone
@@ -29,6 +30,7 @@ app.command()(colorize)
 app.command()(defocus)
 app.command()(abstract)
 app.command()(fit)
+app.command()(frames)
 app.command()(inspect)
 app.command()(demo)
 

@@ -1,0 +1,92 @@
+"""``nlfilter-torch frames``: one edit for all frames of a film, without flicker."""
+
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+from nlfilter_torch.cli import options
+from nlfilter_torch.cli.detail import Residual
+from nlfilter_torch.cli.progress import steps
+from nlfilter_torch.files import SUFFIXES, Photograph, check_folder, check_output, read_photograph, write_photograph
+from nlfilter_torch.frames import filter_frames
+
+Frames = Annotated[
+    Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
+]
+Edited = Annotated[
+    Path, typer.Argument(metavar="OUTDIR", help="The folder for the edited ones; it is made if it is not there.")
+]
+References = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Number of frames, spread over the film, that the filter learns from. More for scenes that change.",
+    ),
+]
+
+
+def frames(
+    folder: Frames,
+    target: Edited,
+    alpha: options.Alpha = "3,3,4,1.05",
+    bandwidth: options.Bandwidth = "auto",
+    residual: Residual = None,
+    references: References = 3,
+    patch_size: options.PatchSize = 5,
+    landmarks: options.Landmarks = 100,
+    sampling: options.LandmarkSampling = options.Sampling.kmeans,
+    seed: options.Seed = 0,
+) -> None:
+    """Edit the details of all frames of a film alike, so that nothing flickers.
+
+    The sliders are those of `nlfilter-torch detail`; the filter is made once, and each frame is edited with it. Every
+    file keeps its name, type, depth, transparency, colour profile and notes of the camera.
+
+    Example: `nlfilter-torch frames shots edited --alpha 2,2,2,1`
+    """
+    sliders = options.parse_alpha(alpha)
+    paths = _pictures(folder)
+    if target.exists() and target.resolve() == folder.resolve():
+        raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
+    check_folder(target)
+    needed = (1 + min(references, len(paths))) * options.working_bytes(landmarks, patch_size)
+    with steps(len(paths) + 1) as begin:
+        begin("Learning from some frames")
+        spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
+        samples = [read_photograph(paths[i], bytes_per_pixel=needed).pixels for i in spread]
+        films: list[Photograph] = []  # the one that is being edited
+
+        def read(path: Path) -> torch.Tensor:
+            begin(path.name)
+            films[:] = [read_photograph(path, bytes_per_pixel=needed)]
+            check_output(target.parent / path.name, films[0])
+            return films[0].pixels
+
+        edited = filter_frames(
+            map(read, paths),
+            sliders,
+            references=samples,
+            residual=residual,
+            photometric_bandwidth=options.parse_bandwidth(bandwidth),
+            patch_size=patch_size,
+            num_landmarks=landmarks,
+            landmarks=sampling.value,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        target.mkdir(exist_ok=True)
+        for path, pixels in zip(paths, edited, strict=True):
+            write_photograph(films[0].with_pixels(pixels), target / path.name)
+    typer.echo(f"{len(paths)} frames in {target}")
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """The image files of a folder, by name."""
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder; name the one that holds the frames")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF or WebP file; put the frames there")
+    return paths

@@ -1,0 +1,190 @@
+"""A filter fitted to one image and applied to others: frames of a film, a set of photographs, tiles of a large one.
+
+Whatever W does to a pixel is a function of the pixel's own patch and of a few m-vectors, sums over all pixels of the
+image that W was made from. With those vectors held, equal patches are edited equally in every frame, so that an edit
+does not flicker; on the image that it was fitted to, the fitted filter is the filter itself.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.blocks import moment
+from nlfilter_torch.checks import check_count, check_image, check_same_size
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.filtering import weigh_layers
+from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.precision import full_precision
+from nlfilter_torch.sinkhorn import scaling_from_moment
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFilter:
+    """Detail layers of any image, by the landmarks, balancing and coefficients of the one that it was fitted to.
+
+    Made by :func:`fit_filter`.
+
+    Attributes:
+        kernel: landmarks, bandwidths and window.
+        balancing: sum of factor times scaling over the fitted image, (1, M, 1).
+        moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
+        explained: coefficients of the part of an image that the eigenvectors explain, (1, M, C).
+    """
+
+    kernel: Kernel
+    balancing: Tensor
+    moments: Tensor
+    explained: Tensor
+
+    @full_precision
+    def layers(self, image: Tensor, guide: Tensor | None = None, *, origin: tuple[int, int] = (0, 0)) -> Tensor:
+        """Detail layers (B, k+1, C, H, W) of an image of any size, as :func:`detail_layers`; they sum to the image.
+
+        Args:
+            image: (B, C, H, W), with the channels of the fitted image.
+            guide: (B, C', H, W), with the channels of the fitted guide; None is the image.
+            origin: row and column of the first pixel, for tiles of the fitted image.
+
+        Raises:
+            TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
+        """
+        return self._smoothed(image, guide, origin)[0].to(image.dtype)
+
+    @full_precision
+    def __call__(
+        self,
+        image: Tensor,
+        alpha: Tensor,
+        guide: Tensor | None = None,
+        *,
+        residual: float | Tensor | None = None,
+        origin: tuple[int, int] = (0, 0),
+    ) -> Tensor:
+        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; other arguments as :meth:`layers`."""
+        layers, explained = self._smoothed(image, guide, origin)
+        filtered = weigh_layers(layers, alpha)
+        if residual is not None:
+            finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
+            finest = finest.to(filtered) if alpha.ndim == 4 else finest.to(filtered).reshape(-1, 1, 1, 1)
+            weight = torch.as_tensor(residual).to(filtered).reshape(-1, 1, 1, 1)
+            filtered = filtered + (weight - finest) * (image.to(filtered) - explained)
+        return filtered.to(image.dtype)
+
+    def _smoothed(self, image: Tensor, guide: Tensor | None, origin: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Layers (B, k+1, C, H, W) and explained part (B, C, H, W), in the kernel's dtype."""
+        channels = self.moments.shape[3]
+        check_image(image, "image", channels=channels)
+        size = (image.shape[-2], image.shape[-1])
+        if guide is not None:
+            check_image(guide, "guide", batch=image.shape[0])
+            guide = guide.expand(image.shape[0], -1, -1, -1)
+            check_same_size(guide, size, "guide", "image")
+        batch = (image.shape[0], -1, -1)
+        kernel = replace(
+            self.kernel, landmarks=self.kernel.landmarks.expand(batch), whitening=self.kernel.whitening.expand(batch)
+        )
+        factor, diagonal = kernel.columns(image if guide is None else guide, origin=origin)  # (B, M, N), (B, N)
+        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor)).unsqueeze(1)
+        remainder = scaling.square() * diagonal.unsqueeze(1)
+        smoothed = [image.to(factor).flatten(2)]
+        for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
+            smoothed.append(scaling * (coefficients.mT @ factor) + remainder * smoothed[-1])
+        powers = torch.stack(smoothed, dim=1)  # (B, k+1, C, N)
+        layers = torch.cat([powers[:, :-1] - powers[:, 1:], powers[:, -1:]], dim=1).unflatten(-1, size)
+        explained = (scaling * (self.explained.to(factor).mT @ factor)).unflatten(-1, size)
+        return layers, explained
+
+
+@full_precision
+def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> FittedFilter:
+    """Keep what it takes to filter other images as an operator filters this one.
+
+    Args:
+        operator: W, of one image or a batch of one.
+        image: y, (1, C, H, W): the image that the operator was made from, or another of its size.
+        order: k, the number of detail layers.
+
+    Returns:
+        The fitted filter; on ``image`` and its guide, its layers are those of :func:`detail_layers`. Differentiable in
+        operator and image.
+
+    Raises:
+        TypeError, ValueError: if ``image`` does not fit the operator, or either is a batch.
+
+    Example:
+        >>> image = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> fitted = fit_filter(nonlocal_operator(image, num_landmarks=20), image)
+        >>> fitted.layers(image.roll(3, -1)[..., :10]).shape
+        torch.Size([1, 4, 1, 24, 10])
+    """
+    check_count(order, "order")
+    check_image(image, "image")
+    if operator.factor.shape[0] != 1 or image.shape[0] != 1:
+        raise ValueError(
+            f"image must be one image, as the operator's must, got {image.shape[0]} and {operator.factor.shape[0]}; "
+            "fit one filter for each"
+        )
+    powers = operator.powers(image, order)[0]  # (k, C, H, W)
+    before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
+    scaling = operator.scaling.unsqueeze(1)  # (1, 1, N)
+    balancing = moment(operator.factor, scaling)
+    moments = torch.stack([moment(operator.factor, scaling * y) for y in before.unsqueeze(1)], dim=1)
+    explained = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
+    return FittedFilter(operator.kernel, balancing, moments, explained)
+
+
+def filter_frames(
+    frames: Iterable[Tensor],
+    alpha: Tensor,
+    *,
+    references: Sequence[Tensor],
+    residual: float | Tensor | None = None,
+    **options: Any,
+) -> Iterator[Tensor]:
+    """Filter the frames of a film, or any set of like images, with one filter, so that the edit does not flicker.
+
+    Args:
+        frames: images (B, C, H, W) in [0, 1], read one at a time; with C = 3 they are RGB, and their colours are kept.
+        alpha: sliders (k+1,) of :func:`polynomial_filter`.
+        references: one or a few frames (1, C, H, W) of one size that show what there is to see; the filter is fitted to
+            all of them. What looks like nothing in them stays as it is.
+        residual: of :func:`polynomial_filter`.
+        **options: of :func:`nonlocal_operator`, for the luminance of the references.
+
+    Returns:
+        The edited frames, in their order, each worked out when it is asked for; values may leave [0, 1].
+
+    Raises:
+        TypeError, ValueError: if there is no reference, references differ in size, several of them come with a
+            ``spatial_bandwidth``, or a frame is no image.
+
+    Example:
+        >>> film = [torch.rand(1, 3, 16, 20, generator=torch.Generator().manual_seed(i)) for i in range(3)]
+        >>> edited = filter_frames(film, torch.tensor([2.0, 1.0]), references=film[:1], num_landmarks=20)
+        >>> [frame.shape for frame in edited]
+        [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
+    """
+    if not references:
+        raise ValueError("references must hold at least one frame, got none; pass the first of the film")
+    if len(references) > 1 and options.get("spatial_bandwidth") is not None:
+        raise ValueError(
+            f"references must be a single frame where spatial_bandwidth is set, got {len(references)}; "
+            "their coordinates would mean several places at once"
+        )
+    for frame in references:
+        check_image(frame, "references", batch=1)
+        check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
+    # One above the other they are one image; the few patches across a seam are the price.
+    tall = torch.cat([reduce_channels(frame, "luminance") for frame in references], dim=2)
+    fitted = fit_filter(nonlocal_operator(tall, **options), tall, order=alpha.shape[-1] - 1)
+
+    def edit(frame: Tensor) -> Tensor:
+        check_image(frame, "frames")
+        return edit_luminance(frame, lambda planes: fitted(planes, alpha, residual=residual))
+
+    return map(edit, frames)

@@ -1,0 +1,211 @@
+"""A filter fitted to one image and applied to others: exact on its own, alike for equal patches, without flicker."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import skimage.data
+import torch
+
+from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_operator, polynomial_filter
+from nlfilter_torch.cli import main
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from tests.problems import build, noise, picture
+
+ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize("spatial_bandwidth", [None, 10.0])
+def test_on_its_own_image_it_is_the_filter(completion: str, spatial_bandwidth: float | None) -> None:
+    guide, image = picture("coffee", 24, 26), noise(1, 2, 24, 26)
+    operator = build(
+        guide,
+        num_landmarks=60,
+        photometric_bandwidth=0.2 if completion == "diagonal" else 0.6,
+        spatial_bandwidth=spatial_bandwidth,
+        completion=completion,
+    )
+    fitted = fit_filter(operator, image, order=4)
+    torch.testing.assert_close(fitted.layers(image, guide), detail_layers(operator, image, order=4), atol=1e-7, rtol=0)
+    alpha = torch.tensor([2.0, 0.5, 3.0, 1.0, 1.1], dtype=torch.float64)
+    for residual in (None, 0.0, 1.0):
+        found, expected = (
+            fitted(image, alpha, guide, residual=residual),
+            polynomial_filter(operator, image, alpha, residual=residual),
+        )
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
+def test_a_tile_is_a_part_of_the_whole() -> None:
+    """With the margin of half a patch around it, to which its own border is padding."""
+    image = picture("astronaut", 40, 44)
+    operator = build(image, num_landmarks=60, photometric_bandwidth=0.2, spatial_bandwidth=15.0)
+    fitted, whole = fit_filter(operator, image), detail_layers(operator, image)
+    tile = fitted.layers(image[..., 10:30, 8:40], origin=(10, 8))
+    torch.testing.assert_close(tile[..., 2:-2, 2:-2], whole[..., 12:28, 10:38], atol=1e-7, rtol=0)
+
+
+def test_equal_patches_are_edited_equally_whatever_is_around() -> None:
+    image = picture("astronaut", 40, 44)
+    fitted = fit_filter(build(image, num_landmarks=60, photometric_bandwidth=0.2), image)
+    other = noise(1, 1, 30, 30)
+    other[..., 5:25, 5:25] = image[..., 10:30, 12:32]
+    found = fitted(other, ALPHA)[..., 7:23, 7:23]
+    torch.testing.assert_close(found, fitted(image, ALPHA)[..., 12:28, 14:30], atol=1e-9, rtol=0)
+
+
+def test_what_the_references_do_not_show_stays() -> None:
+    dark = 0.1 + 0.05 * noise(1, 1, 20, 20)
+    fitted = fit_filter(build(dark, num_landmarks=40, photometric_bandwidth=0.02), dark)
+    bright = 0.8 + 0.1 * noise(1, 1, 20, 20, seed=1)
+    torch.testing.assert_close(fitted(bright, ALPHA.new_tensor([3.0, 1.0, 1.0, 1.0])), bright, atol=1e-6, rtol=0)
+
+
+def test_layers_of_frames_sum_to_them_in_their_dtype() -> None:
+    image = picture("coffee", 24, 26)
+    fitted = fit_filter(build(image, num_landmarks=40), image)
+    for dtype in (torch.float16, torch.float32, torch.float64):
+        frames = noise(3, 1, 20, 30, dtype=dtype)
+        layers = fitted.layers(frames)
+        assert layers.dtype == dtype
+        tolerance = 5e-3 if dtype == torch.float16 else 1e-5
+        torch.testing.assert_close(layers.sum(1), frames, atol=tolerance, rtol=0)
+
+
+def test_gradients_reach_frame_and_reference() -> None:
+    reference, frame = noise(1, 1, 6, 7).requires_grad_(), noise(2, 1, 5, 6, seed=1).requires_grad_()
+
+    def way(reference: torch.Tensor, frame: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+        operator = nonlocal_operator(reference, photometric_bandwidth=0.5, num_landmarks=8, landmarks="uniform")
+        return fit_filter(operator, reference)(frame, alpha, residual=0.5)
+
+    assert torch.autograd.gradcheck(way, (reference, frame, ALPHA.clone().requires_grad_()))
+
+
+def pan(count: int, step: int, height: int = 100, width: int = 120) -> list[torch.Tensor]:
+    """Frames of a camera that moves over the astronaut, ``step`` pixels to the right and down each time."""
+    scene = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / 255
+    return [
+        scene[..., 60 + step * i : 60 + step * i + height, 130 + step * i : 130 + step * i + width]
+        for i in range(count)
+    ]
+
+
+def flicker(edited: list[torch.Tensor], step: int) -> float:
+    """Mean difference of successive frames, moved back."""
+    pairs = pairwise(edited)
+    return float(torch.stack([(a[..., step:, step:] - b[..., :-step, :-step]).abs().mean() for a, b in pairs]).mean())
+
+
+@pytest.mark.slow
+def test_ten_frames_of_a_pan_do_not_flicker() -> None:
+    film, step = pan(10, 7), 7
+    assert flicker(film, step) == 0
+    alpha = ALPHA.float()
+    together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
+    each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
+    assert flicker(together, step) <= flicker(each, step) / 4
+    # And it is the same edit: the frames differ from those edited alone by less than the edit changes them.
+    change = torch.stack([(a - b).abs().mean() for a, b in zip(each, film, strict=True)]).mean()
+    apart = torch.stack([(a - b).abs().mean() for a, b in zip(each, together, strict=True)]).mean()
+    assert apart < change / 3
+
+
+def test_one_reference_is_the_usual_filter_on_luminance() -> None:
+    frame = pan(1, 1, 40, 50)[0]
+    grey = reduce_channels(frame, "luminance")
+    operator = nonlocal_operator(grey)
+    expected = edit_luminance(frame, lambda planes: polynomial_filter(operator, planes, ALPHA.float()))
+    found = next(filter_frames([frame], ALPHA.float(), references=[frame]))
+    torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
+
+
+def test_frames_are_read_one_at_a_time() -> None:
+    film, seen = pan(3, 5, 30, 30), []
+
+    def read() -> object:
+        for i, frame in enumerate(film):
+            seen.append(i)
+            yield frame
+
+    edited = filter_frames(read(), ALPHA.float(), references=film[:1], num_landmarks=30)
+    assert seen == []
+    next(edited)
+    assert seen == [0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"references": []}, "references must hold at least one frame, got none"),
+        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must be a single frame where"),
+        (
+            {"references": [*pan(1, 1, 20, 20), *pan(1, 1, 20, 21)]},
+            "references must have the height and width of the first",
+        ),
+        ({"references": [torch.rand(2, 1, 9, 9)]}, "references must have batch size 1 or 1, got 2"),
+    ],
+)
+def test_bad_references(arguments: dict, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        filter_frames([], ALPHA, **arguments)
+
+
+def test_bad_fits_and_frames() -> None:
+    image = noise(1, 1, 12, 13)
+    operator = build(image, num_landmarks=20)
+    with pytest.raises(ValueError, match=r"image must be one image, as the operator's must, got 2 and 1"):
+        fit_filter(operator, image.expand(2, -1, -1, -1))
+    with pytest.raises(ValueError, match="order must be at least 1, got 0"):
+        fit_filter(operator, image, order=0)
+    fitted = fit_filter(operator, image)
+    with pytest.raises(ValueError, match=r"image must have 1 channel\(s\), got 3"):
+        fitted.layers(noise(1, 3, 9, 9))
+    with pytest.raises(ValueError, match="guide must have the height and width of the image, 9x9, got 8x9"):
+        fitted.layers(noise(1, 1, 9, 9), noise(1, 1, 8, 9))
+    with pytest.raises(ValueError, match="alpha must have one entry per layer, 4, got 3"):
+        fitted(image, ALPHA[:3])
+
+
+# --- the command
+
+
+def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = pan(4, 6, 40, 50)
+    (tmp_path / "film").mkdir()
+    (tmp_path / "film" / "notes.txt").write_text("not a frame")
+    for i, frame in enumerate(film):
+        name = f"{i}.tif" if i == 2 else f"{i}.png"
+        write_photograph(Photograph(frame, "uint16" if i == 2 else "uint8"), tmp_path / "film" / name)
+    arguments = ["frames", str(tmp_path / "film"), str(tmp_path / "out"), "--landmarks", "40", "--alpha", "3,3,1"]
+    for _ in range(2):  # the folder may be there
+        assert main([*arguments, "--references", "2"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == f"4 frames in {tmp_path / 'out'}"
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.tif", "3.png"]
+    stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").glob("[0-9]*"))]
+    wanted = filter_frames(stored, torch.tensor([3.0, 3.0, 1.0]), references=[stored[0], stored[3]], num_landmarks=40)
+    for path, frame in zip(sorted((tmp_path / "out").iterdir()), wanted, strict=True):
+        found = read_photograph(path)
+        assert (found.pixels - frame.clamp(0, 1)).abs().max() < 0.6 / 255
+        assert found.depth == ("uint16" if path.suffix == ".tif" else "uint8")
+
+
+def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(*arguments: object) -> str:
+        assert main(["frames", *map(str, arguments)]) == 2
+        return capsys.readouterr().err
+
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "film").mkdir()
+    write_photograph(Photograph(pan(1, 1, 20, 20)[0]), tmp_path / "film" / "a.png")
+    write_photograph(Photograph(pan(1, 1, 20, 22)[0]), tmp_path / "film" / "b.png")
+    assert "is no folder; name the one that holds the frames" in refused(tmp_path / "none", tmp_path / "out")
+    assert "holds no PNG, JPEG, TIFF or WebP file" in refused(tmp_path / "empty", tmp_path / "out")
+    assert "must be another folder than that of the frames" in refused(tmp_path / "film", tmp_path / "film")
+    assert "does not exist; make it first" in refused(tmp_path / "film", tmp_path / "no" / "where")
+    assert "is a file, not a folder" in refused(tmp_path / "film", tmp_path / "film" / "a.png")
+    assert "references must have the height and width of the first" in refused(tmp_path / "film", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
