@@ -16,9 +16,10 @@ from nlfilter_torch.differentiation import once_differentiable, write_columns
 Completion = Literal["diagonal", "none"]
 
 JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, which float32 can bear
-# exp(-40) is nothing beside 1; smaller ones become denormal floats, six times slower, and their squares vanish in
-# float32, which would leave pixels that resemble no landmark without a single eigenvector.
+# Beside a completed diagonal exp(-40) is nothing; smaller affinities become denormal floats, six times slower, and
+# their squares vanish in float32, which would leave pixels that resemble no landmark without a single eigenvector.
 SMALLEST_EXPONENT = -40.0
+PLAIN_EXPONENT = -60.0  # without completion small affinities are all that links such pixels, and balancing raises them
 
 
 def whitener(landmarks: Tensor) -> Tensor:
@@ -59,7 +60,8 @@ class _Affinity:
     A fresh tensor for every block would cost more in page faults than the exponential does.
     """
 
-    def __init__(self, landmarks: Tensor) -> None:
+    def __init__(self, landmarks: Tensor, complete: bool) -> None:
+        self.floor = SMALLEST_EXPONENT if complete else PLAIN_EXPONENT
         self.centre = landmarks.mean(dim=2, keepdim=True)  # distances are formed near the origin, where they are exact
         self.landmarks = landmarks - self.centre  # (B, D, M)
         self.doubled = 2.0 * self.landmarks.mT
@@ -70,7 +72,7 @@ class _Affinity:
         centred = features - self.centre
         torch.bmm(self.doubled, centred, out=out)
         out.sub_(self.norms).sub_(centred.square().sum(1, keepdim=True))
-        return out.clamp_(SMALLEST_EXPONENT, 0.0).exp_(), centred
+        return out.clamp_(self.floor, 0.0).exp_(), centred
 
 
 class _NystromFactor(torch.autograd.Function):
@@ -84,7 +86,7 @@ class _NystromFactor(torch.autograd.Function):
         factor = large_empty((batch, landmarks.shape[2], pixels), features)
         diagonal = features.new_zeros(batch, pixels)
         scale = features.new_ones(batch, pixels)
-        affinity = _Affinity(landmarks)
+        affinity = _Affinity(landmarks, complete)
         for block, (first, second) in buffered_blocks(factor, 2):
             kernel, _ = affinity(features[:, :, block], first)
             columns = torch.bmm(whitening, kernel, out=second)  # into a buffer: rows of the factor are far apart
@@ -105,7 +107,7 @@ class _NystromFactor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
-        affinity = _Affinity(landmarks)
+        affinity = _Affinity(landmarks, ctx.complete)
         grad_features = large_empty(features.shape, features)
         grad_landmarks = torch.zeros_like(landmarks, dtype=torch.float64)
         grad_whitening = torch.zeros_like(whitening, dtype=torch.float64)

@@ -174,7 +174,7 @@ class NonlocalOperator:
             largest_eigenvalue=spectrum.largest.tolist(),
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(flat @ flat.mT - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(self.scaling.square() * self.diagonal).mean(1).tolist(),
+            diagonal_share=(self.scaling * (self.scaling * self.diagonal)).mean(1).tolist(),
         )
 
 

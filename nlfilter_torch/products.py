@@ -23,7 +23,7 @@ def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tenso
         (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
         as the operator needs no gradient.
     """
-    remainder = scaling.square() * diagonal
+    remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order)  # type: ignore[no-untyped-call]
         return result

@@ -25,7 +25,7 @@ ALARM = 1e-3  # a residual that balancing ends above is worth a warning
 SOLVE_STEPS = {torch.float32: 10, torch.float64: 21}  # 2 * 5.8^-steps is below the rounding of the dtype
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
 SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
-LARGEST_SCALING = 1e12  # of a pixel that the plain method links to nothing; its square is finite in float32
+LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
 
 
 @dataclass(frozen=True)

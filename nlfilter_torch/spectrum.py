@@ -112,11 +112,9 @@ def compute_spectrum(
     factor: Tensor, scaling: Tensor, diagonal: Tensor | None, size: tuple[int, int], rank: int | None
 ) -> Spectrum:
     """Spectrum of ``W``; ``diagonal`` is None where W has no diagonal part."""
-    weights = [scaling.square()]  # F F^T = sum_i d_i^2 u_i u_i^T
-    if diagonal is not None:
-        weights.append(scaling.pow(4) * diagonal)  # F diag(r) F^T
-    # (B, J, M, M)
-    grams: Tensor = _WeightedGram.apply(factor, torch.stack(weights, dim=1))  # type: ignore[no-untyped-call]
+    remainder = None if diagonal is None else scaling.square() * diagonal
+    # F F^T and F diag(r) F^T, (B, J, M, M)
+    grams: Tensor = _Grams.apply(factor, scaling, remainder)  # type: ignore[no-untyped-call]
     gram = SymmetricMatrix.of(grams[:, 0])
     kept = gram.eigenvalues > CUT[factor.dtype] * gram.eigenvalues[:, :1]
     root = gram.apply(torch.rsqrt, kept)
@@ -137,33 +135,39 @@ def compute_spectrum(
     return Spectrum(eigenvalues[:, :shown].to(factor), ritz, root, support, factor, scaling, size, top)
 
 
-class _WeightedGram(torch.autograd.Function):
-    """``sum_i w_ji u_i u_i^T`` for the columns u_i of the factor and several weightings j, block by block."""
+class _Grams(torch.autograd.Function):
+    """``F F^T`` and, given r, ``F diag(r) F^T`` for F = factor diag(d), block by block.
+
+    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small.
+    """
 
     @staticmethod
-    def forward(ctx: Any, factor: Tensor, weights: Tensor) -> Tensor:
+    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None) -> Tensor:
         batch, marks, _ = factor.shape
-        count = weights.shape[1]
-        total = factor.new_zeros(batch, count, marks, marks, dtype=torch.float64)
-        for block, (first, *others) in buffered_blocks(factor, 1 + count):
-            rows = first.copy_(factor[:, :, block])
-            for j, weighted in enumerate(others):
-                total[:, j] += torch.mul(rows, weights[:, j : j + 1, block], out=weighted) @ rows.mT
-        ctx.save_for_backward(factor, weights)
+        total = factor.new_zeros(batch, 1 if remainder is None else 2, marks, marks, dtype=torch.float64)
+        for block, (rows, weighted) in buffered_blocks(factor, 2):
+            torch.mul(factor[:, :, block], scaling[:, None, block], out=rows)
+            total[:, 0] += rows @ rows.mT
+            if remainder is not None:
+                total[:, 1] += torch.mul(rows, remainder[:, None, block], out=weighted) @ rows.mT
+        ctx.save_for_backward(factor, scaling, remainder)
         return total
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
-        factor, weights = ctx.saved_tensors
-        grad_factor, grad_weights = torch.empty_like(factor), torch.empty_like(weights)
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        factor, scaling, remainder = ctx.saved_tensors
+        grad_factor, grad_scaling = torch.empty_like(factor), torch.empty_like(scaling)
+        grad_remainder = None if remainder is None else torch.empty_like(remainder)
         symmetric = (grad + grad.mT).to(factor)  # (B, J, M, M)
-        for block, (rows, pulled, product, total) in buffered_blocks(factor, 4):
-            rows.copy_(factor[:, :, block])
-            total.zero_()
-            for j in range(weights.shape[1]):
-                torch.bmm(symmetric[:, j], rows, out=pulled)
-                grad_weights[:, j, block] = torch.mul(pulled, rows, out=product).sum(1) / 2
-                total += pulled.mul_(weights[:, j : j + 1, block])
-            grad_factor[:, :, block] = total
-        return grad_factor, grad_weights
+        for block, (rows, pulled, weighted, product) in buffered_blocks(factor, 4):
+            d = scaling[:, None, block]
+            torch.mul(factor[:, :, block], d, out=rows)
+            torch.bmm(symmetric[:, 0], rows, out=pulled)
+            if remainder is not None and grad_remainder is not None:
+                torch.bmm(symmetric[:, 1], rows, out=weighted)
+                grad_remainder[:, block] = torch.mul(weighted, rows, out=product).sum(1) / 2
+                pulled.addcmul_(weighted, remainder[:, None, block])
+            grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
+            grad_factor[:, :, block] = pulled.mul_(d)
+        return grad_factor, grad_scaling, grad_remainder
