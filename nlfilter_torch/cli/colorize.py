@@ -65,4 +65,4 @@ def colorize(
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
         return edit(grey, painted, mask, method=method.value, strength=strength, **shared)
 
-    editing.edit_file(source, target, depth, work, landmarks=3 * landmarks // 2)
+    editing.edit_file(source, target, depth, work, landmarks=landmarks)

@@ -16,7 +16,7 @@ from nlfilter_torch.strokes import check_painted, check_share, propagate_strokes
 # Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
 # than 0.3 dB.
 LOCALITY = 0.375  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
-NARROW = {"photometric": 3.0, "spatial": 1 / 3, "landmarks": 1.5}  # the second operator, as multiples of the first
+NARROW, TOLERANT = 1 / 3, 3.0  # spatial and photometric bandwidths of the second operator, as multiples of the first's
 
 
 @full_precision
@@ -83,25 +83,25 @@ def colorize(
     luminance = grey.to(working_dtype(grey))
     bandwidth = LOCALITY * min(size) if spatial_bandwidth is None else spatial_bandwidth
 
-    def spectrum(reach: float, tolerance: float, patch: int, landmarks: float) -> Spectrum:
+    def spectrum(reach: float, tolerance: float, patch: int) -> Spectrum:
         return nonlocal_operator(
             luminance,
             patch_size=patch,
             photometric_bandwidth=tolerance * photometric_bandwidth,
             spatial_bandwidth=reach * bandwidth,
-            num_landmarks=min(round(landmarks * num_landmarks), luminance[0].numel()),
+            num_landmarks=min(num_landmarks, luminance[0].numel()),
             generator=generator,
         ).spectrum()
 
     painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)
     wanted = split_luminance(strokes.to(luminance).expand(batch, -1, -1, -1))[1]
-    far = spectrum(1.0, 1.0, patch_size, 1.0)
+    far = spectrum(1.0, 1.0, patch_size)
     if method == "kmeans":
         regions, colours, _ = group_colours(wanted, painted)
         pieces = segment_mask(far, regions, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
     else:
         chroma = propagate_strokes(far, wanted, painted, strength=strength, smoothness=2.0)
-        near = spectrum(NARROW["spatial"], NARROW["photometric"], min(patch_size, 3), NARROW["landmarks"])
+        near = spectrum(NARROW, TOLERANT, min(patch_size, 3))
         chroma = chroma + propagate_strokes(near, wanted - chroma, painted, strength=0.0, reach=0.5, smoothness=4.0)
     return merge_luminance(luminance, chroma).to(grey.dtype)
