@@ -1,8 +1,8 @@
 """Colours from strokes, against optimisation: ``python -m benchmarks.colorize [--quick] [--first-seed 0]``.
 
 Five photographs at 160x240 in grey, with 6, 20 and 60 random 5x5 strokes of their true chroma, three seeds each. PSNR
-of the RGB result against the photograph, and time, for the stroke regression (the default), the paper's k-means way, and
-Levin's optimisation (:mod:`benchmarks.levin`). All three keep the luminance and share one step into the RGB gamut.
+of the RGB result against the photograph, and time, for the stroke regression (the default), the paper's k-means way,
+and Levin's optimisation (:mod:`benchmarks.levin`). All three keep the luminance and share one step into the RGB gamut.
 """
 
 import argparse
