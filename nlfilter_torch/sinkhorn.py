@@ -93,7 +93,7 @@ def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, 
     total = moment(factor, scaling.unsqueeze(1))
     move = torch.zeros_like(scaling)
     watched = factor.device.type == "cpu"
-    worst = float("inf")
+    worst, slow = float("inf"), 0
     for steps, (momentum, gain) in enumerate(_chebyshev(1.0, 2.0), start=1):
         current, following = total.to(factor).mT, torch.empty_like(scaling)
         next_total, residual = torch.zeros_like(total), scaling.new_zeros(scaling.shape[0])
@@ -107,7 +107,8 @@ def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, 
             torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
             next_total += rows @ following[:, block].unsqueeze(2)
         previous, worst = worst, residual.max().item() if watched else worst
-        stalled = worst < ALARM and worst > previous / 2  # at the level of rounding
+        slow = slow + 1 if worst > previous / 2 else 0
+        stalled = worst < ALARM and slow > 1  # at the level of rounding; a single slow step is no sign of it
         if worst <= tolerance or stalled or steps == (MAX_STEPS if watched else ACCELERATOR_STEPS):
             break
         scaling, total = following, next_total

@@ -6,8 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nlfilter_torch import estimate_bandwidth, nonlocal_operator
 from nlfilter_torch.sinkhorn import balance
 from tests import reference
+from tests.images import reduced
 
 
 def problem(
@@ -56,6 +58,13 @@ def test_the_residual_is_that_of_the_scaling() -> None:
     torch.testing.assert_close(result.residual, measured, atol=1e-12, rtol=0)
     assert result.residual.max() <= 1e-3
     assert 1 <= result.steps < balance(factor, diagonal).steps
+
+
+def test_one_slow_step_is_not_the_end() -> None:
+    """On this picture the residual falls by less than half once, at 1e-4, and goes on to rounding from there."""
+    image = torch.from_numpy(reduced("hubble_deep_field", 160).copy())[None, None]
+    operator = nonlocal_operator(image, photometric_bandwidth=2 * estimate_bandwidth(image))
+    assert operator.residual.item() <= 1e-12
 
 
 def test_identity_is_balanced_already() -> None:
