@@ -221,18 +221,13 @@ def test_bad_arguments_of_masks(call: Callable[[], object], error: type[Exceptio
 # --- what an error or a warning leaves behind
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"num_landmarks": 100},
-        {"num_landmarks": 20, "photometric_bandwidth": 1 / 255, "landmarks": "uniform", "completion": "none"},
-    ],
-    ids=["too many landmarks", "no balance"],
-)
-def test_warnings_point_at_the_caller(options: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("landmarks", "alarm"), [(100, 1.0), (20, 0.0)], ids=["too many landmarks", "no balance"])
+def test_warnings_point_at_the_caller(landmarks: int, alarm: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    # No small image leaves the row sums off by what is worth a warning, so any deviation has to do.
+    monkeypatch.setattr("nlfilter_torch.sinkhorn.ALARM", alarm)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        nonlocal_operator(GUIDE, **options)
+        nonlocal_operator(GUIDE, num_landmarks=landmarks)
     assert [w.filename for w in caught] == [__file__]
 
 
