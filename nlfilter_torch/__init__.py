@@ -10,6 +10,7 @@ from nlfilter_torch.edits.defocus import defocus
 from nlfilter_torch.edits.denoise import denoise, estimate_noise
 from nlfilter_torch.edits.enhance import enhance
 from nlfilter_torch.edits.recolor import recolor
+from nlfilter_torch.edits.sharpen import sharpen
 from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.filtering import captured_energy, detail_layers, polynomial_filter, spectral_filter
 from nlfilter_torch.fitting import fit_alpha
@@ -62,5 +63,6 @@ __all__ = [
     "propagate_strokes",
     "recolor",
     "segment_mask",
+    "sharpen",
     "spectral_filter",
 ]

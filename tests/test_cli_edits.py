@@ -7,7 +7,7 @@ import skimage.data
 import torch
 from PIL import Image
 
-from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor
+from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.cli.painting import Rectangle
 from nlfilter_torch.files import Photograph, read_photograph, write_photograph
@@ -118,6 +118,11 @@ def test_denoise(photo: Path, pixels: torch.Tensor) -> None:
     assert is_written(run("denoise", photo), denoise(pixels, num_landmarks=40, generator=seeded()))
 
 
+def test_sharpen(photo: Path, pixels: torch.Tensor) -> None:
+    wanted = sharpen(pixels, amount=6.0, guide_blur=0.8, patch_size=3, num_landmarks=40, generator=seeded())
+    assert is_written(run("sharpen", photo, "--amount", 6, "--guide-blur", 0.8, "--patch-size", 3), wanted)
+
+
 def test_tone(photo: Path, pixels: torch.Tensor) -> None:
     wanted = adjust_tone(pixels, contrast=1.3, clarity=2.0, num_landmarks=40, generator=seeded())
     assert is_written(run("tone", photo, "--contrast", 1.3, "--clarity", 2), wanted)
@@ -147,7 +152,7 @@ def test_depth_and_transparency_are_kept(tmp_path: Path, pixels: torch.Tensor) -
     assert read_photograph(tmp_path / "out.tif").depth == "float32"
 
 
-@pytest.mark.parametrize("verb", ["recolor", "colorize", "defocus", "abstract", "denoise", "tone"])
+@pytest.mark.parametrize("verb", ["recolor", "colorize", "defocus", "abstract", "denoise", "sharpen", "tone"])
 def test_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([verb, "--help"]) == 0
     assert f"Usage: nlfilter-torch {verb}" in capsys.readouterr().out

@@ -21,6 +21,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     polynomial_filter,
     recolor,
+    sharpen,
 )
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
 from tests.problems import noise
@@ -294,6 +295,26 @@ def test_tone_holds_mean_and_colours() -> None:
     torch.testing.assert_close(adjust_tone(grey, contrast=1.4, clarity=3.0), expected)
 
 
+def test_sharpening_raises_edges_and_spares_noise() -> None:
+    clean = luminance(colour("astronaut", 96, 96))
+    noisy = clean + 10 / 255 * torch.randn(2, 1, 96, 96, generator=torch.Generator().manual_seed(0))
+    sharp = sharpen(noisy, amount=5.0)
+    direction = torch.stack([clean.diff(dim=3)[..., :-1, :], clean.diff(dim=2)[..., :-1]])
+    strength = direction.norm(dim=0)
+    strong = strength > strength.quantile(0.95)
+
+    def slope(image: torch.Tensor) -> torch.Tensor:
+        mean = image.mean(0, keepdim=True)
+        gradient = torch.stack([mean.diff(dim=3)[..., :-1, :], mean.diff(dim=2)[..., :-1]])
+        return ((gradient * direction).sum(0) / strength)[strong].mean()
+
+    wall = (slice(None), slice(None), slice(2, 18), slice(58, 70))
+    assert slope(sharp) > 1.2 * slope(noisy)
+    assert (sharp[0] - sharp[1])[wall[1:]].std() < 1.2 * (noisy[0] - noisy[1])[wall[1:]].std()
+    torch.testing.assert_close(sharpen(clean, amount=1.0), clean, atol=1e-5, rtol=0)
+    assert not torch.equal(sharpen(clean), sharpen(clean, guide_blur=0.0))
+
+
 def test_detail_reaches_the_likes_of_a_region_only() -> None:
     image = colour("astronaut")
     sliders = torch.tensor([4.0, 4.0, 4.0, 1.0])
@@ -332,6 +353,7 @@ EDITS: dict[str, tuple[torch.Tensor, Edit]] = {
     "abstract": (RGB, lambda x: abstract(x, tones=6, edges=0.5, num_landmarks=30)),
     "denoise": (RGB, lambda x: denoise(x, noise_level=0.1, num_landmarks=30)),
     "adjust_tone": (RGB, lambda x: adjust_tone(x, contrast=1.2, clarity=2.0, num_landmarks=30)),
+    "sharpen": (RGB, lambda x: sharpen(x, amount=3.0, num_landmarks=30)),
     "enhance": (RGB, lambda x: enhance(x, torch.tensor([2.0, 1.5, 1.0]), SPOT.to(x), num_landmarks=30)),
 }
 each_edit = pytest.mark.parametrize("name", EDITS)
@@ -425,6 +447,7 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
         (abstract, RGB, {"tones": 1}, "tones must be at least 2, got 1"),
         (abstract, RGB[:, :2], {"tones": 4}, "image must have 1 or 3 channels for edges and tones, got 2"),
         (denoise, RGB, {"noise_level": -0.1}, "noise_level must be at least 0 and finite"),
+        (sharpen, RGB, {"guide_blur": -1.0}, "guide_blur must be at least 0, got -1"),
         (adjust_tone, RGB, {"order": 0}, "order must be at least 1, got 0"),
     ],
 )

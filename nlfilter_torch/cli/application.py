@@ -17,12 +17,14 @@ from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
 from nlfilter_torch.cli.recolor import recolor
+from nlfilter_torch.cli.sharpen import sharpen
 from nlfilter_torch.cli.tone import tone
 
 NAME = "nlfilter-torch"
 
 app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 app.command()(detail)
+app.command()(sharpen)
 app.command()(tone)
 app.command()(denoise)
 app.command()(recolor)

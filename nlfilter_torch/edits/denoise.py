@@ -1,5 +1,6 @@
 """Less noise, with sliders that every pixel sets from the noise level. Paper: Sec. III, Fig. 6(c), (d); Sec. V."""
 
+import math
 from typing import Any
 
 import torch
@@ -67,7 +68,7 @@ def denoise(
 
     heard = level.clamp(min=QUIET)
     operator = nonlocal_operator(
-        _soften(pixels),
+        soften(pixels, GUIDE_BLUR),
         photometric_bandwidth=heard if photometric_bandwidth is None else photometric_bandwidth,
         spatial_bandwidth=LOCALITY * min(pixels.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth,
         patch_size=patch_size,
@@ -115,11 +116,14 @@ def estimate_noise(image: Tensor) -> Tensor:
     return (response.median(1).values / MEDIAN).unflatten(0, image.shape[:2]).mean(1)
 
 
-def _soften(image: Tensor) -> Tensor:
+def soften(image: Tensor, sigma: float) -> Tensor:
+    """Blur an image (B, C, H, W) of any size by a Gaussian."""
     from kornia.filters import gaussian_blur2d  # kornia takes half a second to import: only who needs it waits
 
-    padded = pad_border(image, 2)
-    return gaussian_blur2d(padded, (5, 5), (GUIDE_BLUR, GUIDE_BLUR))[..., 2:-2, 2:-2]
+    reach = math.ceil(2.5 * sigma)
+    size = 2 * reach + 1
+    padded = pad_border(image, reach)
+    return gaussian_blur2d(padded, (size, size), (sigma, sigma))[..., reach:-reach, reach:-reach]
 
 
 def _passed_noise(operator: NonlocalOperator) -> Tensor:
