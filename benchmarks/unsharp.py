@@ -1,0 +1,87 @@
+"""What photographs are sharpened with elsewhere: detail images whose multiples are added to the photograph.
+
+Adaptive unsharp masking after Polesel, Ramponi and Mathews, "Image Enhancement via Adaptive Unsharp Masking", IEEE
+Transactions on Image Processing 9(3), 2000, the paper's [12].
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+# Of the adaptive method, for grey levels from 0 to 255: variances that tell flat, medium and high activity apart, the
+# gain wanted in the latter two, step of the adaptation and forgetting of its correlation matrix.
+ACTIVITY = (60.0, 200.0)
+WANTED = (4.0, 3.0)
+STEP, FORGETTING = 0.1, 0.5
+
+
+def gaussian(image: Tensor, sigma: float) -> Tensor:
+    """Blur (B, 1, H, W)."""
+    from kornia.filters import gaussian_blur2d
+
+    size = 2 * math.ceil(3 * sigma) + 1
+    return gaussian_blur2d(image, (size, size), (sigma, sigma))
+
+
+def unsharp(image: Tensor, sigma: float) -> Tensor:
+    """Plain unsharp masking: what a Gaussian takes away."""
+    return image - gaussian(image, sigma)
+
+
+def band(image: Tensor, fine: float, coarse: float) -> Tensor:
+    """Unsharp masking that spares the finest grain: a difference of Gaussians."""
+    return gaussian(image, fine) - gaussian(image, coarse)
+
+
+def bilateral(image: Tensor, range_sigma: float) -> Tensor:
+    """What a bilateral filter of 11x11 pixels takes away."""
+    from kornia.filters import bilateral_blur
+
+    return image - bilateral_blur(image, (11, 11), range_sigma, (3.0, 3.0))
+
+
+def guided(image: Tensor, eps: float) -> Tensor:
+    """What a guided filter of 11x11 pixels takes away."""
+    from kornia.filters import guided_blur
+
+    return image - guided_blur(image, image, 11, eps)
+
+
+def adaptive(image: Tensor) -> Tensor:
+    """Second differences along rows and columns, each times a gain that a recursion adapts along the row.
+
+    Where the image is active, the gains drive its local dynamics towards a multiple; where it is flat, to no change.
+    """
+    dtype, image = image.dtype, 255 * image.double()
+    padded = F.pad(image, (1, 1, 1, 1), mode="reflect")
+    across = 2 * image - padded[..., 1:-1, :-2] - padded[..., 1:-1, 2:]
+    along = 2 * image - padded[..., :-2, 1:-1] - padded[..., 2:, 1:-1]
+    dynamics, dynamics_across, dynamics_along = (_dynamics(x) for x in (image, across, along))
+    variance = F.avg_pool2d(padded.square(), 3, 1) - F.avg_pool2d(padded, 3, 1).square()
+    medium, high = (torch.full_like(image, gain) for gain in WANTED)
+    wanted = torch.where(variance < ACTIVITY[1], medium, high)
+    wanted = torch.where(variance < ACTIVITY[0], torch.ones_like(image), wanted)
+
+    batch, _, height, width = image.shape
+    gains = image.new_zeros(batch, height, 2)
+    correlation = 1e-2 * torch.eye(2).to(image).expand(batch, height, 2, 2)
+    columns = []
+    for x in range(width):  # all rows at once
+        given = torch.stack([dynamics_across[:, 0, :, x], dynamics_along[:, 0, :, x]], dim=-1)
+        columns.append(gains)
+        lack = (wanted * dynamics - dynamics)[:, 0, :, x] - (gains * given).sum(-1)
+        correlation = (1 - FORGETTING) * correlation + FORGETTING * given.unsqueeze(-1) * given.unsqueeze(-2)
+        step = torch.linalg.solve(correlation + 1e-3 * torch.eye(2).to(image), given)
+        gains = gains + 2 * STEP * lack.unsqueeze(-1) * step
+    adapted = torch.stack(columns, dim=2)  # (B, H, W, 2)
+    detail = adapted[..., 0].unsqueeze(1) * across + adapted[..., 1].unsqueeze(1) * along
+    return (detail / 255).to(dtype)
+
+
+def _dynamics(image: Tensor) -> Tensor:
+    """Difference of a pixel to its eight neighbours."""
+    kernel = -torch.ones(1, 1, 3, 3, dtype=image.dtype)
+    kernel[..., 1, 1] = 8
+    return F.conv2d(F.pad(image, (1, 1, 1, 1), mode="reflect"), kernel)
