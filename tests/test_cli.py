@@ -196,7 +196,7 @@ def test_wrong_options(
 
 def test_wrong_calls(capsys: pytest.CaptureFixture[str]) -> None:
     assert refused(capsys, "detail") == "Missing argument 'IN'."
-    assert refused(capsys, "sharpen").startswith("No such command 'sharpen'.")
+    assert refused(capsys, "embellish").startswith("No such command 'embellish'.")
 
 
 def test_wrong_inputs(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
