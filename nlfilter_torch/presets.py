@@ -1,13 +1,20 @@
 """Sliders and the filter they belong to, as a small JSON file: an edit that was found once, for any other photograph.
 
-Names and units are those of the command line, so that the file can be read and changed by hand.
+Names and units are those of the command line, so that the file can be read and changed by hand. :data:`PRESETS` are
+presets that have a name.
 """
 
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.edits.enhance import enhance
 
 
 @dataclass(frozen=True)
@@ -29,6 +36,40 @@ class Preset:
     patch_size: int = 5
     landmarks: int = 100
     sampling: str = "kmeans"
+
+    def apply(self, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+        """Edit a photograph as ``nlfilter-torch detail --preset`` does.
+
+        Args:
+            image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
+            generator: source of randomness for the landmarks; None draws the same for every call.
+
+        Returns:
+            (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in the image.
+
+        Raises:
+            TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or an entry leaves its range.
+
+        Example:
+            >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+            >>> PRESETS["crisp"].apply(image).shape
+            torch.Size([1, 3, 24, 24])
+        """
+        return enhance(image, torch.tensor(self.alpha), generator=generator, **self.options())
+
+    def options(self) -> dict[str, Any]:
+        """What :func:`nonlocal_operator` takes, in units of the picture.
+
+        >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
+        15.0
+        """
+        return {
+            "photometric_bandwidth": self.bandwidth if isinstance(self.bandwidth, str) else self.bandwidth / 255,
+            "spatial_bandwidth": self.spatial_bandwidth,
+            "patch_size": self.patch_size,
+            "num_landmarks": self.landmarks,
+            "landmarks": self.sampling,
+        }
 
     def to_json(self) -> str:
         """The preset as text, a line for each entry.
@@ -73,6 +114,52 @@ class Preset:
             if not is_valid(value):
                 raise ValueError(f"{entry} in {name} must be {wanted}, got {json.dumps(value)}; correct it")
         return Preset(**entries | {"alpha": tuple(map(float, entries["alpha"]))})
+
+
+# Chosen by eye on astronaut, chelsea, coffee and rocket of scikit-image; docs/presets.md shows them.
+PRESETS: dict[str, Preset] = {
+    "crisp": Preset((3.0, 3.0, 4.0, 1.05)),
+    "clear": Preset((1.5, 1.7, 1.8, 1.0)),
+    "texture": Preset((3.0, 1.5, 1.0, 1.0)),
+    "dramatic": Preset((2.0, 3.0, 4.5, 0.95), 30.0),
+    "glow": Preset((0.3, 1.0, 2.5, 1.06), 30.0),
+    "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 12.0),
+    "calm": Preset((0.8, 0.6, 0.4, 1.0), 40.0),
+    "smooth": Preset((0.0, 0.0, 0.0, 1.0), 15.0),
+}
+
+PURPOSES: dict[str, str] = {
+    "crisp": "all details, large and small, strongly",
+    "clear": "a little more of everything",
+    "texture": "the finest only: fur, hair, cloth, stone; grain too",
+    "dramatic": "deep light and shade; dark corners go black",
+    "glow": "fine detail soft, light and shade deep",
+    "soft skin": "pores and grain away, eyes and outlines kept",
+    "calm": "less contrast within things, as in haze",
+    "smooth": "all texture away, edges kept; the start of a drawing",
+}
+
+
+def find_preset(name: str) -> Preset:
+    """The preset of that name (``soft-skin`` is ``soft skin``), or the one in the file at that path.
+
+    Raises:
+        ValueError: if there is neither, or the file holds no preset.
+
+    Example:
+        >>> find_preset("soft-skin").alpha
+        (0.1, 0.4, 1.0, 1.0)
+    """
+    spoken = name.lower().replace("-", " ").replace("_", " ")
+    if spoken in PRESETS:
+        return PRESETS[spoken]
+    path = Path(name)
+    if not path.is_file():
+        raise ValueError(
+            f"{name} does not exist or is no file, nor is it one of the presets {', '.join(PRESETS)}; "
+            "make a file with nlfilter-torch fit"
+        )
+    return Preset.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
 
 
 def _is_number(value: Any) -> bool:

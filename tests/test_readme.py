@@ -40,10 +40,10 @@ def test_python_blocks_run_in_order(folder: Path) -> None:
 
 def test_commands_run(folder: Path) -> None:
     ours = [shlex.split(command)[1:] for command in COMMANDS if command.startswith("nlfilter-torch ")]
-    assert len(ours) == 5
+    assert len(ours) == 6
     for arguments in ours:
         assert main(arguments) == 0
-    assert {"crisp.jpg", "calm.png", "looks", "look.json", "again.jpg"} <= {path.name for path in folder.iterdir()}
+    assert {"crisp.jpg", "calm.png", "soft.jpg", "looks", "look.json", "again.jpg"} <= {path.name for path in folder.iterdir()}
 
 
 def test_set_up_commands_exist() -> None:

@@ -16,6 +16,7 @@ from nlfilter_torch.cli.detail import detail
 from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
+from nlfilter_torch.cli.presets import presets
 from nlfilter_torch.cli.recolor import recolor
 from nlfilter_torch.cli.sharpen import sharpen
 from nlfilter_torch.cli.tone import tone
@@ -32,6 +33,7 @@ app.command()(colorize)
 app.command()(defocus)
 app.command()(abstract)
 app.command()(fit)
+app.command()(presets)
 app.command()(frames)
 app.command()(inspect)
 app.command()(demo)

@@ -3,7 +3,6 @@
 import math
 from dataclasses import asdict, replace
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -18,7 +17,7 @@ from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.files import Depth, check_output, read_photograph, write_photograph
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.masks import filter_regions
-from nlfilter_torch.presets import Preset
+from nlfilter_torch.presets import PRESETS, find_preset
 
 
 class FileDepth(StrEnum):
@@ -59,15 +58,19 @@ OutputDepth = Annotated[
 ]
 
 
-def use_preset(context: typer.Context, path: Path | None) -> Path | None:
-    """Let the file's entries take the place of the options' defaults."""
-    if path is not None:
-        if not path.is_file():
-            raise ValueError(f"--preset {path} does not exist or is no file; make one with nlfilter-torch fit")
-        entries = asdict(Preset.from_json(path.read_text(encoding="utf-8", errors="replace"), str(path)))
+def check_residual(residual: float | None) -> None:
+    """Raise unless ``--residual`` was left out or is finite."""
+    if residual is not None and not math.isfinite(residual):
+        raise ValueError(f"--residual must be a finite number, such as 1, got {residual}")
+
+
+def use_preset(context: typer.Context, name: str | None) -> str | None:
+    """Let the preset's entries take the place of the options' defaults."""
+    if name is not None:
+        entries = asdict(find_preset(name))
         alpha = ",".join(map(str, entries.pop("alpha")))
         context.default_map = {"alpha": alpha, **{k: v for k, v in entries.items() if v is not None}}
-    return path
+    return name
 
 
 Spread = Annotated[
@@ -76,13 +79,14 @@ Spread = Annotated[
         metavar="TIME", help="How far the edit of a region spreads to what is less like it: 0.5 little, 5 far."
     ),
 ]
-PresetFile = Annotated[
-    Path | None,
+PresetName = Annotated[
+    str | None,
     typer.Option(
-        metavar="FILE",
+        metavar="NAME|FILE",
         callback=use_preset,
         is_eager=True,
-        help="What `nlfilter-torch fit` found, in place of the defaults here; options that are given count for more.",
+        help=f"One of {', '.join(PRESETS)} (`nlfilter-torch presets` describes them), or a file that "
+        "`nlfilter-torch fit` made, in place of the defaults here; options that are given count for more.",
     ),
 ]
 
@@ -100,7 +104,7 @@ def detail(
     landmarks: options.Landmarks = 100,
     sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
-    preset: PresetFile = None,
+    preset: PresetName = None,
     region: painting.SliderRegions = None,
     mask: painting.MaskFile = None,
     spread: Spread = 1.0,
@@ -117,11 +121,12 @@ def detail(
 
     Sharpen all that looks like a spot: `nlfilter-torch detail in.jpg out.jpg --region 60,300,20,20`
 
+    By the name of a look: `nlfilter-torch detail in.jpg out.jpg --preset "soft skin"` (see `nlfilter-torch presets`)
+
     Edit like another photograph: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
     """
     sliders = options.parse_alpha(alpha)
-    if residual is not None and not math.isfinite(residual):
-        raise ValueError(f"--residual must be a finite number, such as 1, got {residual}")
+    check_residual(residual)
     # A mask is worked out before the filter, from coordinates as large as a factor beside its own factor.
     needed = options.working_bytes(landmarks, patch_size, factors=2 if region or mask else 1)
     with steps(4) as begin:

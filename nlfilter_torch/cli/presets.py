@@ -1,0 +1,30 @@
+"""``nlfilter-torch presets``: the looks that have a name."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from nlfilter_torch.presets import PRESETS, PURPOSES, find_preset
+
+Name = Annotated[
+    str | None,
+    typer.Argument(metavar="NAME", help="Print this preset as a file to change and to give to `detail --preset`."),
+]
+
+
+def presets(name: Name = None) -> None:
+    """List the looks that `nlfilter-torch detail --preset NAME` knows, or print one of them as a file.
+
+    Start of your own: `nlfilter-torch presets crisp > mine.json`
+    """
+    if name is not None:
+        typer.echo(find_preset(name).to_json(), nl=False)
+        return
+    table = Table("preset", "alpha", "bandwidth", "what it does")
+    for title, preset in PRESETS.items():
+        sliders = ", ".join(f"{value:g}" for value in preset.alpha)
+        bandwidth = preset.bandwidth if isinstance(preset.bandwidth, str) else f"{preset.bandwidth:g}"
+        table.add_row(title, sliders, bandwidth, PURPOSES[title])
+    Console().print(table)

@@ -1,0 +1,83 @@
+"""Presets that have a name: in Python, on the command line and in its list."""
+
+from pathlib import Path
+
+import pytest
+import skimage.data
+import torch
+
+from nlfilter_torch.cli import main
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.presets import PRESETS, PURPOSES, Preset, find_preset
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    pixels = torch.from_numpy(skimage.data.astronaut()[60:140, 180:280].copy()).permute(2, 0, 1)[None].float() / 255
+    write_photograph(Photograph(pixels), tmp_path / "photo.png")
+    return tmp_path / "photo.png"
+
+
+def contrast(pixels: torch.Tensor) -> float:
+    """RMS of what is left beside a blur of 9x9 pixels."""
+    return float((pixels - torch.nn.functional.avg_pool2d(pixels, 9, 1, 4)).square().mean())
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_command_and_function_agree(photo: Path, name: str) -> None:
+    out = photo.with_name("out.png")
+    assert main(["detail", str(photo), str(out), "--preset", name]) == 0
+    expected = PRESETS[name].apply(read_photograph(photo).pixels).clamp(0, 1)
+    assert (read_photograph(out).pixels - expected).abs().max() <= 0.51 / 255
+
+
+def test_each_raises_or_lowers_what_it_says(photo: Path) -> None:
+    pixels = read_photograph(photo).pixels
+    change = {name: contrast(preset.apply(pixels)) / contrast(pixels) for name, preset in PRESETS.items()}
+    for stronger in ("crisp", "clear", "texture", "dramatic"):
+        assert change[stronger] > 1.2, change
+    for weaker in ("soft skin", "calm", "smooth"):
+        assert change[weaker] < 0.9, change
+    assert change["crisp"] > change["clear"]
+    assert change["smooth"] < change["soft skin"]
+
+
+def test_names_and_files_are_found(photo: Path) -> None:
+    assert find_preset("soft-skin") == find_preset("Soft_Skin") == PRESETS["soft skin"]
+    path = photo.with_name("mine.json")
+    path.write_text(Preset((2.0, 1.0), landmarks=30).to_json())
+    assert find_preset(str(path)) == Preset((2.0, 1.0), landmarks=30)
+
+
+def test_an_option_counts_for_more_than_a_name(photo: Path) -> None:
+    out = photo.with_name("out.png")
+    assert main(["detail", str(photo), str(out), "--preset", "crisp", "--alpha", "1,1"]) == 0
+    assert torch.equal(read_photograph(out).pixels, read_photograph(photo).pixels)
+
+
+def test_an_unknown_name_is_told(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["detail", str(photo), str(photo.with_name("out.png")), "--preset", "crips"]) == 2
+    complaint = capsys.readouterr().err
+    assert "crips does not exist or is no file, nor is it one of the presets crisp, clear" in complaint
+    assert complaint.count("\n") == 1
+    assert main(["presets", "crips"]) == 2
+
+
+def test_the_list_names_them_all(capsys: pytest.CaptureFixture[str]) -> None:
+    assert PURPOSES.keys() == PRESETS.keys()
+    assert main(["presets"]) == 0
+    listed = capsys.readouterr().out
+    for name in PRESETS:
+        assert name in listed
+
+
+def test_one_is_printed_as_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["presets", "soft-skin"]) == 0
+    assert Preset.from_json(capsys.readouterr().out, "it") == PRESETS["soft skin"]
+
+
+def test_gradient_reaches_the_image() -> None:
+    image = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    PRESETS["glow"].apply(image).square().mean().backward()
+    assert image.grad is not None
+    assert image.grad.abs().max() > 0
