@@ -18,7 +18,7 @@ $(VENV)/.installed: $(PINS)
 	touch $@
 
 $(VENV)/.installed-test: $(VENV)/.installed
-	$(PIP) --no-build-isolation -e '.[cli,notebooks,bench,test]'
+	$(PIP) --no-build-isolation -e '.[cli,notebooks,bench,docs,test]'
 	touch $@
 
 # A picture of every step, from a photograph that comes with scikit-image, in out/.
