@@ -59,6 +59,7 @@ def extract_features(
     photometric_bandwidth: float | Tensor,
     spatial_bandwidth: Bandwidth = None,
     origin: tuple[int, int] = (0, 0),
+    halo: tuple[int, int] = (0, 0),
 ) -> Tensor:
     """Features whose squared distance is the exponent of the kernel: ``K_ij = exp(-||x_i - x_j||^2)``.
 
@@ -70,18 +71,22 @@ def extract_features(
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
         spatial_bandwidth: h_x in pixels, likewise; None leaves the coordinates out.
         origin: coordinates (row, column) of the first pixel.
+        halo: rows at the top and at the bottom that patches reach into, but that get no features themselves.
 
     Returns:
-        (B, D, H*W) with D = C p^2, plus 2 with coordinates. Pixels come last: each feature is a plane.
+        (B, D, N) with D = C p^2, plus 2 with coordinates, N pixels in the rows without the halo. Pixels come last: each
+        feature is a plane.
     """
     batch, channels, height, width = guide.shape
     size = patch_weights.shape[0]
     scale = patch_weights.to(guide).div(channels).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
     padded = pad_border(guide, size // 2)
+    # Real rows push as many reflected ones out: where the halo is shorter than the margin, the border is near.
+    padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
     features: Tensor = _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
     if spatial_bandwidth is None:
         return features
-    rows = origin[0] + torch.arange(height, dtype=guide.dtype, device=guide.device)
+    rows = origin[0] + torch.arange(halo[0], height - halo[1], dtype=guide.dtype, device=guide.device)
     columns = origin[1] + torch.arange(width, dtype=guide.dtype, device=guide.device)
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
     coordinates = grid / _per_image(spatial_bandwidth, guide).view(-1, 1, 1)

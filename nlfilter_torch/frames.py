@@ -42,18 +42,27 @@ class FittedFilter:
     explained: Tensor
 
     @full_precision
-    def layers(self, image: Tensor, guide: Tensor | None = None, *, origin: tuple[int, int] = (0, 0)) -> Tensor:
+    def layers(
+        self,
+        image: Tensor,
+        guide: Tensor | None = None,
+        *,
+        origin: tuple[int, int] = (0, 0),
+        halo: tuple[int, int] = (0, 0),
+    ) -> Tensor:
         """Detail layers (B, k+1, C, H, W) of an image of any size, as :func:`detail_layers`; they sum to the image.
 
         Args:
             image: (B, C, H, W), with the channels of the fitted image.
             guide: (B, C', H, W), with the channels of the fitted guide; None is the image.
             origin: row and column of the first pixel, for tiles of the fitted image.
+            halo: rows at the top and at the bottom of a tile that are there for the patches of the others, half a patch
+                or as many as there are before the border; the result is without them.
 
         Raises:
             TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
         """
-        return self._smoothed(image, guide, origin)[0].to(image.dtype)
+        return self._smoothed(image, guide, origin, halo)[0].to(image.dtype)
 
     @full_precision
     def __call__(
@@ -64,18 +73,21 @@ class FittedFilter:
         *,
         residual: float | Tensor | None = None,
         origin: tuple[int, int] = (0, 0),
+        halo: tuple[int, int] = (0, 0),
     ) -> Tensor:
         """The image under the sliders ``alpha``, as :func:`polynomial_filter`; other arguments as :meth:`layers`."""
-        layers, explained = self._smoothed(image, guide, origin)
+        layers, explained = self._smoothed(image, guide, origin, halo)
         filtered = weigh_layers(layers, alpha)
         if residual is not None:
             finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
             finest = finest.to(filtered) if alpha.ndim == 4 else finest.to(filtered).reshape(-1, 1, 1, 1)
             weight = torch.as_tensor(residual).to(filtered).reshape(-1, 1, 1, 1)
-            filtered = filtered + (weight - finest) * (image.to(filtered) - explained)
+            filtered = filtered + (weight - finest) * (_without(image.to(filtered), halo) - explained)
         return filtered.to(image.dtype)
 
-    def _smoothed(self, image: Tensor, guide: Tensor | None, origin: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    def _smoothed(
+        self, image: Tensor, guide: Tensor | None, origin: tuple[int, int], halo: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
         """Layers (B, k+1, C, H, W) and explained part (B, C, H, W), in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
@@ -88,9 +100,11 @@ class FittedFilter:
         kernel = replace(
             self.kernel, landmarks=self.kernel.landmarks.expand(batch), whitening=self.kernel.whitening.expand(batch)
         )
-        factor, diagonal = kernel.columns(image if guide is None else guide, origin=origin)  # (B, M, N), (B, N)
+        factor, diagonal = kernel.columns(image if guide is None else guide, origin=origin, halo=halo)
         scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor)).unsqueeze(1)
         remainder = scaling.square() * diagonal.unsqueeze(1)
+        image = _without(image, halo)
+        size = (image.shape[-2], image.shape[-1])
         smoothed = [image.to(factor).flatten(2)]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(scaling * (coefficients.mT @ factor) + remainder * smoothed[-1])
@@ -98,6 +112,11 @@ class FittedFilter:
         layers = torch.cat([powers[:, :-1] - powers[:, 1:], powers[:, -1:]], dim=1).unflatten(-1, size)
         explained = (scaling * (self.explained.to(factor).mT @ factor)).unflatten(-1, size)
         return layers, explained
+
+
+def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:
+    """The rows of an image that lie between those of its halo."""
+    return image[..., halo[0] : image.shape[-2] - halo[1], :]
 
 
 @full_precision

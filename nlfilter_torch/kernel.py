@@ -35,13 +35,16 @@ class Kernel:
     whitening: Tensor
     completion: Completion
 
-    def columns(self, guide: Tensor, *, origin: tuple[int, int] = (0, 0)) -> tuple[Tensor, Tensor]:
+    def columns(
+        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0)
+    ) -> tuple[Tensor, Tensor]:
         """Factor (B, M, N) and diagonal (B, N) of the pixels of any guide (B, C, H, W).
 
         Args:
             guide: with the channels of the guide that the landmarks come from.
-            origin: row and column of its first pixel in the coordinates of that guide, for tiles; border pixels of a
-                tile need a margin of half a patch around them.
+            origin: row and column of its first pixel in the coordinates of that guide, for tiles.
+            halo: rows at the top and at the bottom of a tile that only patches reach into; they get no columns. Half a
+                patch, or as many as there are before the border of the whole guide.
         """
         features = extract_features(
             reduce_channels(guide.to(self.landmarks.dtype), self.guide_channels),
@@ -49,5 +52,6 @@ class Kernel:
             photometric_bandwidth=self.photometric_bandwidth,
             spatial_bandwidth=self.spatial_bandwidth,
             origin=origin,
+            halo=halo,
         )
         return nystrom_factor(features, self.landmarks, self.whitening, self.completion)

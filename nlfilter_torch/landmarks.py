@@ -31,17 +31,29 @@ def choose_landmarks(
         (B, D, M), differentiable in the features (k-means with the assignment held). All images of a batch draw the
         same pixels, so that a batch gives what single calls give.
     """
-    pixels = features.shape[-1]
-    if count == pixels:
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    if count == features.shape[-1]:
         return features
+    candidates = features[:, :, candidate_pixels(size, count, sampling, generator).to(features.device)]
+    return condense(candidates, count, generator)
+
+
+def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
+    """Indices of the pixels whose features :func:`condense` makes ``count`` landmarks of, all different."""
+    pixels = size[0] * size[1]
+    if count == pixels:
+        return torch.arange(pixels)
     if sampling == "uniform":
-        return features[:, :, _grid(size, count).to(features.device)]
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
+        return _grid(size, count)
     if sampling == "random":
-        chosen = torch.randperm(pixels, generator=generator, device=generator.device)[:count]
-        return features[:, :, chosen.to(features.device)]
-    subset = features[:, :, _stratified(pixels, min(pixels, PER_LANDMARK * count), generator).to(features.device)]
+        return torch.randperm(pixels, generator=generator, device=generator.device)[:count]
+    return stratified(pixels, min(pixels, PER_LANDMARK * count), generator)
+
+
+def condense(subset: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Landmarks (B, D, M) from the features (B, D, S) of the candidates: centroids where there are more than M."""
+    if subset.shape[2] == count:
+        return subset
     points = subset.detach()
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
     start = _pivots(points, count, generator).unsqueeze(1)  # (B, 1, M)
@@ -63,7 +75,7 @@ def _grid(size: tuple[int, int], count: int) -> Tensor:
     return torch.cat(lines)
 
 
-def _stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
+def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
     """``count`` distinct pixels, one from each of ``count`` equal stretches of the image, in random order."""
     device = generator.device
     offsets = torch.rand(count, generator=generator, device=device, dtype=torch.float64)

@@ -115,24 +115,32 @@ def compute_spectrum(
     remainder = None if diagonal is None else scaling.square() * diagonal
     # F F^T and F diag(r) F^T, (B, J, M, M)
     grams: Tensor = _Grams.apply(factor, scaling, remainder)  # type: ignore[no-untyped-call]
-    gram = SymmetricMatrix.of(grams[:, 0])
-    kept = gram.eigenvalues > CUT[factor.dtype] * gram.eigenvalues[:, :1]
-    root = gram.apply(torch.rsqrt, kept)
-    inner = gram.matrix @ gram.matrix
-    if diagonal is not None:
-        inner = inner + grams[:, 1]
-    projected = root @ inner @ root
-    ritz = SymmetricMatrix.of((projected + projected.mT) / 2)
+    root, inner, ranks = whiten_gram(grams, factor.dtype)
+    ritz = SymmetricMatrix.of(inner)
     top = ritz.eigenvalues[:, 0]
     ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
 
-    ranks = kept.sum(1)  # (B,)
     full = int(ranks.max())
     shown = full if rank is None else min(rank, full)
     support = torch.arange(factor.shape[1], device=factor.device) < ranks.clamp(max=shown).unsqueeze(1)
     # First-order perturbation: the derivative of an eigenvalue is v^T dT v, repeated or not.
     eigenvalues = (ritz.vectors * (ritz.matrix @ ritz.vectors)).sum(1).clamp(0.0, 1.0) * support
     return Spectrum(eigenvalues[:, :shown].to(factor), ritz, root, support, factor, scaling, size, top)
+
+
+def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels and nothing else.
+
+    Args:
+        grams: ``F F^T`` and, where W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
+        dtype: of the factor, whose rounding they hold.
+    """
+    gram = SymmetricMatrix.of(grams[:, 0])
+    kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
+    root = gram.apply(torch.rsqrt, kept)
+    inner = gram.matrix @ gram.matrix + grams[:, 1:].sum(1)
+    projected = root @ inner @ root
+    return root, (projected + projected.mT) / 2, kept.sum(1)
 
 
 class _Grams(torch.autograd.Function):
