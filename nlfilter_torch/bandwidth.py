@@ -25,7 +25,7 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
         guide_channels: ``"luminance"`` reduces three channels to one; ``"all"`` takes the mean over channels.
 
     Returns:
-        (B,), in units of the guide. Constant: no gradient reaches the guide through it.
+        (B,), in units of the guide. Constant, as no gradient reaches the guide through it.
 
     Raises:
         TypeError, ValueError: if ``guide`` is not a finite floating-point (B, C, H, W) tensor.

@@ -14,8 +14,7 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
     """Split an image into detail layers, fine to coarse, and the smooth layer that remains.
 
     Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Whoever keeps the layers moves
-        sliders
-    without another look at the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, which is
+    sliders without another look at the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, which is
     :class:`PolynomialSliders`.
 
     Args:
@@ -95,8 +94,7 @@ def polynomial_filter(
 
     Raises:
         TypeError, ValueError: if ``image`` does not fit the operator, or ``alpha`` has fewer than two entries or
-        another
-            shape.
+            another shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator

@@ -64,13 +64,13 @@ def fit_alpha(
             they are blended.
 
     Returns:
-        alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype: every other alpha has a mean squared error (or
+        alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype; every other alpha has a mean squared error (or
         a ``loss``) at least as large. Ones where the image decides nothing, as a constant one. Differentiable in image,
         target, mask and operator; with a ``loss``, not.
 
     Raises:
         TypeError, ValueError: if ``image``, ``target`` or ``mask`` do not fit together, ``mask`` is negative or all
-        zero for an image, ``order`` is not a positive integer, or ``ridge`` or ``rounding`` is negative.
+            zero for an image, ``order`` is not a positive integer, or ``ridge`` or ``rounding`` is negative.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator, polynomial_filter

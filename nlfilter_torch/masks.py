@@ -133,7 +133,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
 
     Raises:
         TypeError, ValueError: if ``regions`` does not fit, is negative or holds an empty one, or ``time`` is not
-        positive.
+            positive.
     """
     check_positive(time, "time")
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
@@ -163,7 +163,7 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
         alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
 
     Returns:
-        (B, k+1, H, W): ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in both.
+        (B, k+1, H, W), ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in both.
 
     Raises:
         TypeError, ValueError: if ``masks`` is no such tensor or leaves [0, 1], or ``alpha`` has another number of

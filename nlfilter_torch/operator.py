@@ -197,9 +197,8 @@ def nonlocal_operator(
     """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
 
     Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
-        autocast
-    too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks (for
-    k-means, the assignment of pixels to centroids) held.
+    autocast too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks
+    (for k-means, the assignment of pixels to centroids) held.
 
     Args:
         guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network.

@@ -58,7 +58,7 @@ class Preset:
         return enhance(image, torch.tensor(self.alpha), generator=generator, **self.options())
 
     def options(self) -> dict[str, Any]:
-        """What :func:`nonlocal_operator` takes, in units of the picture.
+        """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
 
         >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
         15.0

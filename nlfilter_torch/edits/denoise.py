@@ -96,7 +96,7 @@ def estimate_noise(image: Tensor) -> Tensor:
         image: (B, C, H, W), at least 3x3.
 
     Returns:
-        (B,), in units of the image; 0 for an image smaller than 3x3. Constant: no gradient passes.
+        (B,), in units of the image; 0 for an image smaller than 3x3. Constant, as no gradient passes.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point (B, C, H, W) tensor.
