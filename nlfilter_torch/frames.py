@@ -75,7 +75,7 @@ class FittedFilter:
         origin: tuple[int, int] = (0, 0),
         halo: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; the rest as :meth:`FittedFilter.layers`."""
+        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`."""
         layers, explained = self._smoothed(image, guide, origin, halo)
         filtered = weigh_layers(layers, alpha)
         if residual is not None:

@@ -116,7 +116,7 @@ class Preset:
         return Preset(**entries | {"alpha": tuple(map(float, entries["alpha"]))})
 
 
-# Chosen by eye on astronaut, chelsea, coffee and rocket of scikit-image; docs/presets.md shows them.
+#: The presets that have a name. Chosen by eye on astronaut, chelsea, coffee and rocket of scikit-image.
 PRESETS: dict[str, Preset] = {
     "crisp": Preset((3.0, 3.0, 4.0, 1.05)),
     "clear": Preset((1.5, 1.7, 1.8, 1.0)),
@@ -128,6 +128,7 @@ PRESETS: dict[str, Preset] = {
     "smooth": Preset((0.0, 0.0, 0.0, 1.0), 15.0),
 }
 
+#: What each of :data:`PRESETS` does, in a few words.
 PURPOSES: dict[str, str] = {
     "crisp": "all details, large and small, strongly",
     "clear": "a little more of everything",
