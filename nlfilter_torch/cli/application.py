@@ -8,6 +8,7 @@ import typer
 
 from nlfilter_torch import __version__
 from nlfilter_torch.cli.abstract import abstract
+from nlfilter_torch.cli.batch import batch
 from nlfilter_torch.cli.colorize import colorize
 from nlfilter_torch.cli.defocus import defocus
 from nlfilter_torch.cli.demo import demo
@@ -34,6 +35,7 @@ app.command()(defocus)
 app.command()(abstract)
 app.command()(fit)
 app.command()(presets)
+app.command()(batch)
 app.command()(frames)
 app.command()(inspect)
 app.command()(demo)

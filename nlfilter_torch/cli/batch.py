@@ -1,0 +1,122 @@
+"""``nlfilter-torch batch``: the same edit of the details for all photographs of a folder."""
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from nlfilter_torch.checks import check_patch_size, check_positive
+from nlfilter_torch.cli import options
+from nlfilter_torch.cli.detail import Edited, PresetName, Residual, check_residual, detail
+from nlfilter_torch.cli.progress import steps
+from nlfilter_torch.folders import Tally, edit_folder, pictures, prepare
+from nlfilter_torch.ranks import connected_ranks
+
+Folder = Annotated[Path, typer.Argument(metavar="IN_DIR", help="The folder that holds the photographs.")]
+Target = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OUT_DIR",
+        help="The folder for the edited ones, under the same names; it is made if it is not there. What it holds "
+        "already is not done again.",
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="How many photographs are edited at a time; each takes memory of its own. Left out: one for every core.",
+    ),
+]
+
+
+def batch(
+    folder: Folder,
+    target: Target,
+    alpha: options.Alpha = "3,3,4,1.05",
+    bandwidth: options.Bandwidth = "auto",
+    residual: Residual = None,
+    channels: Edited = options.Channels.luminance,
+    spatial_bandwidth: options.SpatialBandwidth = None,
+    patch_size: options.PatchSize = 5,
+    landmarks: options.Landmarks = 100,
+    sampling: options.LandmarkSampling = options.Sampling.kmeans,
+    seed: options.Seed = 0,
+    preset: PresetName = None,
+    workers: Workers = None,
+) -> None:
+    """Edit the details of all photographs of a folder, as `nlfilter-torch detail` edits one.
+
+    A file that cannot be edited is reported and the others are done; the exit status is 1 then. After an interruption
+    the same command does what is left.
+
+    All like one: `nlfilter-torch batch shots edited --preset look.json`
+
+    On several machines that share the folders: `torchrun ... -m nlfilter_torch batch shots edited --preset look.json`
+    """
+    options.parse_alpha(alpha)
+    options.parse_bandwidth(bandwidth)
+    check_residual(residual)
+    check_patch_size(patch_size)
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "--spatial-bandwidth")
+    settings: dict[str, Any] = {
+        "alpha": alpha,
+        "bandwidth": bandwidth,
+        "residual": residual,
+        "channels": channels,
+        "spatial_bandwidth": spatial_bandwidth,
+        "patch_size": patch_size,
+        "landmarks": landmarks,
+        "sampling": sampling,
+        "seed": seed,
+    }
+    paths = pictures(folder)
+    with connected_ranks() as ranks:
+        prepare(paths, target, settings)
+        share, tally, total = ranks.share(paths), Tally(), Tally()
+        cores = max(1, _cores() // ranks.local)
+        count = workers or cores
+        try:
+            with steps(len(share)) as begin:
+                edit_folder(
+                    share,
+                    target,
+                    partial(detail, **settings),
+                    workers=count,
+                    threads=max(1, cores // count),
+                    tell=_tell,
+                    begin=begin,
+                    tally=tally,
+                )
+        except KeyboardInterrupt:
+            _tell("interrupted; the same command does the rest")
+        for part in ranks.gather(tally):
+            total.add(part)
+        if ranks.rank == 0 or ranks.group is None:
+            _summarise(total, target)
+        ranks.gather(None)  # the first rank to end with status 1 ends the others, which may still have to say something
+    if total.failures or total.left:
+        raise typer.Exit(1)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _tell(sentence: str) -> None:
+    typer.echo(f"nlfilter-torch: {sentence}", err=True)
+
+
+def _summarise(tally: Tally, target: Path) -> None:
+    """Counts on the standard output, and the names of what is missing."""
+    counts = [f"{tally.done} edited", f"{tally.skipped} there already", f"{len(tally.failures)} failed"]
+    if tally.left:
+        counts.append(f"{tally.left} not begun")
+    typer.echo(f"{', '.join(counts)}, in {target}")
+    if tally.failures:
+        typer.echo(f"failed: {', '.join(sorted(tally.failures))}")

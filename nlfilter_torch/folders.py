@@ -1,0 +1,222 @@
+"""A folder of photographs edited by worker processes, on one machine or, by their ranks, on several.
+
+Needs the ``cli`` extra. A file is done when the folder for the output holds its name: names appear only with the whole
+file behind them (:func:`nlfilter_torch.files.open_beside`), so an interrupted run is taken up by starting it again.
+"""
+
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import LifoQueue
+
+import torch
+
+from nlfilter_torch.files import SUFFIXES, check_folder, open_beside
+
+RECORD = ".nlfilter-batch.json"  # in the folder for the output: the settings of what is in it
+DEATHS = 3  # deaths for each worker, without a file done in between, after which it is not the files' fault
+
+Edit = Callable[[str, str], object]  # reads the file of the first name, writes that of the second; can be pickled
+
+
+@dataclass
+class Tally:
+    """What became of some files.
+
+    Attributes:
+        done: how many were edited now.
+        skipped: how many were there already.
+        failures: name to reason of those that could not be.
+        left: how many were not begun, because workers died one after the other.
+    """
+
+    done: int = 0
+    skipped: int = 0
+    failures: dict[str, str] = field(default_factory=dict)
+    left: int = 0
+
+    def add(self, other: "Tally") -> None:
+        """Take in the files of another tally."""
+        self.done += other.done
+        self.skipped += other.skipped
+        self.failures |= other.failures
+        self.left += other.left
+
+
+def pictures(folder: Path) -> list[Path]:
+    """The image files of a folder, by name.
+
+    Raises:
+        ValueError: if it is no folder, or holds none.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder; name the one that holds the photographs")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not paths:
+        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF or WebP file; put the photographs there")
+    return paths
+
+
+def prepare(paths: Sequence[Path], target: Path, settings: Mapping[str, object]) -> None:
+    """Make the folder for the output, or see that an earlier run of the same settings began it.
+
+    Raises:
+        ValueError: if ``target`` is the folder of ``paths``, is no folder, or holds files of these names that were made
+            with other settings, or not by this function's callers.
+        OSError: if it cannot be written to.
+    """
+    if target.resolve() == paths[0].parent.resolve():
+        raise ValueError(f"{target} must be another folder than that of the photographs; name a new one")
+    check_folder(target)
+    target.mkdir(exist_ok=True)
+    # In this order: another rank may be at work already, and the record precedes its first file.
+    present = next((path.name for path in paths if (target / path.name).exists()), None)
+    record, text = target / RECORD, json.dumps(settings, indent=2, sort_keys=True) + "\n"
+    if record.exists():
+        if record.read_text(encoding="utf-8") != text:
+            raise ValueError(
+                f"{target} was begun with other settings, which {record} tells; name a new folder, or empty this one"
+            )
+    elif present is not None:
+        raise ValueError(f"{target} holds a file {present} from somewhere else; name a new folder")
+    else:
+        with open_beside(record) as stream:
+            stream.write(text.encode())
+
+
+def edit_folder(
+    paths: Sequence[Path],
+    target: Path,
+    edit: Edit,
+    *,
+    workers: int,
+    threads: int,
+    tell: Callable[[str], None],
+    begin: Callable[[str], None],
+    tally: Tally,
+) -> None:
+    """Edit those of ``paths`` that the prepared folder ``target`` does not hold yet; failures do not stop the rest.
+
+    Args:
+        paths: image files, all in one folder.
+        target: folder of the edited ones, under the same names.
+        edit: does one of them in a worker; what it raises and warns is told.
+        workers: processes.
+        threads: of each process.
+        tell: called with a sentence for every failure and warning, as they happen.
+        begin: called with the name of every file that ended.
+        tally: counts the files as they end, so that it is right when this is interrupted, too.
+    """
+    _remove_leftovers(paths, target)
+    jobs = [path for path in paths if not (target / path.name).exists()]
+    tally.skipped += len(paths) - len(jobs)
+    tally.left += len(jobs)
+    deaths = 0
+    with contextlib.closing(_outcomes(jobs, target, edit, workers=min(workers, len(jobs)), threads=threads)) as ended:
+        for path, outcome in ended:
+            begin(path.name)
+            tally.left -= 1
+            deaths = deaths + 1 if isinstance(outcome, BrokenProcessPool) else 0
+            if isinstance(outcome, list):
+                tally.done += 1
+                for note in outcome:
+                    tell(f"note: {path.name}: {note}")
+                continue
+            sentence = _sentence(outcome)
+            tally.failures[path.name] = sentence
+            tell(sentence if path.name in sentence else f"{path.name}: {sentence}")
+            if deaths >= DEATHS * workers:
+                tell(f"{deaths} workers died one after the other; no other file is begun")
+                return
+
+
+def _remove_leftovers(paths: Sequence[Path], target: Path) -> None:
+    """Take away what killed runs had begun to write under these names."""
+    names = {path.name for path in paths}
+    for part in target.glob(".*.part"):
+        if part.name[1:].rsplit(".", 2)[0] in names:
+            part.unlink(missing_ok=True)
+
+
+def _outcomes(
+    jobs: Sequence[Path], target: Path, edit: Edit, *, workers: int, threads: int
+) -> Generator[tuple[Path, list[str] | Exception]]:
+    """Each job with its warnings or its error, as they end.
+
+    Every worker is a pool of its own: where one dies, the file that it had is known and the others work on.
+    """
+
+    def hire() -> ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(threads,))
+
+    idle: LifoQueue[ProcessPoolExecutor] = LifoQueue()
+    for _ in range(workers):
+        idle.put(hire())
+
+    def run(path: Path) -> list[str]:
+        worker = idle.get()
+        try:
+            future = worker.submit(_work, edit, str(path), str(target / path.name))
+            return future.result()
+        except BrokenProcessPool:
+            worker.shutdown()
+            worker = hire()
+            raise
+        finally:
+            idle.put(worker)
+
+    lanes = ThreadPoolExecutor(max(workers, 1))
+    try:
+        futures: dict[Future[list[str]], Path] = {lanes.submit(run, path): path for path in jobs}
+        for future in as_completed(futures):
+            error = future.exception()
+            if error is not None and not isinstance(error, Exception):
+                raise error
+            yield futures[future], future.result() if error is None else error
+    finally:
+        lanes.shutdown(cancel_futures=True)  # files that are begun are ended
+        while not idle.empty():
+            idle.get().shutdown()
+
+
+def _begin(threads: int) -> None:
+    """Set a worker up."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is for the main process to stop
+    torch.set_num_threads(threads)
+    # A worker that waits for work would not notice that the main process was killed, and wait for ever.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _work(edit: Edit, source: str, target: str) -> list[str]:
+    """Edit one file in a worker; the warnings that it gave rise to."""
+    with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(io.StringIO()):
+        warnings.simplefilter("always", UserWarning)
+        edit(source, target)
+    return [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+
+
+def _sentence(error: Exception) -> str:
+    """Why a file could not be edited."""
+    if isinstance(error, BrokenProcessPool):
+        return "the process that worked on it died; give it more memory, by fewer --workers, or look at the file"
+    if isinstance(error, ValueError | OSError | MemoryError):
+        return " ".join(str(error).split())
+    return " ".join(f"{type(error).__name__}: {error}".split())
