@@ -15,6 +15,7 @@ from torch import Tensor
 ACTIVITY = (60.0, 200.0)
 WANTED = (4.0, 3.0)
 STEP, FORGETTING = 0.1, 0.5
+SLACK = 0.1  # of the constrained method: overshoot as a share of the range of the surroundings
 
 
 def gaussian(image: Tensor, sigma: float) -> Tensor:
@@ -85,3 +86,11 @@ def _dynamics(image: Tensor) -> Tensor:
     kernel = -torch.ones(1, 1, 3, 3, dtype=image.dtype)
     kernel[..., 1, 1] = 8
     return F.conv2d(F.pad(image, (1, 1, 1, 1), mode="reflect"), kernel)
+
+
+def constrained(image: Tensor, amount: float, radius: int = 2) -> Tensor:
+    """Unsharp masking whose overshoot is held to a tenth of the range of the surroundings, as the paper's [28] does."""
+    size = 2 * radius + 1
+    highest, lowest = F.max_pool2d(image, size, 1, radius), -F.max_pool2d(-image, size, 1, radius)
+    slack = SLACK * (highest - lowest)
+    return torch.minimum(torch.maximum(image + amount * unsharp(image, 1.5), lowest - slack), highest + slack)

@@ -1,0 +1,96 @@
+"""Figs. 14 to 16: strokes of colour that reach everything alike."""
+
+import torch
+from kornia.color import rgb_to_lab
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks.colorize import levin, psnr
+from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, painted_over, rounded, scene, spots, strokes
+from nlfilter_torch import colorize, recolor
+from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from nlfilter_torch.pictures import show_images
+
+BLUE, GREEN, VIOLET = (0.1, 0.3, 0.85), (0.1, 0.55, 0.3), (0.5, 0.2, 0.75)
+TOLERANCE = 20.0  # of the replacement by colour range, in units of Lab
+
+
+def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
+    """One stroke on a motorcycle's tank recolours all of its red, beside replacing a range of colours.
+
+    (c) is where the colour goes. (e) takes the stroke's hue for all colours within 20 units of Lab, fading out.
+    """
+    image, scale = scene("motorcycle", size)
+    colours, mask = strokes(image, scale, ((350, 190, 50, 10), BLUE))
+    edited = recolor(image, colours, mask)
+    replaced = colour_range(image, colours, mask)
+    panels = {
+        "(a) photograph": image,
+        "(b) a stroke": painted_over(image, colours, mask),
+        "(c) where it goes": reached(image, edited),
+        "(d) recolor": edited,
+        "(e) a range of colours replaced": replaced,
+    }
+    numbers = {"recolor": _told(image, edited), "range replaced": _told(image, replaced)}
+    return show_images(panels, columns=3, side=SIDE), numbers
+
+
+def figure_15(size: int = SIZE) -> tuple[Figure, Numbers]:
+    """Two strokes on things of one red: the spatial term sends each to its own side."""
+    image, scale = scene("motorcycle", size)
+    colours, mask = strokes(
+        image, scale, ((350, 190, 50, 10), BLUE), ((580, 280, 30, 8), BLUE), ((545, 200, 30, 30), GREEN)
+    )
+    edited = recolor(image, colours, mask, spatial_bandwidth=0.3 * min(image.shape[-2:]), num_landmarks=200)
+    panels = {
+        "(a) photograph": image,
+        "(b) two colours of strokes": painted_over(image, colours, mask),
+        "(c) where they go": reached(image, edited),
+        "(d) recolor": edited,
+    }
+    return show_images(panels, columns=2, side=SIDE), {"recolor": _told(image, edited)}
+
+
+def figure_16(size: int = SIZE) -> tuple[Figure, Numbers]:
+    """A grey photograph and a few strokes of its own colours; PSNR is against the photograph in its own colours.
+
+    (d) is the regression, the default; (e) the paper's k-means, whose pieces (c) shows; (f) Levin's optimisation.
+    """
+    image, scale = scene("coffee", size)
+    grey = luminance(image)
+    boxes = ((120, 170, 30, 30), (480, 120, 40, 30), (280, 60, 20, 20), (260, 140, 30, 16), (30, 30, 30, 30))
+    mask = spots(image, scale, *boxes)
+    methods = {
+        "(d) colorize": colorize(grey, image * mask, mask),
+        "(e) k-means, the paper's way": colorize(grey, image * mask, mask, method="kmeans"),
+        "(f) Levin's optimisation": levin(grey, image * mask, mask),
+    }
+    pieces = (methods["(e) k-means, the paper's way"] - grey).abs()
+    panels = {"(a) grey": grey, "(b) strokes": painted_over(grey, image, mask), "(c) pieces": 0.5 + pieces, **methods}
+    numbers: Numbers = {title: {"PSNR in dB": rounded(psnr(found, image), 1)} for title, found in methods.items()}
+    return show_images(panels, columns=3, side=SIDE), numbers
+
+
+def reached(before: Tensor, after: Tensor) -> Tensor:
+    """Where chroma changed, and by how much of its largest change, (1, 1, H, W)."""
+    change = (split_luminance(after)[1] - split_luminance(before)[1]).norm(dim=1, keepdim=True)
+    return (change / change.flatten().quantile(0.99).clamp(min=1e-6)).clamp(0, 1)
+
+
+def colour_range(image: Tensor, colours: Tensor, mask: Tensor) -> Tensor:
+    """What a colour replacement tool does: the stroke's chroma for all colours like those under it."""
+    lab = rgb_to_lab(image)
+    under = (lab * mask).sum((2, 3), keepdim=True) / mask.sum()
+    distance = (lab - under)[:, 1:].norm(dim=1, keepdim=True)
+    share = (1 - distance / TOLERANCE).clamp(0, 1)
+    brightness, chroma = split_luminance(image)
+    wanted = (split_luminance(colours)[1] * mask).sum((2, 3), keepdim=True) / mask.sum()
+    return merge_luminance(brightness, torch.lerp(chroma, wanted.expand_as(chroma), share))
+
+
+def _told(before: Tensor, after: Tensor) -> Numbers:
+    change = (after - before).abs().amax(1)
+    return {
+        "pixels that changed by over 2 levels, %": rounded(100 * (change > 2 / 255).float().mean(), 1),
+        "luminance, largest change in levels": rounded(255 * (luminance(after) - luminance(before)).abs().max(), 3),
+    }

@@ -1,0 +1,80 @@
+"""Figs. 12 and 13: detail where a region is alike, beside editing everything and beside unsharp masks."""
+
+from collections.abc import Callable
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks import unsharp
+from benchmarks.detail_pictures import fine_part, halo, noise_gain
+from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, painted_over, rounded, scene, spots
+from nlfilter_torch import diffusion_mask, nonlocal_operator, polynomial_filter
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.pictures import show_images
+
+ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.0])
+BANDWIDTH = 25 / 255
+STEPS = 24  # of a bisection
+STRONGEST = 40.0
+YELLOW = (1.0, 0.85, 0.1)
+
+
+def figure_12(size: int = SIZE) -> tuple[Figure, Numbers]:
+    """Detail of a cat's fur only. All have the same gain of detail on what the mask selects (its fur).
+
+    Propagated from the spots, the edit leaves the smooth background as it is, and with it the background's noise.
+    """
+    return _compare("chelsea", size, ((150, 30, 40, 20), (110, 130, 30, 30)))
+
+
+def figure_13(size: int = SIZE) -> tuple[Figure, Numbers]:
+    """Detail of a table's wood only. All have the same gain of detail on what the mask selects."""
+    return _compare("coffee", size, ((430, 40, 50, 30), (40, 250, 40, 40)))
+
+
+def _compare(name: str, size: int, boxes: tuple[Box, ...]) -> tuple[Figure, Numbers]:
+    image, scale = scene(name, size)
+    before, region = luminance(image), spots(image, scale, *boxes)
+    by_colour = nonlocal_operator(image, photometric_bandwidth=BANDWIDTH, guide_channels="all")
+    mask = diffusion_mask(by_colour.spectrum(), region)
+    selected = mask > 0.5
+    whole = polynomial_filter(nonlocal_operator(before), before, ALPHA) - before
+    gain = _gain(before, before + mask * whole, selected)
+    methods: dict[str, Callable[[float], Tensor]] = {
+        "(b) adaptive unsharp mask": _adding(before, unsharp.adaptive(before)),
+        "(c) constrained unsharp mask": lambda amount: unsharp.constrained(before, amount),
+        "(d) edited everywhere": _adding(before, whole),
+        "(e) propagated from the spots": _adding(before, mask * whole),
+    }
+    colour = torch.tensor(YELLOW).view(1, 3, 1, 1).expand_as(image)
+    panels = {"(a) photograph and spots": painted_over(image, colour, region)}
+    numbers: Numbers = {"selected, %": rounded(100 * selected.float().mean(), 1)}
+    for title, method in methods.items():
+        result = _reach(method, before, gain, selected)
+        panels[title] = edit_luminance(image, lambda _, crisp=result: crisp)
+        numbers[title] = {
+            "detail gain where selected": rounded(_gain(before, result, selected), 2),
+            "elsewhere": rounded(_gain(before, result, ~selected), 2),
+            "noise gain in the flattest tenth": rounded(noise_gain(before, result), 2),
+            "halo, grey levels": rounded(halo(before, result), 1),
+        }
+    panels["(f) the mask"] = mask
+    return show_images(panels, columns=3, side=SIDE), numbers
+
+
+def _gain(before: Tensor, after: Tensor, where: Tensor) -> float:
+    return float(fine_part(after)[where].square().mean().sqrt() / fine_part(before)[where].square().mean().sqrt())
+
+
+def _adding(image: Tensor, detail: Tensor) -> Callable[[float], Tensor]:
+    return lambda amount: image + amount * detail
+
+
+def _reach(method: Callable[[float], Tensor], before: Tensor, gain: float, where: Tensor) -> Tensor:
+    """The result that has the gain, or the strongest one where the method never gets there."""
+    low, high = 0.0, STRONGEST
+    for _ in range(STEPS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _gain(before, method(middle), where) < gain else (low, middle)
+    return method(high)
