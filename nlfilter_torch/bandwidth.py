@@ -7,6 +7,7 @@ from torch import Tensor
 from nlfilter_torch.checks import check_choice, check_image
 from nlfilter_torch.features import GuideChannels, reduce_channels
 from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.sharding import Shard, reduce_sum
 
 # The paper's 0.6 belongs to its own patch weights, whose squares sum to 0.056; under weights of unit sum the same
 # kernel has a bandwidth larger by 1 / sqrt(0.056) = 4.2, hence 2.5.
@@ -36,11 +37,17 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     """
     check_image(guide, "guide")
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    return bandwidth_of_rows(reduce_channels(guide.to(working_dtype(guide)), guide_channels), (0, 0), None)
+
+
+def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None) -> Tensor:
+    """:func:`estimate_bandwidth` from some rows of an image, and as many of their neighbours as ``halo`` tells."""
     with torch.no_grad():
-        guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
         # Central differences by slices take a twentieth of the time of a convolution, kornia's import not counted.
         padded = F.pad(guide, (1, 1, 1, 1), mode="replicate")
         down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
         right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-        magnitude = torch.hypot(down, right).mean((1, 2, 3)) / 2
-        return (FACTOR * magnitude).clamp(min=SMALLEST)
+        magnitude = torch.hypot(down, right)[:, :, halo[0] : guide.shape[2] - halo[1]] / 2
+        count = magnitude[0].numel() if shard is None else guide.shape[1] * shard.pixels
+        mean = reduce_sum(magnitude.sum((1, 2, 3), dtype=torch.float64), shard) / count
+        return (FACTOR * mean).clamp(min=SMALLEST).to(guide)

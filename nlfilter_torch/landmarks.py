@@ -5,6 +5,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.sharding import Shard, from_first, gather_columns
+
 Sampling = Literal["kmeans", "uniform", "random"]
 
 EXPLAINED = 1e-4  # a residual of the unit diagonal below which a point counts as explained
@@ -15,7 +17,12 @@ ITERATIONS = 10
 
 
 def choose_landmarks(
-    features: Tensor, size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator | None
+    features: Tensor,
+    size: tuple[int, int],
+    count: int,
+    sampling: Sampling,
+    generator: torch.Generator | None,
+    shard: Shard | None = None,
 ) -> Tensor:
     """Choose or compute ``count`` landmarks.
 
@@ -26,16 +33,17 @@ def choose_landmarks(
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
         generator: source of randomness; None seeds a new one with 0, so that equal calls give equal landmarks.
+        shard: of the image; N is then the pixels here, and the first rank's choices hold.
 
     Returns:
         (B, D, M), differentiable in the features (k-means with the assignment held). All images of a batch draw the
         same pixels, so that a batch gives what single calls give.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    if count == features.shape[-1]:
+    if count == features.shape[-1] and shard is None:
         return features
-    candidates = features[:, :, candidate_pixels(size, count, sampling, generator).to(features.device)]
-    return condense(candidates, count, generator)
+    pixels = from_first(candidate_pixels(size, count, sampling, generator).to(features.device), shard)
+    return condense(gather_columns(features, pixels, shard), count, generator, shard)
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
@@ -50,14 +58,14 @@ def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, gene
     return stratified(pixels, min(pixels, PER_LANDMARK * count), generator)
 
 
-def condense(subset: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shard | None = None) -> Tensor:
     """Landmarks (B, D, M) from the features (B, D, S) of the candidates: centroids where there are more than M."""
     if subset.shape[2] == count:
         return subset
     points = subset.detach()
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
-    start = _pivots(points, count, generator).unsqueeze(1)  # (B, 1, M)
-    assignment = _lloyd(points, points.gather(2, start.expand(-1, points.shape[1], -1)))
+    start = from_first(_pivots(points, count, generator), shard).unsqueeze(1)  # (B, 1, M)
+    assignment = from_first(_lloyd(points, points.gather(2, start.expand(-1, points.shape[1], -1))), shard)
     return cluster_means(subset, assignment, subset.gather(2, start.expand(-1, subset.shape[1], -1)))
 
 
