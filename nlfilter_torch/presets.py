@@ -61,7 +61,7 @@ class Preset:
         """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
 
         >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
-        15.0
+        12.0
         """
         return {
             "photometric_bandwidth": self.bandwidth if isinstance(self.bandwidth, str) else self.bandwidth / 255,
@@ -123,9 +123,9 @@ PRESETS: dict[str, Preset] = {
     "texture": Preset((3.0, 1.5, 1.0, 1.0)),
     "dramatic": Preset((2.0, 3.0, 4.5, 0.95), 30.0),
     "glow": Preset((0.3, 1.0, 2.5, 1.06), 30.0),
-    "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 12.0),
+    "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 8.0),
     "calm": Preset((0.8, 0.6, 0.4, 1.0), 40.0),
-    "smooth": Preset((0.0, 0.0, 0.0, 1.0), 15.0),
+    "smooth": Preset((0.0, 0.0, 0.0, 1.0), 12.0),
 }
 
 #: What each of :data:`PRESETS` does, in a few words.
@@ -137,7 +137,7 @@ PURPOSES: dict[str, str] = {
     "glow": "fine detail soft, light and shade deep",
     "soft skin": "pores and grain away, eyes and outlines kept",
     "calm": "less contrast within things, as in haze",
-    "smooth": "all texture away, edges kept; the start of a drawing",
+    "smooth": "texture away, edges kept; the start of a drawing",
 }
 
 
@@ -163,11 +163,13 @@ def find_preset(name: str) -> Preset:
     return Preset.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value of JSON is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_count(value: Any) -> bool:
+def is_count(value: Any) -> bool:
+    """Whether a value of JSON is a positive whole number."""
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
@@ -175,11 +177,11 @@ def _is_count(value: Any) -> bool:
 ENTRIES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "alpha": (
         "a list of at least two numbers",
-        lambda v: isinstance(v, list) and len(v) > 1 and all(map(_is_number, v)),
+        lambda v: isinstance(v, list) and len(v) > 1 and all(map(is_number, v)),
     ),
-    "bandwidth": ('a positive number of grey levels or "auto"', lambda v: v == "auto" or (_is_number(v) and v > 0)),
-    "spatial_bandwidth": ("a positive number of pixels or null", lambda v: v is None or (_is_number(v) and v > 0)),
-    "patch_size": ("an odd positive number", lambda v: _is_count(v) and v % 2 == 1),
-    "landmarks": ("a positive number", _is_count),
+    "bandwidth": ('a positive number of grey levels or "auto"', lambda v: v == "auto" or (is_number(v) and v > 0)),
+    "spatial_bandwidth": ("a positive number of pixels or null", lambda v: v is None or (is_number(v) and v > 0)),
+    "patch_size": ("an odd positive number", lambda v: is_count(v) and v % 2 == 1),
+    "landmarks": ("a positive number", is_count),
     "sampling": ('"kmeans", "uniform" or "random"', lambda v: v in ("kmeans", "uniform", "random")),
 }

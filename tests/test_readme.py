@@ -43,7 +43,9 @@ def test_commands_run(folder: Path) -> None:
     assert len(ours) == 6
     for arguments in ours:
         assert main(arguments) == 0
-    assert {"crisp.jpg", "calm.png", "soft.jpg", "looks", "look.json", "again.jpg"} <= {path.name for path in folder.iterdir()}
+    assert {"crisp.jpg", "calm.png", "soft.jpg", "looks", "look.json", "again.jpg"} <= {
+        path.name for path in folder.iterdir()
+    }
 
 
 def test_set_up_commands_exist() -> None:
