@@ -43,11 +43,21 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
 def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None) -> Tensor:
     """:func:`estimate_bandwidth` from some rows of an image, and as many of their neighbours as ``halo`` tells."""
     with torch.no_grad():
-        # Central differences by slices take a twentieth of the time of a convolution, kornia's import not counted.
-        padded = F.pad(guide, (1, 1, 1, 1), mode="replicate")
-        down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-        right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-        magnitude = torch.hypot(down, right)[:, :, halo[0] : guide.shape[2] - halo[1]] / 2
+        magnitude = gradients(guide, halo)
         count = magnitude[0].numel() if shard is None else guide.shape[1] * shard.pixels
         mean = reduce_sum(magnitude.sum((1, 2, 3), dtype=torch.float64), shard) / count
-        return (FACTOR * mean).clamp(min=SMALLEST).to(guide)
+        return bandwidth_of_gradient(mean).to(guide)
+
+
+def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
+    """Magnitude of the gradient (B, C, h, W) at the rows of a guide that lie between those of its halo."""
+    # Central differences by slices take a twentieth of the time of a convolution, kornia's import not counted.
+    padded = F.pad(guide, (1, 1, 1, 1), mode="replicate")
+    down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
+    return torch.hypot(down, right)[:, :, halo[0] : guide.shape[2] - halo[1]] / 2
+
+
+def bandwidth_of_gradient(mean: Tensor) -> Tensor:
+    """The bandwidth for a mean magnitude of the gradient."""
+    return (FACTOR * mean).clamp(min=SMALLEST)

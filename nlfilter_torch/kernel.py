@@ -46,7 +46,12 @@ class Kernel:
             halo: rows at the top and at the bottom of a tile that only patches reach into; they get no columns. Half a
                 patch, or as many as there are before the border of the whole guide.
         """
-        features = extract_features(
+        features = self.features(guide, origin=origin, halo=halo)
+        return nystrom_factor(features, self.landmarks, self.whitening, self.completion)
+
+    def features(self, guide: Tensor, *, origin: tuple[int, int], halo: tuple[int, int]) -> Tensor:
+        """Features (B, D, N) of the same pixels."""
+        return extract_features(
             reduce_channels(guide.to(self.landmarks.dtype), self.guide_channels),
             patch_weights=self.patch_weights,
             photometric_bandwidth=self.photometric_bandwidth,
@@ -54,4 +59,3 @@ class Kernel:
             origin=origin,
             halo=halo,
         )
-        return nystrom_factor(features, self.landmarks, self.whitening, self.completion)

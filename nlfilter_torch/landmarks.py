@@ -14,6 +14,7 @@ EXPLAINED = 1e-4  # a residual of the unit diagonal below which a point counts a
 # as many features lower the mean diagonal, what the landmarks miss, by at most 2 %.
 PER_LANDMARK = 64
 ITERATIONS = 10
+MANY = 1 << 24  # a permutation of more pixels would take more memory than the image
 
 
 def choose_landmarks(
@@ -53,6 +54,9 @@ def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, gene
         return torch.arange(pixels)
     if sampling == "uniform":
         return _grid(size, count)
+    if sampling == "random" and pixels > MANY:
+        draws = torch.randint(pixels, (2 * count,), generator=generator, device=generator.device)
+        return torch.tensor(list(dict.fromkeys(draws.tolist()))[:count])  # distinct, in their random order
     if sampling == "random":
         return torch.randperm(pixels, generator=generator, device=generator.device)[:count]
     return stratified(pixels, min(pixels, PER_LANDMARK * count), generator)

@@ -54,7 +54,7 @@ def nystrom_factor(
     return factor, diagonal
 
 
-class _Affinity:
+class Affinity:
     """Affinities of blocks of features to the landmarks, written into one buffer after the other.
 
     A fresh tensor for every block would cost more in page faults than the exponential does.
@@ -86,7 +86,7 @@ class _NystromFactor(torch.autograd.Function):
         factor = large_empty((batch, landmarks.shape[2], pixels), features)
         diagonal = features.new_zeros(batch, pixels)
         scale = features.new_ones(batch, pixels)
-        affinity = _Affinity(landmarks, complete)
+        affinity = Affinity(landmarks, complete)
         for block, (first, second) in buffered_blocks(factor, 2):
             kernel, _ = affinity(features[:, :, block], first)
             columns = torch.bmm(whitening, kernel, out=second)  # into a buffer: rows of the factor are far apart
@@ -107,7 +107,7 @@ class _NystromFactor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
-        affinity = _Affinity(landmarks, ctx.complete)
+        affinity = Affinity(landmarks, ctx.complete)
         grad_features = large_empty(features.shape, features)
         grad_landmarks = torch.zeros_like(landmarks, dtype=torch.float64)
         grad_whitening = torch.zeros_like(whitening, dtype=torch.float64)
