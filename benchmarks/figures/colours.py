@@ -21,7 +21,7 @@ def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
     (c) is where the colour goes. (e) takes the stroke's hue for all colours within 20 units of Lab, fading out.
     """
     image, scale = scene("motorcycle", size)
-    colours, mask = strokes(image, scale, ((350, 190, 50, 10), BLUE))
+    colours, mask = strokes(image, scale, ((350, 205, 40, 20), BLUE))
     edited = recolor(image, colours, mask)
     replaced = colour_range(image, colours, mask)
     panels = {
@@ -39,7 +39,7 @@ def figure_15(size: int = SIZE) -> tuple[Figure, Numbers]:
     """Two strokes on things of one red: the spatial term sends each to its own side."""
     image, scale = scene("motorcycle", size)
     colours, mask = strokes(
-        image, scale, ((350, 190, 50, 10), BLUE), ((580, 280, 30, 8), BLUE), ((545, 200, 30, 30), GREEN)
+        image, scale, ((350, 205, 40, 20), BLUE), ((565, 272, 30, 14), BLUE), ((565, 190, 40, 40), GREEN)
     )
     edited = recolor(image, colours, mask, spatial_bandwidth=0.3 * min(image.shape[-2:]), num_landmarks=200)
     panels = {

@@ -9,10 +9,13 @@ from nlfilter_torch.checks import check_image, check_same_size
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.strokes import check_painted, propagate_strokes
+from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.strokes import check_painted, check_share
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.25, 0.7  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
+DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: strokes of two colours on one thing are no error
+MAX_SPOTS = 64  # further ones of a colour are taken together
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
 
 
@@ -30,8 +33,9 @@ def recolor(
 ) -> Tensor:
     """Give the colour of strokes to everything that looks like the spots they are painted on.
 
-    Paper: Sec. V-A, with the regression of :func:`propagate_strokes` in place of k-means: it is soft, and any number of
-    spots with any number of colours divide the image among them. Hue and saturation count before lightness, in CIE Lab.
+    Paper: Sec. V-A, with a regression on correlations in place of k-means: it is soft, and any number of spots with any
+    number of colours divide the image among them. A spot, which is paint of one colour without a gap, stands for what
+    most of it covers. Hue and saturation count before lightness, in CIE Lab.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
@@ -40,7 +44,8 @@ def recolor(
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
         keep: (B, 1, H, W) in [0, 1], above 0 on spots whose likes are to stay as they are; None is none. Strokes paint
             over it.
-        reach: in [0, 1), of :func:`propagate_strokes`; larger takes in what is less alike.
+        reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
+            alike.
         photometric_bandwidth: in hundredths of Lab: 0.15 is 15 units.
         patch_size: of the patches that are compared.
         **options: further ones of :func:`nonlocal_operator`, such as ``spatial_bandwidth``, ``num_landmarks`` or
@@ -69,6 +74,7 @@ def recolor(
         check_image(tensor, name, channels=channels, batch=batch)
         check_same_size(tensor, size, name, "image")
     check_painted(stroke_mask)
+    check_share(reach, "reach", below=True)
 
     pixels = image.to(working_dtype(image))
     spectrum = nonlocal_operator(
@@ -82,12 +88,16 @@ def recolor(
     painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
     wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
     regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
-    known = painted if keep is None else torch.maximum(painted, keep.to(pixels))
-    labels = regions / painted.clamp(min=1e-6)  # 1 on the strokes of a colour, 0 on those of others and on what is kept
-    likeness = propagate_strokes(spectrum, labels, known, strength=0.0, reach=reach)
+    marked = regions * counts[..., None, None]
+    if keep is not None:
+        held = keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
+        marked = torch.cat([marked, held], dim=1)
+    likeness = spot_likeness(spectrum, marked, reach)[:, : counts.shape[1]]
     shares = ((likeness - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
-    shares = shares * shares * (3 - 2 * shares) * counts[..., None, None]  # no edge where the colour sets in
+    shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
     shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
+    if keep is not None:
+        shares = shares * (1 - held)
 
     # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative saturation.
     old = (regions.flatten(2) @ chroma.flatten(2).mT) / regions.sum((2, 3)).unsqueeze(2)  # (B, K, 3)
@@ -97,6 +107,46 @@ def recolor(
     chroma = chroma * (1 - shares.sum(1, keepdim=True)) + painted_chroma
     untouched = (shares.sum(1, keepdim=True) == 0).expand_as(pixels)
     return torch.where(untouched, pixels, merge_luminance(luminance, chroma)).to(image.dtype)
+
+
+def spot_likeness(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Tensor:
+    """How much every pixel resembles one region rather than the others, (B, K, H, W), about 0 to 1.
+
+    Correlations under ``W + s W^2 + s^2 W^3 + ...``, s the reach, with the mean of each spot of the regions (B, K, H, W):
+    the few odd pixels that a brush touches do not count. The spots share a pixel by the best linear estimate of their
+    region's number, so that a region painted on what resembles another one takes from it what is its own.
+    """
+    factor = spectrum.factor  # (B, M, N)
+    walk = torch.as_tensor(reach).to(spectrum.root).reshape(-1, 1)
+    core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues)).to(factor)
+    image = core @ factor
+    unit = (factor * image).sum(1, keepdim=True).clamp(min=1e-6).rsqrt()  # (B, 1, N)
+    found = []
+    for b, region in enumerate(regions):
+        members, owners = _spots(region)  # (J, N), (J, K)
+        means = members @ (factor[b] * unit[b]).mT  # (J, M)
+        gram = means @ core[b] @ means.mT  # (J, J)
+        scale = gram.diagonal().clamp(min=1e-6).rsqrt()
+        correlation = scale[:, None] * (means @ image[b]) * unit[b]  # (J, N)
+        between = scale[:, None] * gram * scale + DOUBT * torch.eye(len(gram)).to(gram)
+        found.append(torch.linalg.solve(between, owners).mT @ correlation)
+    return torch.stack(found).unflatten(2, spectrum.size)
+
+
+def _spots(region: Tensor) -> tuple[Tensor, Tensor]:
+    """Connected spots of regions (K, H, W): weights (J, N) of unit sum, and the region (J, K) that each belongs to."""
+    from skimage.measure import label
+
+    members, owners = [], []
+    for number, plane in enumerate(region):
+        spots = torch.from_numpy(label((plane.detach() > 0).cpu().numpy(), connectivity=2)).to(plane.device)
+        for spot in range(1, min(int(spots.max()), MAX_SPOTS) + 1):
+            inside = plane * (spots >= spot if spot == MAX_SPOTS else spots == spot)
+            members.append(inside.flatten() / inside.sum())
+            owners.append(number)
+    return torch.stack(members), torch.nn.functional.one_hot(
+        torch.tensor(owners, device=region.device), len(region)
+    ).to(region)
 
 
 def colour_guide(image: Tensor) -> Tensor:
