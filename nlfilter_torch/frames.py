@@ -18,9 +18,9 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import weigh_layers
 from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sinkhorn import scaling_from_moment
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,31 +1,25 @@
 """Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
-With ``u = log d`` the equation is ``u + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies
-in [1, 2]: Chebyshev's semi-iteration for that interval gains a factor 5.8 a step, where the textbook alternation barely
-converges. The same interval makes the implicit gradient cheap: ten steps of the same recurrence solve ``(I + W) x =
-b``.
+The scaling of a completed kernel comes from :mod:`~nlfilter_torch.newton`, that of any other from
+:mod:`~nlfilter_torch.chebyshev`. Its gradient is implicit, whichever way it was found.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+from nlfilter_torch import chebyshev, newton
+from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-MAX_STEPS = 40
-ACCELERATOR_STEPS = 12  # on an accelerator a look at the residual would stop the queue: a fixed number of steps instead
 ALARM = 1e-3  # a residual that balancing ends above is worth a warning
-SOLVE_STEPS = {torch.float32: 10, torch.float64: 21}  # 2 * 5.8^-steps is below the rounding of the dtype
-TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
-SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
-LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
+# Conjugate gradients gain a factor 5.8 a step or more: so many steps, or a residual below the rounding of the dtype.
+SOLVE_STEPS = {torch.float32: 10, torch.float64: 24}
+SOLVED = {torch.float32: 1e-7, torch.float64: 1e-16}
 
 
 @dataclass(frozen=True)
@@ -43,7 +37,7 @@ class Balancing:
     steps: int
 
 
-def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None) -> Balancing:
+def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None, completed: bool = False) -> Balancing:
     """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
 
     Args:
@@ -51,8 +45,10 @@ def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None)
         diagonal: (B, N), non-negative.
         tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. The iteration also stops
             where rounding keeps the residual from falling, and warns if that is above 1e-3.
+        completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
     """
-    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance or TOLERANCE[factor.dtype])  # type: ignore[no-untyped-call]
+    tolerance = tolerance or TOLERANCE[factor.dtype]
+    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed)  # type: ignore[no-untyped-call]
     if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
         warn(
             f"balancing left row sums off by up to {residual.max().item():.1e}; "
@@ -61,89 +57,70 @@ def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None)
     return Balancing(scaling, residual, int(steps))
 
 
-def _chebyshev(low: float, high: float) -> Iterator[tuple[float, float]]:
-    """Weights (momentum, gradient) of Chebyshev's semi-iteration for a spectrum in [low, high]."""
-    centre, radius = (high + low) / 2, (high - low) / 2
-    sigma = centre / radius
-    rho = 1 / sigma
-    yield 0.0, 1 / centre
-    while True:
-        previous, rho = rho, 1 / (2 * sigma - rho)
-        yield rho * previous, 2 * rho / radius
-
-
-def _start(factor: Tensor, diagonal: Tensor) -> Tensor:
-    """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
-    total = moment(factor, torch.ones_like(diagonal).unsqueeze(1)).to(factor)
-    return ((total.mT @ factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
-
-
-def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
-    """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
-
-    A pixel's equation is ``d (u . total + diagonal d) = 1``, so d is the positive root of a quadratic.
-    """
-    affinity = (total.mT @ factor).squeeze(1).clamp(min=SMALLEST_AFFINITY)
-    return 2 / (affinity + torch.sqrt(affinity.square() + 4 * diagonal))
-
-
-def _solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, int]:
-    """Scaling (B, N), its measured residual (B,), and the number of sweeps."""
-    scaling = _start(factor, diagonal)
-    total = moment(factor, scaling.unsqueeze(1))
-    move = torch.zeros_like(scaling)
-    watched = factor.device.type == "cpu"
-    worst, slow = float("inf"), 0
-    for steps, (momentum, gain) in enumerate(_chebyshev(1.0, 2.0), start=1):
-        current, following = total.to(factor).mT, torch.empty_like(scaling)
-        next_total, residual = torch.zeros_like(total), scaling.new_zeros(scaling.shape[0])
-        # One read of the factor: a block gives its row sums, takes its update and adds to the next moment while cached.
-        for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-            rows, d = factor[:, :, block], scaling[:, block]
-            sums = d * ((current @ rows).squeeze(1) + diagonal[:, block] * d)  # row sums of W
-            residual = torch.maximum(residual, (sums - 1).abs().amax(1))
-            # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
-            step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
-            torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
-            next_total += rows @ following[:, block].unsqueeze(2)
-        previous, worst = worst, residual.max().item() if watched else worst
-        slow = slow + 1 if worst > previous / 2 else 0
-        stalled = worst < ALARM and slow > 1  # at the level of rounding; a single slow step is no sign of it
-        if worst <= tolerance or stalled or steps == (MAX_STEPS if watched else ACCELERATOR_STEPS):
-            break
-        scaling, total = following, next_total
-    return scaling, residual, steps
-
-
 class _Balance(torch.autograd.Function):
     """Implicit differentiation of ``log d + log(K d) = 0``.
 
     ``(I + W) d(log d) = -diag(d) dK d``, so with ``(I + W) x = d * g`` and ``a = d * x`` the loss changes by ``-a^T dK
-    d``: its gradient is ``-(z a^T + w d^T)`` in the factor, z = factor d, w = factor a, and ``-a d`` in the diagonal.
+    d``: its gradient is ``-(z a^T + s d^T)`` in the factor, z = factor d, s = factor a, and ``-a d`` in the diagonal.
+
+    With r = d^2 c the equation reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, which solves a system of
+    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.newton`; the estimate of its inverse that
+    balancing leaves behind preconditions conjugate gradients.
     """
 
     @staticmethod
-    def forward(ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, int]:
-        scaling, residual, steps = _solve(factor, diagonal, tolerance)
-        ctx.save_for_backward(factor, diagonal, scaling)
+    def forward(
+        ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool
+    ) -> tuple[Tensor, Tensor, int]:
+        if completed:
+            scaling, total, residual, steps, inverse = newton.solve(factor, diagonal, tolerance)
+        else:
+            scaling, total, residual, steps = chebyshev.solve(factor, diagonal, tolerance)
+            inverse = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device)
+        ctx.save_for_backward(factor, diagonal, scaling, total, inverse)
         ctx.mark_non_differentiable(residual)
         return scaling, residual, steps
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        factor, diagonal, scaling = ctx.saved_tensors
-        target = scaling * grad
-        solution, move = torch.zeros_like(target), torch.zeros_like(target)
-        total = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)  # factor @ (d x)
-        for momentum, gain in islice(_chebyshev(1.0, 2.0), SOLVE_STEPS[factor.dtype]):
-            current, total = total.to(factor).mT, torch.zeros_like(total)
-            for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-                rows, d, x = factor[:, :, block], scaling[:, block], solution[:, block]
-                image = x + d * ((current @ rows).squeeze(1) + diagonal[:, block] * d * x)  # (I + W) x
-                x += move[:, block].mul_(momentum).add_(target[:, block] - image, alpha=gain)
-                total += rows @ (d * x).unsqueeze(2)
-        a = scaling * solution
-        totals = torch.cat([moment(factor, scaling.unsqueeze(1)), total], dim=2).to(factor)  # (B, M, 2)
-        grad_factor = outer_product(totals, torch.stack([-a, -scaling], dim=1))
-        return grad_factor, -a * scaling, None
+        factor, diagonal, scaling, total, inverse = ctx.saved_tensors
+        share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
+        weight = scaling.square() * share
+        right = _weighted_moment(factor, scaling.square() * share * grad)
+        solution = _conjugate_gradients(factor, weight, right, inverse)
+        affinity = (solution.to(factor).mT @ factor).squeeze(1)
+        a = scaling * scaling * share * (grad - affinity)
+        totals = torch.cat([total, solution], dim=2).to(factor)  # (B, M, 2)
+        return outer_product(totals, torch.stack([-a, -scaling], dim=1)), -a * scaling, None, None
+
+
+def _weighted_moment(factor: Tensor, weighted: Tensor, total: Tensor | None = None) -> Tensor:
+    """``factor @ weighted`` (B, M, 1) in float64; given a ``total``, ``factor @ (weighted * (factor^T total))``."""
+    found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
+    row = None if total is None else total.to(factor).mT
+    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+        columns, part = factor[:, :, block], weighted[:, block]
+        if row is not None:
+            part = part * (row @ columns).squeeze(1)
+        found += columns @ part.unsqueeze(2)
+    return found
+
+
+def _conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor) -> Tensor:
+    """The s (B, M, 1) in float64 with ``(I + factor diag(weight) factor^T) s = right``."""
+    tiny = torch.finfo(torch.float64).tiny  # where the right side is zero, so is the solution
+    solution, residual = torch.zeros_like(right), right
+    preconditioned = inverse @ residual
+    direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
+    goal = SOLVED[factor.dtype] ** 2 * size
+    for _ in range(SOLVE_STEPS[factor.dtype]):
+        image = direction + _weighted_moment(factor, weight, direction)
+        step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
+        solution, residual = solution + step * direction, residual - step * image
+        preconditioned = inverse @ residual
+        before, size = size, (residual * preconditioned).sum(1, keepdim=True)
+        if factor.device.type == "cpu" and bool((size <= goal).all()):
+            break
+        direction = preconditioned + size / before.clamp(min=tiny) * direction
+    return solution

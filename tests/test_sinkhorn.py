@@ -29,17 +29,19 @@ def row_sums(factor: torch.Tensor, diagonal: torch.Tensor, d: torch.Tensor) -> t
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 5e-5), (torch.float64, 1e-10)])
 @pytest.mark.parametrize("pixels", [1, 2, 300, 20000, 70000])
-def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float) -> None:
+@pytest.mark.parametrize("completed", [False, True])
+def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float, completed: bool) -> None:
     factor, diagonal = problem(2, 6, pixels, dtype=dtype)
-    result = balance(factor, diagonal)
+    result = balance(factor, diagonal, completed=completed)
     assert (result.scaling > 0).all()
     assert (row_sums(factor, diagonal, result.scaling) - 1).abs().max() <= tolerance
 
 
-def test_scaling_is_the_reference_scaling() -> None:
+@pytest.mark.parametrize("completed", [False, True])
+def test_scaling_is_the_reference_scaling(completed: bool) -> None:
     factor, diagonal = problem(1, 5, 80)
     kernel = (factor.mT @ factor + torch.diag_embed(diagonal))[0].numpy()
-    d = balance(factor, diagonal).scaling[0].numpy()
+    d = balance(factor, diagonal, completed=completed).scaling[0].numpy()
     np.testing.assert_allclose(d[:, None] * kernel * d, reference.balanced(kernel), atol=1e-11)
 
 
@@ -51,13 +53,14 @@ def test_a_kernel_times_c_is_scaled_by_its_root(scale: float) -> None:
     torch.testing.assert_close(scaled, d / scale**0.5, rtol=1e-9, atol=0)
 
 
-def test_the_residual_is_that_of_the_scaling() -> None:
-    factor, diagonal = problem(3, 6, 500)
-    result = balance(factor, diagonal, tolerance=1e-3)
+@pytest.mark.parametrize(("completed", "pixels"), [(False, 500), (True, 500), (True, 20000)])
+def test_the_residual_is_that_of_the_scaling(completed: bool, pixels: int) -> None:
+    factor, diagonal = problem(3, 6, pixels)
+    result = balance(factor, diagonal, tolerance=1e-3, completed=completed)
     measured = (row_sums(factor, diagonal, result.scaling) - 1).abs().amax(1)
     torch.testing.assert_close(result.residual, measured, atol=1e-12, rtol=0)
     assert result.residual.max() <= 1e-3
-    assert 1 <= result.steps < balance(factor, diagonal).steps
+    assert 1 <= result.steps < balance(factor, diagonal, completed=completed).steps
 
 
 def test_one_slow_step_is_not_the_end() -> None:
@@ -67,16 +70,38 @@ def test_one_slow_step_is_not_the_end() -> None:
     assert operator.residual.item() <= 1e-12
 
 
-def test_identity_is_balanced_already() -> None:
-    result = balance(torch.zeros(1, 3, 50), torch.ones(1, 50))
+@pytest.mark.parametrize("completed", [False, True])
+def test_identity_is_balanced_already(completed: bool) -> None:
+    result = balance(torch.zeros(1, 3, 50), torch.ones(1, 50), completed=completed)
     torch.testing.assert_close(result.scaling, torch.ones(1, 50))
 
 
-def test_a_batch_is_its_images() -> None:
-    factor, diagonal = problem(3, 6, 500)
-    together = balance(factor, diagonal).scaling
-    alone = torch.cat([balance(factor[i : i + 1], diagonal[i : i + 1]).scaling for i in range(3)])
-    torch.testing.assert_close(together, alone, rtol=1e-10, atol=0)
+@pytest.mark.parametrize(("completed", "pixels"), [(False, 500), (True, 500), (True, 20000)])
+def test_a_batch_is_its_images(completed: bool, pixels: int) -> None:
+    factor, diagonal = problem(3, 6, pixels)
+    together = balance(factor, diagonal, completed=completed).scaling
+    alone = [balance(factor[i : i + 1], diagonal[i : i + 1], completed=completed).scaling for i in range(3)]
+    torch.testing.assert_close(together, torch.cat(alone), rtol=1e-10, atol=0)
+
+
+def test_the_estimated_jacobian_leaves_the_gradient_exact() -> None:
+    """With a sample of the pixels and with all of them the solution, and so its gradient, is the same."""
+    problems = [[t.requires_grad_() for t in problem(2, 4, 4000)] for _ in range(2)]
+    gradients = []
+    for (factor, diagonal), completed in zip(problems, (False, True), strict=True):
+        weights = torch.randn(2, 4000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        loss = (balance(factor, diagonal, completed=completed).scaling * weights).sum()
+        gradients.append(torch.autograd.grad(loss, (factor, diagonal)))
+    for found, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["retina", "astronaut", "rocket"])
+def test_few_sweeps_balance_a_photograph(name: str) -> None:
+    image = torch.from_numpy(reduced(name, 256).copy()).float()[None, None]
+    operator = nonlocal_operator(image, num_landmarks=50, tolerance=1e-4)
+    assert operator.balancing_steps <= 6
+    assert operator.residual.item() <= 1e-4
 
 
 def test_row_sums_that_stay_off_are_told() -> None:
@@ -87,10 +112,13 @@ def test_row_sums_that_stay_off_are_told() -> None:
     assert (result.scaling > 0).all()
 
 
-def test_implicit_gradient_is_the_unrolled_one() -> None:
+@pytest.mark.parametrize("completed", [False, True])
+def test_implicit_gradient_is_the_unrolled_one(completed: bool) -> None:
     factor, diagonal = (t.requires_grad_() for t in problem(2, 4, 40))
     weights = torch.randn(2, 40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    implicit = torch.autograd.grad((balance(factor, diagonal).scaling * weights).sum(), (factor, diagonal))
+    implicit = torch.autograd.grad(
+        (balance(factor, diagonal, completed=completed).scaling * weights).sum(), (factor, diagonal)
+    )
 
     d = torch.ones(2, 40, dtype=torch.float64)
     for _ in range(60):

@@ -1,0 +1,65 @@
+"""Balancing by Chebyshev's semi-iteration on ``log d``, for kernels of which nothing else is known.
+
+With ``v = log d`` the equation is ``v + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies
+in [1, 2]: the semi-iteration for that interval gains a factor 5.8 a sweep, where the textbook alternation barely
+converges. The plain method of the paper, whose affinities may be negative and whose scalings are large, needs it.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+
+MAX_SWEEPS = 40
+ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
+STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it have met rounding
+TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
+SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
+LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
+
+
+def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
+    """Weights (momentum, gradient) of the semi-iteration for a spectrum in [low, high]."""
+    centre, radius = (high + low) / 2, (high - low) / 2
+    sigma = centre / radius
+    rho = 1 / sigma
+    yield 0.0, 1 / centre
+    while True:
+        previous, rho = rho, 1 / (2 * sigma - rho)
+        yield rho * previous, 2 * rho / radius
+
+
+def _start(factor: Tensor, diagonal: Tensor) -> Tensor:
+    """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
+    total = moment(factor, torch.ones_like(diagonal).unsqueeze(1)).to(factor)
+    return ((total.mT @ factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
+
+
+def solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Scaling (B, N), its moment (B, M, 1), its measured residual (B,), and the number of sweeps."""
+    scaling = _start(factor, diagonal)
+    total = moment(factor, scaling.unsqueeze(1))
+    move = torch.zeros_like(scaling)
+    watched = factor.device.type == "cpu"
+    worst, slow = float("inf"), 0
+    for sweeps, (momentum, gain) in enumerate(_weights(1.0, 2.0), start=1):
+        current, following = total.to(factor).mT, torch.empty_like(scaling)
+        next_total, residual = torch.zeros_like(total), scaling.new_zeros(scaling.shape[0])
+        # One read of the factor: a block gives its row sums, takes its update and adds to the next moment while cached.
+        for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+            rows, d = factor[:, :, block], scaling[:, block]
+            sums = d * ((current @ rows).squeeze(1) + diagonal[:, block] * d)  # row sums of W
+            residual = torch.maximum(residual, (sums - 1).abs().amax(1))
+            # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
+            step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
+            torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
+            next_total += rows @ following[:, block].unsqueeze(2)
+        previous, worst = worst, residual.max().item() if watched else worst
+        slow = slow + 1 if worst > previous / 2 else 0
+        stalled = worst < STALL and slow > 1  # at the level of rounding; a single slow step is no sign of it
+        if worst <= tolerance or stalled or sweeps == (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS):
+            break
+        scaling, total = following, next_total
+    return scaling, total, residual, sweeps

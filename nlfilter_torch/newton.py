@@ -1,0 +1,156 @@
+"""Balancing by Newton's method on the moment ``t = factor @ d``, with the Jacobian of a sample of the pixels.
+
+Given t, a pixel's equation ``d (u . t + c d) = 1`` is a quadratic with one positive root d(t), so M numbers are all
+that is unknown: ``t = sum_i u_i d_i(t)``. The Jacobian of ``t - sum_i u_i d_i(t)`` is symmetric,
+
+    J = I + sum_i w_i u_i u_i^T,    w = d^2 / (1 + c d^2),
+
+with its spectrum in [1, 2] at the solution. It costs as much as 14 sweeps over the factor, its sum over a sample next
+to nothing. Pixels enter the sample in proportion to ``w |u|^2``, their leverage, so that the rare ones, which a uniform
+sample misses and which converge last, are in it: on photographs of a megapixel each sweep then gains a factor of 10 to
+100, where Chebyshev's iteration gains 5.8.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.blocks import SWEPT, pixel_blocks
+
+PER_LANDMARK = 160  # pixels of the sample; its Jacobian is then within sqrt(1 / 160) = 8 % of the true one
+EXPLORED = 8192  # pixels that the first guess of the row sums comes from
+GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly and on no period of the image
+LARGEST = 2.0  # K has a unit diagonal and its entries are not negative but for errors, so that no d exceeds 1
+SMALLEST_AFFINITY = 1e-12
+MAX_SWEEPS = 12
+ACCELERATOR_SWEEPS = 5  # on an accelerator a look at the residual would stop the queue
+ROUGH = 0.1  # a sweep that gains less than a factor of ten asks for another sample
+STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it have met rounding
+
+
+def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
+    """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
+
+    A pixel's equation is ``d (u . total + diagonal d) = 1``, so d is the positive root of a quadratic.
+    """
+    affinity = (total.mT @ factor).squeeze(1).clamp_(min=SMALLEST_AFFINITY)
+    return 2 / (affinity + torch.sqrt(affinity.square() + 4 * diagonal))
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Pixels that stand for the image.
+
+    Attributes:
+        factor: their columns, (B, M, n).
+        diagonal: (B, n).
+        weight: how many pixels each stands for, (B, n).
+    """
+
+    factor: Tensor
+    diagonal: Tensor
+    weight: Tensor
+
+    def scaling(self, total: Tensor) -> Tensor:
+        """Their d (B, n), given t (B, M, 1) in float64."""
+        return scaling_from_moment(self.factor, self.diagonal, total.to(self.factor)).clamp_(max=LARGEST)
+
+    def moment(self, scaling: Tensor) -> Tensor:
+        """The sample's estimate of ``factor @ d``, (B, M, 1) in float64."""
+        return (self.factor @ (self.weight * scaling).unsqueeze(2)).double()
+
+    def jacobian(self, scaling: Tensor) -> Tensor:
+        """J, (B, M, M) in float64."""
+        slope = scaling.square()
+        slope = self.weight * slope / (1 + self.diagonal * slope)
+        gram = (self.factor * slope.unsqueeze(1)) @ self.factor.mT
+        return gram.double() + torch.eye(gram.shape[1], dtype=torch.float64, device=gram.device)
+
+    def residual(self, total: Tensor, found: Tensor) -> Tensor:
+        """Largest deviation of a row sum from 1 among the sample, (B,), where d(total) has the moment ``found``."""
+        return row_residual(self.factor, self.scaling(total), total - found)
+
+
+def row_residual(factor: Tensor, scaling: Tensor, error: Tensor) -> Tensor:
+    """Largest ``|d u . error|``, (B,): what row sums lack where d is the root for a total that is off by ``error``."""
+    return (scaling * (error.to(factor).mT @ factor).squeeze(1)).abs().amax(1)
+
+
+def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int) -> tuple[Sample, Tensor]:
+    """A systematic sample in proportion to leverage, and its part of ``scaling``, (B, n)."""
+    if 2 * count >= factor.shape[2]:
+        return Sample(factor, diagonal, torch.ones_like(diagonal)), scaling
+    slope = scaling.square()
+    leverage = slope * (1 - diagonal) / (1 + slope * diagonal) + 1e-12  # |u|^2 is 1 - c
+    summed = leverage.double().cumsum(1)
+    ticks = (torch.arange(count, dtype=torch.float64, device=factor.device) + 0.5) / count
+    chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
+    weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
+    return Sample(_columns(factor, chosen), diagonal.gather(1, chosen), weight), scaling.gather(1, chosen)
+
+
+def _columns(factor: Tensor, chosen: Tensor) -> Tensor:
+    """Columns ``chosen`` (B, n) of the factor, (B, M, n)."""
+    return torch.stack([columns.index_select(1, picked) for columns, picked in zip(factor, chosen, strict=True)])
+
+
+def _guess(factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
+    """``(K 1)^(-1/2)`` with the sum over a few thousand pixels for that over all, and its exact moment."""
+    pixels = factor.shape[2]
+    few = factor
+    if pixels > 2 * EXPLORED:
+        steps = torch.arange(EXPLORED, dtype=torch.float64, device=factor.device) * GOLDEN
+        few = factor.index_select(2, (steps.frac() * pixels).long().sort().values)
+    total = few.sum(2, keepdim=True) * (pixels / few.shape[2])
+    scaling, found = torch.empty_like(diagonal), total.new_zeros(total.shape, dtype=torch.float64)
+    for block in pixel_blocks(pixels, factor.shape[0], factor.device, length=SWEPT):
+        columns = factor[:, :, block]
+        sums = (total.mT @ columns).squeeze(1) + diagonal[:, block]
+        scaling[:, block] = sums.clamp_(min=1.0).rsqrt_()  # no row of K sums to less than its unit diagonal
+        found += columns @ scaling[:, block].unsqueeze(2)
+    return scaling, found
+
+
+def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
+    scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
+    row = total.to(factor)
+    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+        columns = factor[:, :, block]
+        torch.clamp(scaling_from_moment(columns, diagonal[:, block], row), max=LARGEST, out=scaling[:, block])
+        found += columns @ scaling[:, block].unsqueeze(2)
+    return scaling, found
+
+
+def solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, int, Tensor]:
+    """Scaling (B, N), its moment (B, M, 1) and residual (B,), the sweeps, and an estimate of J^-1, (B, M, M)."""
+    watched = factor.device.type == "cpu"
+    count = PER_LANDMARK * factor.shape[1]
+    scaling, found = _guess(factor, diagonal)
+    total = found
+    worst, slow, gain = 1.0, 0, 1.0
+    for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
+        if gain > ROUGH if watched else sweeps < 3:
+            sample, part = _draw(factor, diagonal, scaling, count)
+            # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
+            error = found - sample.moment(part)
+            for _ in range(2):
+                part = sample.scaling(total)
+                inverse = torch.linalg.inv(sample.jacobian(part))
+                total = total - inverse @ (total - sample.moment(part) - error)
+        else:
+            total = total - inverse @ (total - found)
+        scaling, found = _sweep(factor, diagonal, total)
+        if not watched:
+            continue
+        previous, worst = worst, sample.residual(total, found).max().item()
+        gain = worst / previous
+        slow = slow + 1 if gain > 0.5 else 0
+        if worst <= tolerance or (worst < STALL and slow > 1):
+            residual = row_residual(factor, scaling, total - found)
+            if slow > 1 or bool((residual <= tolerance).all()):
+                break
+    else:
+        residual = row_residual(factor, scaling, total - found)
+    return scaling, found, residual, sweeps, inverse
