@@ -7,6 +7,7 @@ from nlfilter_torch.checks import check_alpha, check_count, check_image, check_s
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.products import fold_batch, unfold_batch
+from nlfilter_torch.sharding import reduce_sum, replicate
 from nlfilter_torch.spectrum import Response, Spectrum
 
 
@@ -106,9 +107,10 @@ def polynomial_filter(
     """
     check_alpha(alpha)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
+    alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None:
-        weights = torch.as_tensor(residual).to(filtered).reshape(-1, 1, 1, 1)
+        weights = torch.as_tensor(replicate(residual, operator.shard)).to(filtered).reshape(-1, 1, 1, 1)
         finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
         finest = finest.to(filtered) if alpha.ndim == 4 else finest.to(filtered).reshape(-1, 1, 1, 1)
         explained = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
@@ -144,7 +146,7 @@ def spectral_filter(spectrum: Spectrum, image: Tensor, response: Response, *, re
     """
     check_image(image, "image")
     check_same_size(image, spectrum.size, "image", "spectrum")
-    rho = torch.as_tensor(residual).to(spectrum.root).reshape(-1, 1)
+    rho = torch.as_tensor(replicate(residual, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
     image_in = image.to(spectrum.factor)
     planes = fold_batch(image_in, spectrum.factor.shape[0])
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still one pass down and one up.
@@ -171,6 +173,6 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     """
     check_image(image, "image")
     explained = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
-    energy = image.to(spectrum.factor).square().sum((1, 2, 3))
-    inner = (explained * image.to(spectrum.factor)).sum((1, 2, 3))  # y^T V V^T y = |V^T y|^2
+    energy = reduce_sum(image.to(spectrum.factor).square().sum((1, 2, 3)), spectrum.shard)
+    inner = reduce_sum((explained * image.to(spectrum.factor)).sum((1, 2, 3)), spectrum.shard)  # y^T V V^T y
     return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))

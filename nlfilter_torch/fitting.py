@@ -17,6 +17,7 @@ from nlfilter_torch.filtering import detail_layers
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
+from nlfilter_torch.sharding import check_whole
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
@@ -80,6 +81,7 @@ def fit_alpha(
         >>> [round(a, 2) for a in fit_alpha(operator, image, edited, order=2)[0].tolist()]
         [3.0, 1.0, 1.2]
     """
+    check_whole(operator.shard, "fit_alpha")
     check_count(order, "order")
     check_image(image, "image")
     check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))

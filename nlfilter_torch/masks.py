@@ -8,6 +8,7 @@ from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.landmarks import assign, cluster_means
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
+from nlfilter_torch.sharding import Shard, check_whole, reduce_sum, replicate
 from nlfilter_torch.spectrum import Spectrum
 
 ITERATIONS = 20  # of k-means, which starts close to its end
@@ -32,7 +33,7 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     """
     check_positive(time, "time")
     gain = spectrum.eigenvalues[:, 1:].pow(torch.as_tensor(time).to(spectrum.factor).reshape(-1, 1))
-    return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * spectrum.scaling.shape[1] ** 0.5
+    return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * spectrum.pixels**0.5
 
 
 @full_precision
@@ -76,11 +77,11 @@ def diffusion_mask(
     check_positive(time, "time")
     check_positive(width, "width")
     weights = region_weights(spectrum, region)  # (B, K, N)
-    exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
+    exponent = torch.as_tensor(replicate(time, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
     # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
     basis = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
-    scale = basis.shape[2] / torch.as_tensor(width).to(basis).reshape(-1, 1, 1)
-    exponents = scale * _squared_distances(basis, weights)  # (B, K, N)
+    scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(basis).reshape(-1, 1, 1)
+    exponents = scale * _squared_distances(basis, weights, spectrum.shard)  # (B, K, N)
     # Far pixels would underflow to 0, where a product of masks loses what it stands for.
     mask = torch.exp(-exponents.clamp(max=60.0))
     if negative is not None:
@@ -90,14 +91,14 @@ def diffusion_mask(
                 f"negative must have 1 channel or the region's {weights.shape[1]}, got {others.shape[1]}; "
                 "give one for all regions or one for each"
             )
-        margin = scale * _squared_distances(basis, others) - exponents
+        margin = scale * _squared_distances(basis, others, spectrum.shard) - exponents
         mask = mask * torch.sigmoid(margin.clamp(min=-20.0))
     return mask.unflatten(2, spectrum.size).to(region.dtype)
 
 
-def _squared_distances(coordinates: Tensor, weights: Tensor) -> Tensor:
+def _squared_distances(coordinates: Tensor, weights: Tensor, shard: Shard | None) -> Tensor:
     """Squared distances (B, K, N) of all pixels to the weighted means of regions (B, K, N), coordinates (B, M, N)."""
-    centres = weights @ coordinates.mT  # (B, K, M)
+    centres = reduce_sum(weights @ coordinates.mT, shard)  # (B, K, M)
     return torch.stack([(coordinates - c.unsqueeze(2)).square().sum(1) for c in centres.unbind(1)], dim=1)
 
 
@@ -108,7 +109,7 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     flat = region.to(spectrum.factor).flatten(2)
     if bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
-    total = flat.sum(2, keepdim=True)
+    total = reduce_sum(flat.sum(2, keepdim=True), spectrum.shard)
     if bool((total <= 0).any()):
         raise ValueError(
             f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
@@ -136,6 +137,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
             positive.
     """
     check_positive(time, "time")
+    check_whole(spectrum.shard, "segment_mask")
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions")  # (B, K, N)

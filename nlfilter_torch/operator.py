@@ -1,12 +1,12 @@
 """Guide to operator: the filter W as an object. Paper: Sec. II."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.bandwidth import estimate_bandwidth
+from nlfilter_torch.bandwidth import bandwidth_of_rows
 from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import (
     check_bandwidth,
@@ -24,6 +24,7 @@ from nlfilter_torch.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.nystrom import Completion, nystrom_factor, whitener
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
+from nlfilter_torch.sharding import Shard, check_whole, meet, replicate, with_halo
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import Spectrum, compute_spectrum
 
@@ -76,6 +77,7 @@ class NonlocalOperator:
         kernel: the recipe of factor and diagonal, for the pixels of other guides.
         residual: largest deviation of a row sum from 1 when balancing stopped, (B,).
         balancing_steps: sweeps over the factor that balancing took.
+        shard: of the image, where other ranks have the rest of it; everything above is then what is here.
     """
 
     factor: Tensor
@@ -85,6 +87,7 @@ class NonlocalOperator:
     kernel: Kernel
     residual: Tensor
     balancing_steps: int
+    shard: Shard | None = None
 
     def matmul(self, image: Tensor) -> Tensor:
         """``W y``, also written ``operator @ image``. Paper: eq. (2).
@@ -110,7 +113,7 @@ class NonlocalOperator:
         check_image(image, "image")
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
-        planes = apply_powers(self.factor, self.scaling, self.diagonal, folded, order)
+        planes = apply_powers(self.factor, self.scaling, self.diagonal, folded, order, self.shard)
         return unfold_batch(planes, image.shape[0], self.size)
 
     def row_sums(self) -> Tensor:
@@ -123,8 +126,9 @@ class NonlocalOperator:
         """The whole matrix W, (B, N, N), symmetric. For small images.
 
         Raises:
-            ValueError: if the image has more than 16384 pixels.
+            ValueError: if the image has more than 16384 pixels, or not all of them are here.
         """
+        check_whole(self.shard, "to_dense")
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
@@ -147,12 +151,17 @@ class NonlocalOperator:
         if rank is not None:
             check_count(rank, "rank")
         diagonal = self.diagonal if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(self.factor, self.scaling, diagonal, self.size, rank)
+        return compute_spectrum(self.factor, self.scaling, diagonal, self.size, rank, self.shard)
 
     @full_precision
     @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
-        """Measure how good the operator is. Costs several times as much as the spectrum."""
+        """Measure how good the operator is. Costs several times as much as the spectrum.
+
+        Raises:
+            ValueError: if other ranks have a part of the image.
+        """
+        check_whole(self.shard, "diagnostics")
         spectrum = self.spectrum()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]
@@ -193,6 +202,7 @@ def nonlocal_operator(
     patch_weights: Tensor | None = None,
     tolerance: float | None = None,
     generator: torch.Generator | None = None,
+    group: Any = None,
 ) -> NonlocalOperator:
     """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
 
@@ -216,12 +226,16 @@ def nonlocal_operator(
         tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
         generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
             never used.
+        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
+            this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
+            process would, for their own rows; see :mod:`nlfilter_torch.sharding`. None is the whole image here.
 
     Returns:
         The operator, with row sums of 1 to ``tolerance`` or to rounding.
 
     Raises:
         TypeError, ValueError: naming the argument, what it must be, and what it was.
+        ConnectionError: if another rank of the group is gone; it says which.
 
     Example:
         >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
@@ -238,17 +252,21 @@ def nonlocal_operator(
     check_count(num_landmarks, "num_landmarks")
     if tolerance is not None:
         check_positive(tolerance, "tolerance")
-    height, width = guide.shape[-2:]
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-    weights = unit_window(patch_size, patch_weights).to(guide)
+    shard = meet(guide, group)
+    size = (guide.shape[2], guide.shape[3])  # here
+    height, width = size if shard is None else (shard.height, shard.width)
+    weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
+    guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
     if isinstance(photometric_bandwidth, str):
         check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
-        bandwidth: float | Tensor = estimate_bandwidth(guide)
+        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
     else:
-        bandwidth = photometric_bandwidth
-        check_bandwidth(bandwidth, "photometric_bandwidth", guide.shape[0])
+        check_bandwidth(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
+        bandwidth = replicate(photometric_bandwidth, shard)
     if spatial_bandwidth is not None:
         check_bandwidth(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+        spatial_bandwidth = replicate(spatial_bandwidth, shard)
     if num_landmarks > height * width:
         warn(
             f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; "
@@ -257,18 +275,24 @@ def nonlocal_operator(
         num_landmarks = height * width
 
     features = extract_features(
-        guide, patch_weights=weights, photometric_bandwidth=bandwidth, spatial_bandwidth=spatial_bandwidth
+        guide,
+        patch_weights=weights,
+        photometric_bandwidth=bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        origin=(0 if shard is None else shard.first - halo[0], 0),
+        halo=halo,
     )
-    points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator)
+    points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator, shard)
     kernel = Kernel(weights, bandwidth, spatial_bandwidth, guide_channels, points, whitener(points), completion)
     factor, diagonal = nystrom_factor(features, points, kernel.whitening, completion)
-    balancing = balance(factor, diagonal, tolerance=tolerance, completed=completion == "diagonal")
+    balancing = balance(factor, diagonal, tolerance=tolerance)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,
         scaling=balancing.scaling,
-        size=(height, width),
+        size=size,
         kernel=kernel,
         residual=balancing.residual,
         balancing_steps=balancing.steps,
+        shard=shard,
     )

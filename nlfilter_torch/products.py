@@ -7,9 +7,12 @@ from torch import Tensor
 
 from nlfilter_torch.blocks import moment
 from nlfilter_torch.differentiation import once_differentiable, outer_product
+from nlfilter_torch.sharding import Shard
 
 
-def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tensor, order: int) -> Tensor:
+def apply_powers(
+    factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tensor, order: int, shard: Shard | None = None
+) -> Tensor:
     """``W y, W^2 y, ..., W^k y``.
 
     Args:
@@ -18,6 +21,7 @@ def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tenso
         diagonal: (B, N) of the kernel, before scaling.
         image: y, (B, C, N).
         order: k, at least 1.
+        shard: of the image, where other ranks have the rest of it.
 
     Returns:
         (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
@@ -25,18 +29,18 @@ def apply_powers(factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tenso
     """
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
-        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order)  # type: ignore[no-untyped-call]
+        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, shard)  # type: ignore[no-untyped-call]
         return result
-    return torch.stack(_powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order)[0][1:], dim=1)
+    return torch.stack(_powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard)[0][1:], dim=1)
 
 
 def _powers(
-    factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int
+    factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int, shard: Shard | None
 ) -> tuple[list[Tensor], list[Tensor]]:
     """The k + 1 images from y to W^k y, and the k moments (B, M, C) that they passed through."""
     images, moments = [image], []
     for _ in range(order):
-        moments.append(moment(factor, scaling * images[-1]).to(factor))
+        moments.append(moment(factor, scaling * images[-1], shard).to(factor))
         images.append(scaling * (moments[-1].mT @ factor) + remainder * images[-1])
     return images, moments
 
@@ -74,8 +78,11 @@ class _Powers(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int) -> Tensor:
-        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order)
+    def forward(
+        ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int, shard: Shard | None
+    ) -> Tensor:
+        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard)
+        ctx.shard = shard
         ctx.save_for_backward(factor, scaling, remainder, *images, *moments)
         return torch.stack(images[1:], dim=1)
 
@@ -92,7 +99,7 @@ class _Powers(torch.autograd.Function):
         for i in range(order, 0, -1):
             adjoint = adjoint + grad[:, i - 1]
             before = images[i - 1]
-            total = moment(factor, d * adjoint).to(factor)
+            total = moment(factor, d * adjoint, ctx.shard).to(factor)
             affinity = total.mT @ factor  # the image of the adjoint, before scaling
             # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
             grad_scaling += (adjoint * (moments[i - 1].mT @ factor) + before * affinity).sum(1)
@@ -101,4 +108,4 @@ class _Powers(torch.autograd.Function):
             right += [d * adjoint, d * before]
             adjoint = d * affinity + r * adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
-        return grad_factor, grad_scaling, grad_remainder, adjoint, None
+        return grad_factor, grad_scaling, grad_remainder, adjoint, None, None

@@ -10,8 +10,7 @@ sums) collects on each of them the part that its own rows contribute; the backwa
 parts up, and so does that of :func:`replicate`, through which parameters come in.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
@@ -61,25 +60,6 @@ class Shard:
     def peer(self, rank: int) -> int:
         """What the whole world calls rank ``rank`` of the group."""
         return dist.get_global_rank(self.group, rank)
-
-
-@contextmanager
-def agreement(group: Any) -> Iterator[None]:
-    """Let the arguments be refused by all ranks when one of them refuses its own; else it would be waited for."""
-    if group is None:
-        yield
-        return
-    problem: Exception | None = None
-    try:
-        yield
-    except (TypeError, ValueError) as error:
-        problem = error
-    refusals = _gather(torch.tensor([problem is not None], dtype=torch.int64, device=_device(group)), group)
-    if problem is not None:
-        raise problem
-    refused = [str(rank) for rank, refusal in enumerate(refusals) if refusal.item()]
-    if refused:
-        raise ValueError(f"all ranks must have valid arguments, got others on rank {', '.join(refused)}; see there")
 
 
 def meet(guide: Tensor, group: Any) -> Shard | None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from nlfilter_torch.blocks import buffered_blocks, moment
 from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
+from nlfilter_torch.sharding import Shard, reduce_sum
 
 # Directions of G below this are rounding: float32 eigenvectors from above it are orthonormal to 1e-3.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -43,6 +44,7 @@ class Spectrum:
         scaling: d, (B, N).
         size: (H, W).
         largest: the first eigenvalue before it was clamped to 1, (B,).
+        shard: of the image, where other ranks have the rest of it.
     """
 
     eigenvalues: Tensor
@@ -53,6 +55,12 @@ class Spectrum:
     scaling: Tensor
     size: tuple[int, int]
     largest: Tensor
+    shard: Shard | None = None
+
+    @property
+    def pixels(self) -> int:
+        """N, of the whole image."""
+        return self.scaling.shape[1] if self.shard is None else self.shard.pixels
 
     @cached_property
     def eigenvectors(self) -> Tensor:
@@ -91,13 +99,13 @@ class Spectrum:
     def apply(self, response: Response, image: Tensor) -> Tensor:
         """``V f(S) V^T y`` for images (B, C, N): one read of the factor for the coefficients, one for the result."""
         scaling = self.scaling.unsqueeze(1)
-        total = moment(self.factor, scaling * image)  # (B, M, C), float64
+        total = moment(self.factor, scaling * image, self.shard)  # (B, M, C), float64
         return scaling * ((self.gain(response) @ total).mT.to(self.factor) @ self.factor)
 
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
         with torch.no_grad():
-            ones = moment(self.factor, self.scaling.unsqueeze(1))  # F 1, (B, M, 1)
+            ones = moment(self.factor, self.scaling.unsqueeze(1), self.shard)  # F 1, (B, M, 1)
             cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
             cluster[:, :1] = True
             target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
@@ -109,12 +117,17 @@ class Spectrum:
 
 
 def compute_spectrum(
-    factor: Tensor, scaling: Tensor, diagonal: Tensor | None, size: tuple[int, int], rank: int | None
+    factor: Tensor,
+    scaling: Tensor,
+    diagonal: Tensor | None,
+    size: tuple[int, int],
+    rank: int | None,
+    shard: Shard | None = None,
 ) -> Spectrum:
     """Spectrum of ``W``; ``diagonal`` is None where W has no diagonal part."""
     remainder = None if diagonal is None else scaling.square() * diagonal
     # F F^T and F diag(r) F^T, (B, J, M, M)
-    grams: Tensor = _Grams.apply(factor, scaling, remainder)  # type: ignore[no-untyped-call]
+    grams = reduce_sum(_Grams.apply(factor, scaling, remainder), shard)  # type: ignore[no-untyped-call]
     root, inner, ranks = whiten_gram(grams, factor.dtype)
     ritz = SymmetricMatrix.of(inner)
     top = ritz.eigenvalues[:, 0]
@@ -125,7 +138,7 @@ def compute_spectrum(
     support = torch.arange(factor.shape[1], device=factor.device) < ranks.clamp(max=shown).unsqueeze(1)
     # First-order perturbation: the derivative of an eigenvalue is v^T dT v, repeated or not.
     eigenvalues = (ritz.vectors * (ritz.matrix @ ritz.vectors)).sum(1).clamp(0.0, 1.0) * support
-    return Spectrum(eigenvalues[:, :shown].to(factor), ritz, root, support, factor, scaling, size, top)
+    return Spectrum(eigenvalues[:, :shown].to(factor), ritz, root, support, factor, scaling, size, top, shard)
 
 
 def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

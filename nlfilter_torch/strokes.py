@@ -14,6 +14,7 @@ from torch import Tensor
 from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import check_image, check_positive, check_same_size, check_unit_range
 from nlfilter_torch.precision import full_precision
+from nlfilter_torch.sharding import check_whole
 from nlfilter_torch.spectrum import Spectrum
 
 SPOT = 25 / 38400  # share of the image that a dab of a brush covers: 5x5 pixels of 160x240
@@ -59,6 +60,7 @@ def propagate_strokes(
         >>> propagate_strokes(spectrum, strokes, painted)[0, 0, 2, ::5].round(decimals=1).abs()
         tensor([0., 0., 1., 1.])
     """
+    check_whole(spectrum.shard, "propagate_strokes")
     batch = spectrum.factor.shape[0]
     images = max(batch, strokes.shape[0], stroke_mask.shape[0])
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
