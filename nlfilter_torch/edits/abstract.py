@@ -16,9 +16,10 @@ from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 
 LOCALITY = 0.1  # default spatial bandwidth as a share of the short side
-# What the eigenvectors do not explain counts as if its eigenvalue were this: gone at the paper's power of 0.1, and back
-# as the power goes to 0.
-UNEXPLAINED = 1e-20
+# What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel has
+# likes, there where it is like no other, such as a pixel on a border, and back everywhere as the power goes to 0.
+TIMES_UNEXPLAINED = 10
+LEAST = 1e-4  # of r
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones where the image is flat, and where it has an edge
@@ -81,7 +82,7 @@ def abstract(
 
     pixels = image.to(working_dtype(image))
     count = pixels.shape[-2] * pixels.shape[-1]
-    spectrum = nonlocal_operator(
+    operator = nonlocal_operator(
         pixels,
         photometric_bandwidth=photometric_bandwidth,  # type: ignore[arg-type]  # checked there
         spatial_bandwidth=LOCALITY * min(pixels.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth,
@@ -89,9 +90,13 @@ def abstract(
         num_landmarks=min(num_landmarks, count),
         guide_channels="all",
         **options,
-    ).spectrum()
+    )
+    spectrum = operator.spectrum()
     exponent = torch.as_tensor(power).to(spectrum.root).reshape(-1, 1)
-    flat = spectral_filter(spectrum, pixels, lambda eigenvalues: eigenvalues**exponent, residual=UNEXPLAINED**exponent)
+    explained = spectral_filter(spectrum, pixels, torch.ones_like)
+    alone = (operator.scaling.square() * operator.diagonal).clamp(LEAST, 1.0).unflatten(1, spectrum.size).unsqueeze(1)
+    kept = alone ** (TIMES_UNEXPLAINED * exponent.to(alone)[..., None, None])  # (B, 1, H, W)
+    flat = spectral_filter(spectrum, pixels, lambda eigenvalues: eigenvalues**exponent) + kept * (pixels - explained)
     if edges == 0 and tones is None:
         return flat.to(image.dtype)
     luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))

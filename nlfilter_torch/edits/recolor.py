@@ -13,7 +13,7 @@ from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.strokes import check_painted, check_share
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
-FAINT, FULL = 0.25, 0.7  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
+FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
 DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: strokes of two colours on one thing are no error
 MAX_SPOTS = 64  # further ones of a colour are taken together
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
@@ -27,7 +27,7 @@ def recolor(
     *,
     keep: Tensor | None = None,
     reach: float | Tensor = 0.8,
-    photometric_bandwidth: float | Tensor = 0.15,
+    photometric_bandwidth: float | Tensor = 0.12,
     patch_size: int = 3,
     **options: Any,
 ) -> Tensor:
@@ -46,7 +46,7 @@ def recolor(
             over it.
         reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
             alike.
-        photometric_bandwidth: in hundredths of Lab: 0.15 is 15 units.
+        photometric_bandwidth: in hundredths of Lab: 0.12 is 12 units.
         patch_size: of the patches that are compared.
         **options: further ones of :func:`nonlocal_operator`, such as ``spatial_bandwidth``, ``num_landmarks`` or
             ``generator``.
