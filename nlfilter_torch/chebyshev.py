@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
@@ -31,16 +32,18 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
         yield rho * previous, 2 * rho / radius
 
 
-def _start(factor: Tensor, diagonal: Tensor) -> Tensor:
+def _start(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
-    total = moment(factor, torch.ones_like(diagonal).unsqueeze(1)).to(factor)
+    total = moment(factor, torch.ones_like(diagonal).unsqueeze(1), shard).to(factor)
     return ((total.mT @ factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
 
 
-def solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, int]:
+def solve(
+    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None
+) -> tuple[Tensor, Tensor, Tensor, int]:
     """Scaling (B, N), its moment (B, M, 1), its measured residual (B,), and the number of sweeps."""
-    scaling = _start(factor, diagonal)
-    total = moment(factor, scaling.unsqueeze(1))
+    scaling = _start(factor, diagonal, shard)
+    total = moment(factor, scaling.unsqueeze(1), shard)
     move = torch.zeros_like(scaling)
     watched = factor.device.type == "cpu"
     worst, slow = float("inf"), 0
@@ -56,6 +59,7 @@ def solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, T
             step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
             torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
             next_total += rows @ following[:, block].unsqueeze(2)
+        residual, next_total = reduce_max(residual, shard), reduce_sum(next_total, shard)
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0
         stalled = worst < STALL and slow > 1  # at the level of rounding; a single slow step is no sign of it

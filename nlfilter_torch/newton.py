@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
+from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 
 PER_LANDMARK = 160  # pixels of the sample; its Jacobian is then within sqrt(1 / 160) = 8 % of the true one
 EXPLORED = 8192  # pixels that the first guess of the row sums comes from
@@ -46,11 +47,13 @@ class Sample:
         factor: their columns, (B, M, n).
         diagonal: (B, n).
         weight: how many pixels each stands for, (B, n).
+        shard: of the image, where other ranks have samples of the rest of it.
     """
 
     factor: Tensor
     diagonal: Tensor
     weight: Tensor
+    shard: Shard | None
 
     def scaling(self, total: Tensor) -> Tensor:
         """Their d (B, n), given t (B, M, 1) in float64."""
@@ -58,36 +61,36 @@ class Sample:
 
     def moment(self, scaling: Tensor) -> Tensor:
         """The sample's estimate of ``factor @ d``, (B, M, 1) in float64."""
-        return (self.factor @ (self.weight * scaling).unsqueeze(2)).double()
+        return reduce_sum((self.factor @ (self.weight * scaling).unsqueeze(2)).double(), self.shard)
 
     def jacobian(self, scaling: Tensor) -> Tensor:
         """J, (B, M, M) in float64."""
         slope = scaling.square()
         slope = self.weight * slope / (1 + self.diagonal * slope)
-        gram = (self.factor * slope.unsqueeze(1)) @ self.factor.mT
+        gram = reduce_sum((self.factor * slope.unsqueeze(1)) @ self.factor.mT, self.shard)
         return gram.double() + torch.eye(gram.shape[1], dtype=torch.float64, device=gram.device)
 
     def residual(self, total: Tensor, found: Tensor) -> Tensor:
         """Largest deviation of a row sum from 1 among the sample, (B,), where d(total) has the moment ``found``."""
-        return row_residual(self.factor, self.scaling(total), total - found)
+        return row_residual(self.factor, self.scaling(total), total - found, self.shard)
 
 
-def row_residual(factor: Tensor, scaling: Tensor, error: Tensor) -> Tensor:
+def row_residual(factor: Tensor, scaling: Tensor, error: Tensor, shard: Shard | None = None) -> Tensor:
     """Largest ``|d u . error|``, (B,): what row sums lack where d is the root for a total that is off by ``error``."""
-    return (scaling * (error.to(factor).mT @ factor).squeeze(1)).abs().amax(1)
+    return reduce_max((scaling * (error.to(factor).mT @ factor).squeeze(1)).abs().amax(1), shard)
 
 
-def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int) -> tuple[Sample, Tensor]:
+def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None) -> tuple[Sample, Tensor]:
     """A systematic sample in proportion to leverage, and its part of ``scaling``, (B, n)."""
     if 2 * count >= factor.shape[2]:
-        return Sample(factor, diagonal, torch.ones_like(diagonal)), scaling
+        return Sample(factor, diagonal, torch.ones_like(diagonal), shard), scaling
     slope = scaling.square()
     leverage = slope * (1 - diagonal) / (1 + slope * diagonal) + 1e-12  # |u|^2 is 1 - c
     summed = leverage.double().cumsum(1)
     ticks = (torch.arange(count, dtype=torch.float64, device=factor.device) + 0.5) / count
     chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
-    return Sample(_columns(factor, chosen), diagonal.gather(1, chosen), weight), scaling.gather(1, chosen)
+    return Sample(_columns(factor, chosen), diagonal.gather(1, chosen), weight, shard), scaling.gather(1, chosen)
 
 
 def _columns(factor: Tensor, chosen: Tensor) -> Tensor:
@@ -95,24 +98,24 @@ def _columns(factor: Tensor, chosen: Tensor) -> Tensor:
     return torch.stack([columns.index_select(1, picked) for columns, picked in zip(factor, chosen, strict=True)])
 
 
-def _guess(factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
+def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
     """``(K 1)^(-1/2)`` with the sum over a few thousand pixels for that over all, and its exact moment."""
     pixels = factor.shape[2]
     few = factor
     if pixels > 2 * EXPLORED:
         steps = torch.arange(EXPLORED, dtype=torch.float64, device=factor.device) * GOLDEN
         few = factor.index_select(2, (steps.frac() * pixels).long().sort().values)
-    total = few.sum(2, keepdim=True) * (pixels / few.shape[2])
+    total = reduce_sum(few.sum(2, keepdim=True) * (pixels / few.shape[2]), shard)
     scaling, found = torch.empty_like(diagonal), total.new_zeros(total.shape, dtype=torch.float64)
     for block in pixel_blocks(pixels, factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
         sums = (total.mT @ columns).squeeze(1) + diagonal[:, block]
         scaling[:, block] = sums.clamp_(min=1.0).rsqrt_()  # no row of K sums to less than its unit diagonal
         found += columns @ scaling[:, block].unsqueeze(2)
-    return scaling, found
+    return scaling, reduce_sum(found, shard)
 
 
-def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
     """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
     scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
     row = total.to(factor)
@@ -120,19 +123,21 @@ def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Ten
         columns = factor[:, :, block]
         torch.clamp(scaling_from_moment(columns, diagonal[:, block], row), max=LARGEST, out=scaling[:, block])
         found += columns @ scaling[:, block].unsqueeze(2)
-    return scaling, found
+    return scaling, reduce_sum(found, shard)
 
 
-def solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, int, Tensor]:
+def solve(
+    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None
+) -> tuple[Tensor, Tensor, Tensor, int, Tensor]:
     """Scaling (B, N), its moment (B, M, 1) and residual (B,), the sweeps, and an estimate of J^-1, (B, M, M)."""
     watched = factor.device.type == "cpu"
-    count = PER_LANDMARK * factor.shape[1]
-    scaling, found = _guess(factor, diagonal)
+    count = -(-PER_LANDMARK * factor.shape[1] // (1 if shard is None else len(shard.rows)))  # of the sample, here
+    scaling, found = _guess(factor, diagonal, shard)
     total = found
     worst, slow, gain = 1.0, 0, 1.0
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         if gain > ROUGH if watched else sweeps < 3:
-            sample, part = _draw(factor, diagonal, scaling, count)
+            sample, part = _draw(factor, diagonal, scaling, count, shard)
             # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
             error = found - sample.moment(part)
             for _ in range(2):
@@ -141,16 +146,16 @@ def solve(factor: Tensor, diagonal: Tensor, tolerance: float) -> tuple[Tensor, T
                 total = total - inverse @ (total - sample.moment(part) - error)
         else:
             total = total - inverse @ (total - found)
-        scaling, found = _sweep(factor, diagonal, total)
+        scaling, found = _sweep(factor, diagonal, total, shard)
         if not watched:
             continue
         previous, worst = worst, sample.residual(total, found).max().item()
         gain = worst / previous
         slow = slow + 1 if gain > 0.5 else 0
         if worst <= tolerance or (worst < STALL and slow > 1):
-            residual = row_residual(factor, scaling, total - found)
+            residual = row_residual(factor, scaling, total - found, shard)
             if slow > 1 or bool((residual <= tolerance).all()):
                 break
     else:
-        residual = row_residual(factor, scaling, total - found)
+        residual = row_residual(factor, scaling, total - found, shard)
     return scaling, found, residual, sweeps, inverse

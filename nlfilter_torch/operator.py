@@ -285,7 +285,7 @@ def nonlocal_operator(
     points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator, shard)
     kernel = Kernel(weights, bandwidth, spatial_bandwidth, guide_channels, points, whitener(points), completion)
     factor, diagonal = nystrom_factor(features, points, kernel.whitening, completion)
-    balancing = balance(factor, diagonal, tolerance=tolerance, completed=completion == "diagonal")
+    balancing = balance(factor, diagonal, tolerance=tolerance, completed=completion == "diagonal", shard=shard)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,

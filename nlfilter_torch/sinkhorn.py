@@ -14,6 +14,7 @@ from nlfilter_torch import chebyshev, newton
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
+from nlfilter_torch.sharding import Shard, reduce_sum
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = 1e-3  # a residual that balancing ends above is worth a warning
@@ -37,7 +38,14 @@ class Balancing:
     steps: int
 
 
-def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None, completed: bool = False) -> Balancing:
+def balance(
+    factor: Tensor,
+    diagonal: Tensor,
+    *,
+    tolerance: float | None = None,
+    completed: bool = False,
+    shard: Shard | None = None,
+) -> Balancing:
     """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
 
     Args:
@@ -46,9 +54,10 @@ def balance(factor: Tensor, diagonal: Tensor, *, tolerance: float | None = None,
         tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. The iteration also stops
             where rounding keeps the residual from falling, and warns if that is above 1e-3.
         completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
+        shard: of the image, where other ranks have the rest of it.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed)  # type: ignore[no-untyped-call]
+    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
     if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
         warn(
             f"balancing left row sums off by up to {residual.max().item():.1e}; "
@@ -70,14 +79,15 @@ class _Balance(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool
+        ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, shard: Shard | None
     ) -> tuple[Tensor, Tensor, int]:
         if completed:
-            scaling, total, residual, steps, inverse = newton.solve(factor, diagonal, tolerance)
+            scaling, total, residual, steps, inverse = newton.solve(factor, diagonal, tolerance, shard)
         else:
-            scaling, total, residual, steps = chebyshev.solve(factor, diagonal, tolerance)
+            scaling, total, residual, steps = chebyshev.solve(factor, diagonal, tolerance, shard)
             inverse = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device)
         ctx.save_for_backward(factor, diagonal, scaling, total, inverse)
+        ctx.shard = shard
         ctx.mark_non_differentiable(residual)
         return scaling, residual, steps
 
@@ -87,15 +97,15 @@ class _Balance(torch.autograd.Function):
         factor, diagonal, scaling, total, inverse = ctx.saved_tensors
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
-        right = _weighted_moment(factor, scaling.square() * share * grad)
-        solution = _conjugate_gradients(factor, weight, right, inverse)
+        right = _weighted_moment(factor, scaling.square() * share * grad, ctx.shard)
+        solution = _conjugate_gradients(factor, weight, right, inverse, ctx.shard)
         affinity = (solution.to(factor).mT @ factor).squeeze(1)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(factor)  # (B, M, 2)
-        return outer_product(totals, torch.stack([-a, -scaling], dim=1)), -a * scaling, None, None
+        return outer_product(totals, torch.stack([-a, -scaling], dim=1)), -a * scaling, None, None, None
 
 
-def _weighted_moment(factor: Tensor, weighted: Tensor, total: Tensor | None = None) -> Tensor:
+def _weighted_moment(factor: Tensor, weighted: Tensor, shard: Shard | None, total: Tensor | None = None) -> Tensor:
     """``factor @ weighted`` (B, M, 1) in float64; given a ``total``, ``factor @ (weighted * (factor^T total))``."""
     found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
     row = None if total is None else total.to(factor).mT
@@ -104,10 +114,10 @@ def _weighted_moment(factor: Tensor, weighted: Tensor, total: Tensor | None = No
         if row is not None:
             part = part * (row @ columns).squeeze(1)
         found += columns @ part.unsqueeze(2)
-    return found
+    return reduce_sum(found, shard)
 
 
-def _conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor) -> Tensor:
+def _conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, shard: Shard | None) -> Tensor:
     """The s (B, M, 1) in float64 with ``(I + factor diag(weight) factor^T) s = right``."""
     tiny = torch.finfo(torch.float64).tiny  # where the right side is zero, so is the solution
     solution, residual = torch.zeros_like(right), right
@@ -115,7 +125,7 @@ def _conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse:
     direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
     goal = SOLVED[factor.dtype] ** 2 * size
     for _ in range(SOLVE_STEPS[factor.dtype]):
-        image = direction + _weighted_moment(factor, weight, direction)
+        image = direction + _weighted_moment(factor, weight, shard, direction)
         step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
         solution, residual = solution + step * direction, residual - step * image
         preconditioned = inverse @ residual
