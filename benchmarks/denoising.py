@@ -11,7 +11,8 @@ from torch import Tensor
 from benchmarks.photographs import photograph
 from nlfilter_torch.features import reduce_channels
 
-HELD_OUT = ("camera", "coffee", "chelsea")
+HELD_OUT = {"camera": (60, 190), "coffee": (150, 220), "chelsea": (70, 130)}  # row and column of a part to look at
+PART = 160  # pixels of it
 NOISE = 25 / 255
 STRENGTHS = (15, 20, 25, 30)  # grey levels; the h that OpenCV's method is tried with
 
@@ -37,19 +38,19 @@ def decibels(squared_error: float) -> float:
 
 
 def held_out_scenes(side: int | None = None) -> list[Scene]:
-    """The photographs to judge on, whole or the ``side`` x ``side`` in their middle; the same noise on every call."""
+    """The photographs to judge on, whole or ``side`` x ``side`` pixels of them; the same noise on every call."""
     generator = torch.Generator().manual_seed(0)
     scenes = []
     for name in HELD_OUT:
         clean = reduce_channels(photograph(name), "luminance")
-        clean = clean if side is None else middle(clean, side)
+        clean = clean if side is None else part(name, clean, side)
         scenes.append(Scene(name, clean, clean + NOISE * torch.randn(clean.shape, generator=generator)))
     return scenes
 
 
-def middle(image: Tensor, side: int) -> Tensor:
-    """The ``side`` x ``side`` pixels in the middle of an image (..., H, W)."""
-    top, left = ((length - side) // 2 for length in image.shape[-2:])
+def part(name: str, image: Tensor, side: int = PART) -> Tensor:
+    """The ``side`` x ``side`` pixels of a held-out photograph that are worth a look."""
+    top, left = HELD_OUT[name]
     return image[..., top : top + side, left : left + side]
 
 
@@ -76,14 +77,21 @@ def best_opencv_strength(scenes: Iterable[Scene]) -> float:
     return max(STRENGTHS, key=lambda h: sum(scene.psnr(opencv_nlm(scene.noisy, h)) for scene in scenes))
 
 
-def judge(methods: Mapping[str, Method], scenes: Iterable[Scene]) -> dict[str, dict[str, float]]:
-    """Print a table of PSNRs, row by row as it comes, and return it: by method, then by photograph and mean."""
+def judge(
+    methods: Mapping[str, Method], scenes: Iterable[Scene]
+) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Tensor]]]:
+    """Print a table of PSNRs, row by row as it comes.
+
+    Returns:
+        The table, by method, then by photograph and mean; and the results, by method and photograph.
+    """
     scenes = list(scenes)
+    table, results = {}, {}
     print(f"{'PSNR in dB':24}" + "".join(f"{name:>10}" for name in [*(scene.name for scene in scenes), "mean"]))
-    table = {}
     for method, function in methods.items():
-        row = {scene.name: scene.psnr(function(scene.noisy)) for scene in scenes}
+        results[method] = {scene.name: function(scene.noisy) for scene in scenes}
+        row = {scene.name: scene.psnr(results[method][scene.name]) for scene in scenes}
         row["mean"] = statistics.mean(row.values())
         print(f"{method:24}" + "".join(f"{value:10.2f}" for value in row.values()), flush=True)
         table[method] = row
-    return table
+    return table, results

@@ -23,11 +23,12 @@ import json
 import math
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from benchmarks.denoising import (
@@ -38,13 +39,14 @@ from benchmarks.denoising import (
     decibels,
     held_out_scenes,
     judge,
-    middle,
     opencv_nlm,
+    part,
     skimage_nlm,
 )
 from benchmarks.photographs import photograph
 from nlfilter_torch import NonlocalFilter, denoise
 from nlfilter_torch.files import open_beside
+from nlfilter_torch.pictures import save_figure, show_images
 
 SCENES = ("astronaut", "motorcycle", "rocket")
 TEXTURES = ("coins", "moon", "brick", "grass", "gravel", "immunohistochemistry", "retina", "hubble_deep_field")
@@ -61,12 +63,11 @@ DILATIONS = (1, 2, 3, 4, 3, 2)  # of the middle convolutions; with the first and
 WIDTH = 32
 FEATURES = 20
 ORDER = 3
-TEST_LANDMARKS = 2  # times as many as in training
 TILES = 8  # filtered at once
 
 SIDES = (16, 96)  # of crops; quick tiles have to fit into 96x96 pixels
 QUICK_SIDE = 96
-SHOWN = 96  # pixels of every photograph in the picture
+SHOWN = ("noisy", "trained", "scikit-image NLM")  # in the picture, beside the clean photographs
 
 
 class Denoiser(nn.Module):
@@ -162,10 +163,11 @@ def train(model: Denoiser, steps: int, side: int, generator: torch.Generator) ->
 
 
 @torch.no_grad()
-def denoise_in_tiles(model: Denoiser, noisy: Tensor, side: int) -> Tensor:
+def denoise_in_tiles(model: nn.Module, noisy: Tensor, side: int) -> Tensor:
     """Filter tiles of the training's size that overlap by half, and average what they say of a pixel.
 
-    Each has landmarks of its own. A tile's say falls to zero towards its border, so that no seam is left.
+    Each is filtered in four orientations, with landmarks of their own: the network knows no upright, and errors that
+    differ average out. A tile's say falls to zero towards its border, so that no seam is left.
 
     Args:
         model: trained on crops of that size.
@@ -182,10 +184,12 @@ def denoise_in_tiles(model: Denoiser, noisy: Tensor, side: int) -> Tensor:
     total, weight = torch.zeros_like(noisy), torch.zeros_like(noisy)
     for start in range(0, len(corners), TILES):
         windows = [(..., slice(y, y + side), slice(x, x + side)) for y, x in corners[start : start + TILES]]
-        tiles = model(torch.cat([noisy[window] for window in windows]))
-        for window, tile in zip(windows, tiles, strict=True):
-            total[window] += say * tile
-            weight[window] += say
+        tiles = torch.cat([noisy[window] for window in windows])
+        for turns in range(4):
+            results = model(tiles.rot90(turns, (2, 3))).rot90(-turns, (2, 3))
+            for window, result in zip(windows, results, strict=True):
+                total[window] += say * result
+                weight[window] += say
     return total / weight
 
 
@@ -203,7 +207,7 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--steps must be at least 1, got {options.steps}; 500 give a first impression")
     if not SIDES[0] <= options.side <= SIDES[1]:
         parser.error(f"--side must be {SIDES[0]} to {SIDES[1]}, got {options.side}; 64 does well")
-    most = options.side**2 // TEST_LANDMARKS
+    most = options.side**2
     if not 1 <= options.landmarks <= most:
         parser.error(f"--landmarks must be 1 to {most} for this --side, got {options.landmarks}; 48 do well")
     if options.seed < 0:
@@ -225,23 +229,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clocks = time.perf_counter(), time.process_time()
     losses = train(model, options.steps, options.side, torch.Generator().manual_seed(options.seed))
     seconds, cpu_seconds = time.perf_counter() - clocks[0], time.process_time() - clocks[1]
-    for layer in (model, untrained):
-        layer.filter.affinity.num_landmarks = TEST_LANDMARKS * options.landmarks
     print(f"\n{model.filter}\n")
 
     scenes = held_out_scenes(QUICK_SIDE if options.quick else None)
     strength = best_opencv_strength(scenes)
-    shown: dict[str, Method] = {
+    methods: dict[str, Method] = {
         "noisy": lambda noisy: noisy,
-        "trained": lambda noisy: denoise_in_tiles(model, noisy, options.side),
-        "scikit-image NLM": skimage_nlm,
-    }
-    others: dict[str, Method] = {
         "untrained": lambda noisy: denoise_in_tiles(untrained, noisy, options.side),
+        "trained": lambda noisy: denoise_in_tiles(model, noisy, options.side),
         "by hand": lambda noisy: denoise(noisy, noise_level=NOISE),
+        "scikit-image NLM": skimage_nlm,
         f"OpenCV NLM, h = {strength}": lambda noisy: opencv_nlm(noisy, strength),
     }
-    table = judge(shown | others, scenes)
+    table, results = judge(methods, scenes)
     ahead = table["trained"]["mean"] - table["scikit-image NLM"]["mean"]
     print(
         f"\ntrained in {seconds:.0f} s ({cpu_seconds:.0f} s of processor time); {ahead:+.2f} dB to scikit-image's NLM"
@@ -255,25 +255,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "loss": [statistics.mean(losses[i : i + EVERY]) for i in range(0, len(losses), EVERY)],
             "psnr": table,
         }
-        save(options.out, model, figures, shown, scenes)
+        save(options.out, model, figures, picture(scenes, results, whole=options.quick))
 
 
-def save(
-    folder: Path, model: Denoiser, figures: dict[str, object], methods: dict[str, Method], scenes: Sequence[Scene]
-) -> None:
-    """Write weights, figures, and a picture of the middle of every photograph: methods side by side, then clean."""
-    from nlfilter_torch.pictures import save_figure, show_images
-
+def picture(scenes: Sequence[Scene], results: Mapping[str, Mapping[str, Tensor]], *, whole: bool) -> Figure:
+    """A row for every photograph, whole or a part of it: noisy, trained, another method, clean."""
     panels: dict[str, Tensor] = {}
     for scene in scenes:
-        results = {method: function(scene.noisy) for method, function in methods.items()} | {"clean": scene.clean}
-        panels |= {f"{scene.name}, {label}": middle(image, SHOWN) for label, image in results.items()}
+        row = {method: results[method][scene.name] for method in SHOWN} | {"clean": scene.clean}
+        for label, image in row.items():
+            panels[f"{scene.name}, {label}"] = image if whole else part(scene.name, image)
+    return show_images(panels, columns=len(SHOWN) + 1, side=320)
+
+
+def save(folder: Path, model: Denoiser, figures: Mapping[str, object], figure: Figure) -> None:
+    """Write weights, figures and picture; each file appears complete or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     with open_beside(folder / "denoiser.pt") as stream:
         torch.save(model.state_dict(), stream)
     with open_beside(folder / "denoiser.json") as stream:
         stream.write(json.dumps(figures, indent=2).encode())
-    save_figure(show_images(panels, columns=len(methods) + 1, side=2 * SHOWN), folder / "denoiser.png")
+    save_figure(figure, folder / "denoiser.png")
 
 
 if __name__ == "__main__":

@@ -99,9 +99,10 @@ def test_tiles_cover_every_pixel_without_a_seam(size):
 def test_scores_are_decibels_of_the_squared_error(capsys):
     clean = torch.full((1, 1, 8, 8), 0.5)
     scene = Scene("grey", clean, clean + 0.1)
-    table = judge({"noisy": lambda noisy: noisy, "half": lambda noisy: noisy - 0.05}, [scene])
+    table, results = judge({"noisy": lambda noisy: noisy, "half": lambda noisy: noisy - 0.05}, [scene])
     assert table["noisy"] == pytest.approx({"grey": 20.0, "mean": 20.0}, abs=1e-4)
     assert table["half"]["mean"] == pytest.approx(26.0206, abs=1e-3)
+    torch.testing.assert_close(results["half"]["grey"], clean + 0.05)
     assert capsys.readouterr().out.splitlines()[1].split() == ["noisy", "20.00", "20.00"]
 
 
@@ -111,8 +112,8 @@ def test_scores_are_decibels_of_the_squared_error(capsys):
         (["--steps", "0"], "--steps must be at least 1, got 0"),
         (["--side", "8"], "--side must be 16 to 96, got 8"),
         (["--side", "128"], "--side must be 16 to 96, got 128"),
-        (["--landmarks", "0"], "--landmarks must be 1 to 2048 for this --side, got 0"),
-        (["--side", "16", "--landmarks", "129"], "--landmarks must be 1 to 128 for this --side, got 129"),
+        (["--landmarks", "0"], "--landmarks must be 1 to 4096 for this --side, got 0"),
+        (["--side", "16", "--landmarks", "257"], "--landmarks must be 1 to 256 for this --side, got 257"),
         (["--seed", "-1"], "--seed must not be negative, got -1"),
         (["--steps", "many"], "--steps: invalid int value: 'many'"),
     ],
