@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c const
 PINS := pyproject.toml constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types bench bench-quick train pictures notebooks clean
+.PHONY: demo test lint types chromium bench bench-quick train pictures notebooks clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
@@ -18,15 +18,22 @@ $(VENV)/.installed: $(PINS)
 	touch $@
 
 $(VENV)/.installed-test: $(VENV)/.installed
-	$(PIP) --no-build-isolation -e '.[cli,notebooks,bench,docs,test]'
+	$(PIP) --no-build-isolation -e '.[cli,app,notebooks,bench,docs,test]'
 	touch $@
+
+# The browser that the editor is tested in; without one those tests are skipped, and say so.
+chromium:
+	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit; done; \
+	if [ "$$(id -u)" = 0 ]; then as_root=; else as_root='sudo -n'; fi; \
+	{ $$as_root apt-get update && $$as_root apt-get install -y --no-install-recommends chromium; } >/dev/null 2>&1 \
+	|| echo "No Chromium could be installed; the editor's tests in the browser will be skipped."
 
 # A picture of every step, from a photograph that comes with scikit-image, in out/.
 demo: $(VENV)/.installed
 	$(BIN)/nlfilter-torch demo out
 
 # Everything that has to hold; pytest comes last, so that its count closes the output.
-test: lint types bench-quick
+test: lint types bench-quick chromium
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.installed-test
@@ -56,10 +63,13 @@ train: $(VENV)/.installed-test
 pictures: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.detail_pictures docs
 
-# Every notebook from the script it is paired with, run, with its pictures.
+# Every notebook from the script it is paired with; those with pictures, run, are put into out/notebooks.
 notebooks: $(VENV)/.installed-test
+	rm -f notebooks/*.ipynb
 	$(BIN)/jupytext --to ipynb notebooks/*.py
-	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
+	mkdir -p out/notebooks
+	cp notebooks/*.ipynb out/notebooks
+	$(BIN)/jupyter execute --inplace out/notebooks/*.ipynb
 
 clean:
 	rm -rf $(VENV) out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis

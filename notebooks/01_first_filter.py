@@ -20,12 +20,14 @@
 # %matplotlib inline
 import skimage.data
 import torch
+from IPython.display import display
+from ipywidgets import FloatSlider, interact
 from kornia.color import rgb_to_grayscale
 from skimage.transform import resize
 
-from nlfilter_torch import captured_energy, detail_layers, diffusion_mask, nonlocal_operator, polynomial_filter
+from nlfilter_torch import captured_energy, detail_layers, nonlocal_operator, polynomial_filter
 from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.pictures import plot_response, show_eigenvectors, show_images, show_layers, show_mask
+from nlfilter_torch.pictures import plot_response, show_eigenvectors, show_images, show_layers
 
 # %% [markdown]
 # ## 1. A photograph
@@ -79,22 +81,29 @@ calm = edit_luminance(image, lambda y: polynomial_filter(operator, y, torch.tens
 show_images({"alpha = (3, 3, 4, 1.05)": crisp, "before": image, "alpha = (0, 0.3, 1, 1)": calm}, side=280)
 
 # %% [markdown]
-# The four numbers are a polynomial of the eigenvalues: fine detail (left) is made three times as strong, the smooth shading
-# (right) nearly left alone.
+# ## 5. Move them
+#
+# Once the layers are there, an edit is their weighted sum, quick enough for sliders that are dragged. The curve below the
+# picture is the gain of each eigenvalue: the four numbers are a polynomial. Fine detail is on its left, the smooth shading
+# on its right; the dots are the eigenvalues of this photograph. (The sliders move when the notebook runs, not on a page.)
+
 
 # %%
-plot_response(alpha, spectrum)
+def edit(fine: float, small: float, large: float, shading: float) -> None:
+    alpha = torch.tensor([fine, small, large, shading])
+    weighed = (alpha.view(1, -1, 1, 1, 1) * layers).sum(1)
+    display(show_images({"before": image, "after": image + weighed - luminance}, side=360))
+    display(plot_response(alpha, spectrum))
+
+
+steps = {"min": 0.0, "max": 5.0, "step": 0.05, "continuous_update": False}
+sliders = interact(
+    edit,
+    fine=FloatSlider(3.0, **steps),
+    small=FloatSlider(3.0, **steps),
+    large=FloatSlider(4.0, **steps),
+    shading=FloatSlider(1.05, **steps),
+)
 
 # %% [markdown]
-# ## 5. One region, and all that looks like it
-#
-# A few pixels of the saucer are enough: the mask finds what is like them anywhere in the picture. It joins both sides of the
-# saucer, the handle and a ring of the coffee of that colour, and leaves out the shadow and most of the table, which is nearly
-# as bright. An edit can be limited to it.
-
-# %%
-by_colour = nonlocal_operator(image, photometric_bandwidth=20 / 255, guide_channels="all")
-region = torch.zeros_like(luminance)
-region[..., 85:97, 42:56] = 1
-mask = diffusion_mask(by_colour.spectrum(), region, width=3.0)
-show_mask(image, region, mask, side=280)
+# Next: [regions and strokes](02_masks_and_strokes.ipynb), [sliders that are found, not moved](03_learning_sliders.ipynb).

@@ -1,0 +1,113 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Sliders that are found
+#
+# Somebody edited a photograph, with whatever program. Which sliders do the same? They are found in one step, or by gradient
+# descent where one step is not enough, and kept for other photographs.
+
+# %%
+# %matplotlib inline
+import skimage.data
+import torch
+from kornia.color import rgb_to_grayscale
+from skimage.filters import unsharp_mask
+from skimage.transform import resize
+
+from nlfilter_torch import estimate_bandwidth, fit_alpha, nonlocal_operator, polynomial_filter
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.pictures import plot_response, show_images
+from nlfilter_torch.presets import PRESETS, Preset
+
+
+def load(name: str, height: int, width: int) -> torch.Tensor:
+    """A photograph (1, 3, H, W) in [0, 1]."""
+    pixels = resize(getattr(skimage.data, name)(), (height, width), anti_aliasing=True)
+    return torch.from_numpy(pixels).float().permute(2, 0, 1)[None]
+
+
+image, other = load("chelsea", 160, 240), load("coffee", 160, 240)
+luminance = rgb_to_grayscale(image)
+
+# %% [markdown]
+# ## 1. An edit from elsewhere
+#
+# An unsharp mask of scikit-image, radius 2, which knows nothing of this filter.
+
+# %%
+sharpened = unsharp_mask(luminance[0, 0].numpy(), radius=2.0, amount=1.5)
+target = torch.from_numpy(sharpened).view_as(luminance).to(luminance)
+edited = edit_luminance(image, lambda _: target)
+show_images({"before": image, "the edit": edited}, side=380)
+
+# %% [markdown]
+# ## 2. Its sliders, in one step
+#
+# The filter is linear in its sliders, so the best ones solve a small least-squares problem. They do not hit it exactly: an
+# unsharp mask looks at what is near, this filter at what is alike. The number says how much of the change they explain.
+
+# %%
+operator = nonlocal_operator(luminance)
+alpha = fit_alpha(operator, luminance, target)[0]
+found = polynomial_filter(operator, luminance, alpha)
+left, change = ((target - x).square().sum() for x in (found, luminance))
+print("alpha:", [round(a, 2) for a in alpha.tolist()])
+print(f"explained: {100 * (1 - left / change):.1f} % of the change")
+show_images({"the edit": edited, "by the sliders": edit_luminance(image, lambda _: found)}, side=380)
+
+# %%
+plot_response(alpha, operator.spectrum())
+
+# %% [markdown]
+# ## 3. Kept, and used on another photograph
+#
+# A preset holds the sliders and the filter they belong to. Written to a file it is what
+# `nlfilter-torch detail photo.jpg out.jpg --preset look.json` reads.
+
+# %%
+look = Preset(tuple(round(a, 3) for a in alpha.tolist()))
+print(look.to_json())
+show_images({"another photograph": other, "with the same look": look.apply(other)}, side=380)
+
+# %% [markdown]
+# Some looks have a name. Each of these is one line of code, or `--preset NAME`.
+
+# %%
+names = ("crisp", "dramatic", "glow", "soft skin", "calm", "smooth")
+show_images({name: PRESETS[name].apply(other) for name in names}, columns=3, side=260)
+
+# %% [markdown]
+# ## 4. The filter itself, by gradient descent
+#
+# Least squares finds sliders. How different two spots may be and still count as alike, the bandwidth, it cannot find. But the
+# fit is differentiable, so the bandwidth goes down the gradient of what the best sliders leave unexplained.
+
+# %%
+logarithm = estimate_bandwidth(luminance).log().requires_grad_()
+optimizer = torch.optim.Adam([logarithm], lr=0.1)
+for step in range(12):
+    trial = nonlocal_operator(luminance, photometric_bandwidth=logarithm.exp())
+    learned = polynomial_filter(trial, luminance, fit_alpha(trial, luminance, target, rounding=0.0))
+    unexplained = (learned - target).square().sum() / change
+    if step % 4 == 0 or step == 11:
+        print(f"{255 * logarithm.exp().item():5.1f} grey levels explain {100 * (1 - unexplained.item()):.1f} %")
+    optimizer.zero_grad()
+    unexplained.backward()
+    optimizer.step()
+
+# %%
+show_images({"the edit": edited, "learned": edit_luminance(image, lambda _: learned.detach())}, side=380)
+
+# %% [markdown]
+# Sliders, bandwidths and a network that makes the guide learn together in [the next notebook](04_inside_a_network.ipynb).
