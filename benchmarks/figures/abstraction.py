@@ -3,29 +3,41 @@
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.figures.scenes import SIDE, SIZE, Numbers, scene
+from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, scene
 from nlfilter_torch import abstract
 from nlfilter_torch.edits.abstract import edge_lines, quantize
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.pictures import show_images
 
 TONES, LINES = 8, 0.8
+PART = (95, 10, 170)  # left, top, side
 ROUNDS, RANGE, SPREAD = 4, 0.08, 3.0  # of the iterated bilateral filter
 
 
 def figure_18(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """W^k y with k = 0.1 (b), with lines and tones (c), and the same lines and tones after a bilateral filter (d).
+    """W^k y with k = 0.1 (b), with lines and tones drawn on it (c), and the same drawn after a bilateral filter (d).
 
-    (d) is the method of the paper's [30].
+    (d) is the method of the paper's [30]. Below, a part of each at three times the size.
     """
-    image = scene("astronaut", size)[0]
+    image, scale = scene("astronaut", size)
     panels = {
         "(a) photograph": image,
         "(b) k = 0.1": abstract(image),
         "(c) with lines and tones": abstract(image, edges=LINES, tones=TONES),
         "(d) bilateral, lines and tones": winnemoeller(image),
     }
-    return show_images(panels, columns=2, side=SIDE), {"tones": TONES, "lines": LINES}
+    numbers: Numbers = {}
+    for title, picture in panels.items():
+        planes = luminance(picture)
+        strength = (planes.diff(dim=2)[..., :-1].square() + planes.diff(dim=3)[..., :-1, :].square()).sqrt()
+        numbers[title] = {
+            "gradient, levels per pixel: median": rounded(255 * strength.median(), 2),
+            "steepest hundredth": rounded(255 * strength.flatten().quantile(0.99), 1),
+        }
+    left, top, side = (round(scale * length) for length in PART)
+    window = (..., slice(top, top + side), slice(left, left + side))
+    parts = {f"{title[:3]} magnified": picture[window] for title, picture in panels.items()}
+    return show_images(panels | parts, columns=4, side=round(0.8 * SIDE)), numbers
 
 
 def winnemoeller(image: Tensor) -> Tensor:

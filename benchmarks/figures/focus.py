@@ -1,33 +1,100 @@
-"""Fig. 17: fake depth of field."""
+"""Fig. 17: fake depth of field, beside what the true depth gives."""
 
+import numpy as np
+import skimage.data
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
-from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, painted_over, rounded, scene, spots
-from nlfilter_torch import defocus
+from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
+from nlfilter_torch import defocus, nonlocal_operator
+from nlfilter_torch.edits.defocus import LOCALITY, RADIUS, blur_by, focus_map
 from nlfilter_torch.pictures import show_images
 
-YELLOW = (1.0, 0.85, 0.1)
-FACE: tuple[Box, ...] = (
+PORTRAIT: tuple[Box, ...] = (
     (190, 70, 70, 90),
-    (170, 30, 60, 20),
+    (185, 30, 50, 20),
+    (270, 60, 20, 40),
     (200, 200, 60, 40),
-    (60, 280, 60, 120),
-    (280, 290, 50, 80),
+    (60, 270, 60, 60),
+    (270, 290, 40, 40),
 )
+MOTORCYCLE: tuple[Box, ...] = (
+    (345, 200, 50, 30),
+    (170, 190, 120, 10),
+    (340, 310, 60, 40),
+    (140, 300, 20, 60),
+    (560, 290, 50, 10),
+    (540, 330, 60, 60),
+    (505, 135, 40, 30),
+    (640, 330, 20, 60),
+    (180, 310, 130, 20),
+)
+WIDE = 741 / 500  # the motorcycle's width over its height
+NEAR, FAR = 5.0, 14.0  # in pixels of disparity from the tank's: the subject, and what is behind it
 
 
 def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Sharp where the yellow spots are, and all that looks like them and is near; blurred elsewhere."""
-    image, scale = scene("astronaut", size)
-    region = spots(image, scale, *FACE)
-    colour = torch.tensor(YELLOW).view(1, 3, 1, 1).expand_as(image)
-    disc = defocus(image, region)
-    gaussian = defocus(image, region, aperture="gaussian")
+    """In focus is what the yellow spots touch, and what is like them and near; the depth of the second scene is known.
+
+    Blur grows as the map falls. (h) is blurred by the depth that a stereo camera measured. Gradient energy is that of
+    the result over that of the photograph.
+    """
+    portrait, scale = scene("astronaut", size)
+    portrait = portrait[..., : round(portrait.shape[-1] / WIDE), :]
+    region = spots(portrait, scale, *PORTRAIT)
     panels = {
-        "(a) photograph": image,
-        "(b) in focus": painted_over(image, colour, region),
-        "(c) disc": disc,
-        "(d) Gaussian": gaussian,
+        "(a) photograph and spots": marked(portrait, region),
+        "(b) focus map": _map(portrait, region),
+        "(c) Gaussian blur": defocus(portrait, region, aperture="gaussian"),
+        "(d) blur of a lens": defocus(portrait, region),
     }
-    return show_images(panels, columns=2, side=SIDE), {"painted, %": rounded(100 * region.mean(), 1)}
+    image, scale = scene("motorcycle", size)
+    region = spots(image, scale, *MOTORCYCLE)
+    disparity = _disparity(image)
+    distance = (disparity - disparity[region > 0].median()).abs()
+    lens = defocus(image, region)
+    true = blur_by(image, ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1), RADIUS * min(image.shape[-2:]), "disc")
+    panels |= {
+        "(e) photograph and spots": marked(image, region),
+        "(f) focus map": _map(image, region),
+        "(g) blur of a lens": lens,
+        "(h) by the true depth": true,
+    }
+    numbers: Numbers = {
+        name: {
+            "gradient energy of the subject": rounded(
+                _energy(found, distance < NEAR) / _energy(image, distance < NEAR), 3
+            ),
+            "behind it": rounded(_energy(found, distance > FAR) / _energy(image, distance > FAR), 3),
+        }
+        for name, found in (("(g) from the spots", lens), ("(h) from the true depth", true))
+    }
+    return show_images(panels, columns=4, side=round(0.9 * SIDE)), numbers
+
+
+def _map(image: Tensor, region: Tensor) -> Tensor:
+    """The map that the defaults of defocus make."""
+    operator = nonlocal_operator(
+        image,
+        photometric_bandwidth=25 / 255,
+        spatial_bandwidth=LOCALITY * min(image.shape[-2:]),
+        patch_size=3,
+        guide_channels="all",
+    )
+    return focus_map(operator.spectrum(), image, region)
+
+
+def _disparity(image: Tensor) -> Tensor:
+    """Of the motorcycle, (1, 1, H, W), unknown ones as on the farther side of the gap."""
+    known = torch.from_numpy(np.array(skimage.data.stereo_motorcycle()[2], dtype=np.float32))
+    known = torch.where(torch.isfinite(known), known, torch.inf)
+    while bool(torch.isinf(known).any()):
+        grown = -torch.nn.functional.max_pool2d(-known[None, None], 3, 1, 1)[0, 0]
+        known = torch.where(torch.isinf(known), grown, known)
+    return torch.nn.functional.interpolate(known[None, None], size=image.shape[-2:], mode="nearest")
+
+
+def _energy(image: Tensor, where: Tensor) -> float:
+    rows, columns = image.diff(dim=2)[..., :-1], image.diff(dim=3)[..., :-1, :]
+    return float(((rows.square() + columns.square()) * where[..., :-1, :-1]).sum())

@@ -12,6 +12,7 @@ SIZE = 640  # of the longer side of a photograph, in pixels
 SIDE = 384  # of a panel
 Numbers = dict[str, Any]  # what JSON holds
 Box = tuple[int, int, int, int]  # column, row, width, height, in pixels of the photograph as it ships
+YELLOW = (1.0, 0.85, 0.1)
 FADED = 0.55  # weight of the photograph under strokes
 
 
@@ -48,6 +49,11 @@ def painted_over(image: Tensor, colours: Tensor, mask: Tensor) -> Tensor:
     faded = FADED * image.expand(-1, 3, -1, -1) + (1 - FADED) * reduce_channels(image, "luminance")
     rim = torch.nn.functional.max_pool2d(mask, 5, 1, 2)
     return torch.where(mask > 0, colours, torch.where(rim > 0, torch.ones_like(faded), faded))
+
+
+def marked(image: Tensor, region: Tensor) -> Tensor:
+    """The photograph, faded, with a region in yellow."""
+    return painted_over(image, torch.tensor(YELLOW).view(1, 3, 1, 1).expand(-1, -1, *image.shape[-2:]), region)
 
 
 def luminance(image: Tensor) -> Tensor:

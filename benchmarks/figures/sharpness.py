@@ -8,36 +8,39 @@ from torch import Tensor
 
 from benchmarks import unsharp
 from benchmarks.detail_pictures import fine_part, halo, noise_gain
-from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, painted_over, rounded, scene, spots
+from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, marked, rounded, scene, spots
 from nlfilter_torch import diffusion_mask, nonlocal_operator, polynomial_filter
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.pictures import show_images
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.0])
 BANDWIDTH = 25 / 255
+Window = tuple[int, int, int]  # column, row and side of what is shown, in pixels of the photograph as it ships
 STEPS = 24  # of a bisection
 STRONGEST = 40.0
-YELLOW = (1.0, 0.85, 0.1)
 
 
 def figure_12(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Detail of a cat's fur only. All have the same gain of detail on what the mask selects (its fur).
+    """Detail of a suit only, from one spot. (b) to (e) have the same gain of detail on what the mask (f) selects.
 
-    Propagated from the spots, the edit leaves the smooth background as it is, and with it the background's noise.
+    Propagated, the edit leaves skin and backdrop as they are, and with them their noise.
     """
-    return _compare("chelsea", size, ((150, 30, 40, 20), (110, 130, 30, 30)))
+    return _compare("astronaut", size, ((60, 300, 20, 20),), time=2.0, window=(10, 40, 330))
 
 
 def figure_13(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Detail of a table's wood only. All have the same gain of detail on what the mask selects."""
-    return _compare("coffee", size, ((430, 40, 50, 30), (40, 250, 40, 40)))
+    """Detail of a lawn only, from one spot. (b) to (e) have the same gain of detail on what the mask (f) selects.
+
+    Propagated, the edit leaves the sky as it is, and with it the sky's noise.
+    """
+    return _compare("camera", size, ((300, 380, 40, 60),), time=0.5, window=(60, 130, 330))
 
 
-def _compare(name: str, size: int, boxes: tuple[Box, ...]) -> tuple[Figure, Numbers]:
+def _compare(name: str, size: int, boxes: tuple[Box, ...], *, time: float, window: Window) -> tuple[Figure, Numbers]:
     image, scale = scene(name, size)
     before, region = luminance(image), spots(image, scale, *boxes)
     by_colour = nonlocal_operator(image, photometric_bandwidth=BANDWIDTH, guide_channels="all")
-    mask = diffusion_mask(by_colour.spectrum(), region)
+    mask = diffusion_mask(by_colour.spectrum(), region, time=time)
     selected = mask > 0.5
     whole = polynomial_filter(nonlocal_operator(before), before, ALPHA) - before
     gain = _gain(before, before + mask * whole, selected)
@@ -45,10 +48,9 @@ def _compare(name: str, size: int, boxes: tuple[Box, ...]) -> tuple[Figure, Numb
         "(b) adaptive unsharp mask": _adding(before, unsharp.adaptive(before)),
         "(c) constrained unsharp mask": lambda amount: unsharp.constrained(before, amount),
         "(d) edited everywhere": _adding(before, whole),
-        "(e) propagated from the spots": _adding(before, mask * whole),
+        "(e) propagated": _adding(before, mask * whole),
     }
-    colour = torch.tensor(YELLOW).view(1, 3, 1, 1).expand_as(image)
-    panels = {"(a) photograph and spots": painted_over(image, colour, region)}
+    panels = {"(a) photograph, spots": marked(image, region)}
     numbers: Numbers = {"selected, %": rounded(100 * selected.float().mean(), 1)}
     for title, method in methods.items():
         result = _reach(method, before, gain, selected)
@@ -60,7 +62,9 @@ def _compare(name: str, size: int, boxes: tuple[Box, ...]) -> tuple[Figure, Numb
             "halo, grey levels": rounded(halo(before, result), 1),
         }
     panels["(f) the mask"] = mask
-    return show_images(panels, columns=3, side=SIDE), numbers
+    left, top, side = (round(scale * length) for length in window)
+    shown = (..., slice(top, top + side), slice(left, left + side))
+    return show_images({title: panel[shown] for title, panel in panels.items()}, columns=3, side=SIDE), numbers
 
 
 def _gain(before: Tensor, after: Tensor, where: Tensor) -> float:

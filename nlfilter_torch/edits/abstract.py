@@ -16,8 +16,8 @@ from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 
 LOCALITY = 0.1  # default spatial bandwidth as a share of the short side
-# What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel has
-# likes, there where it is like no other, such as a pixel on a border, and back everywhere as the power goes to 0.
+# What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel
+# has likes, there where it is like no other, such as on a border, and back everywhere as the power goes to 0.
 TIMES_UNEXPLAINED = 10
 LEAST = 1e-4  # of r
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_image, check_positive, check_same_size
+from nlfilter_torch.edits.spots import spot_correlations
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
@@ -17,9 +18,9 @@ Aperture = Literal["disc", "gaussian"]
 
 RADIUS = 0.025  # default radius of the blur as a share of the short side
 LOCALITY = 0.2  # default spatial bandwidth, likewise
-SPECIMENS = 64  # pixels of the focus region that every other pixel is compared with
+REACH = 0.5  # of the correlations with the spots of the focus region
 CLOSING, SMOOTHING = 0.015, 0.04  # sizes, as shares of the short side, of the gaps in a focus map that are filled
-BLURRED, SHARP = 0.2, 0.6  # likeness below BLURRED gets the whole blur, above SHARP none
+BLURRED, SHARP = 0.15, 0.45  # likeness below BLURRED gets the whole blur, above SHARP none
 STEPS = (0.1, 0.25, 0.5, 1.0)  # blurs that others are mixed from, as shares of the radius
 
 
@@ -91,17 +92,19 @@ def defocus(
         **options,
     ).spectrum()
     focus = focus_map(spectrum, pixels, focus_region.to(pixels))
-    return _blur_by(pixels, 1 - focus, float(reach), aperture).to(image.dtype)
+    return blur_by(pixels, 1 - focus, float(reach), aperture).to(image.dtype)
 
 
 def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor:
     """How much every pixel belongs to what is in focus, (B, 1, H, W) in [0, 1]; the paper's mask, for many spots.
 
-    A pixel is in focus if it correlates with any pixel of the region. Gaps are closed, and borders follow the image's.
+    A pixel is in focus if it correlates with any spot of the region. Gaps are closed, and borders follow the image's.
     """
     from kornia.filters import guided_blur  # kornia takes half a second to import: only who needs it waits
 
-    likeness = _likeness(spectrum, focus_region)
+    painted = focus_region.to(spectrum.factor).expand(image.shape[0], -1, -1, -1)
+    best = [correlation.amax(0) for correlation, _, _ in spot_correlations(spectrum, painted, REACH)]  # B times (N,)
+    likeness = torch.stack(best).unflatten(1, spectrum.size).unsqueeze(1).to(focus_region)
     share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
     focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
     short = min(image.shape[-2:])
@@ -115,23 +118,7 @@ def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor
     return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
 
 
-def _likeness(spectrum: Spectrum, region: Tensor) -> Tensor:
-    """Largest correlation (B, 1, H, W) of every pixel with pixels of a region (B, 1, H, W), times their weight."""
-    factor = spectrum.factor
-    core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - 0.5 * eigenvalues)).to(factor)
-    image = core @ factor  # (B, M, N)
-    norm = (factor * image).sum(1, keepdim=True).clamp(min=1e-6).rsqrt()  # (B, 1, N)
-    weights = region.flatten(2).expand(factor.shape[0], -1, -1)
-    # Equally many specimens from every image, spread over the painted pixels in their order.
-    ranks = (weights[:, 0] > 0).long().cumsum(1)  # (B, N)
-    wanted = (torch.linspace(0, 1, SPECIMENS, device=ranks.device) * (ranks[:, -1:] - 1)).long() + 1  # (B, SPECIMENS)
-    chosen = torch.searchsorted(ranks, wanted).unsqueeze(1)  # (B, 1, SPECIMENS)
-    specimens = (factor * norm).gather(2, chosen.expand(-1, factor.shape[1], -1)) * weights.gather(2, chosen)
-    best = torch.stack([(s.mT @ image).amax(1) for s in specimens.split(16, dim=2)]).amax(0)  # (B, N)
-    return (best.unsqueeze(1) * norm).clamp(0.0, 1.0).unflatten(2, spectrum.size)
-
-
-def _blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:
+def blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:
     """Blur every pixel by ``amount`` (B, 1, H, W) in [0, 1] of the radius, from pixels that are blurred themselves."""
     result, below = image, 0.0
     for step in STEPS:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from nlfilter_torch.checks import check_image, check_same_size
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.edits.spots import spot_correlations
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
@@ -14,8 +15,9 @@ from nlfilter_torch.strokes import check_painted, check_share
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
-DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: strokes of two colours on one thing are no error
-MAX_SPOTS = 64  # further ones of a colour are taken together
+DOUBT = (
+    0.05  # variance of what a spot tells, in units of a pixel's own: strokes of two colours on one thing are no error
+)
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
 
 
@@ -92,7 +94,7 @@ def recolor(
     if keep is not None:
         held = keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
         marked = torch.cat([marked, held], dim=1)
-    likeness = spot_likeness(spectrum, marked, reach)[:, : counts.shape[1]]
+    likeness = _divide(spectrum, marked, reach)[:, : counts.shape[1]]
     shares = ((likeness - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
     shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
     shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
@@ -109,44 +111,17 @@ def recolor(
     return torch.where(untouched, pixels, merge_luminance(luminance, chroma)).to(image.dtype)
 
 
-def spot_likeness(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Tensor:
+def _divide(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Tensor:
     """How much every pixel resembles one region rather than the others, (B, K, H, W), about 0 to 1.
 
-    Correlations under ``W + s W^2 + s^2 W^3 + ...``, s the reach, with the mean of each spot of the regions (B, K, H, W):
-    the few odd pixels that a brush touches do not count. The spots share a pixel by the best linear estimate of their
-    region's number, so that a region painted on what resembles another one takes from it what is its own.
+    The spots share a pixel by the best linear estimate of its region from its correlations with them, so that a region
+    painted on what resembles another one takes from it what is its own.
     """
-    factor = spectrum.factor  # (B, M, N)
-    walk = torch.as_tensor(reach).to(spectrum.root).reshape(-1, 1)
-    core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues)).to(factor)
-    image = core @ factor
-    unit = (factor * image).sum(1, keepdim=True).clamp(min=1e-6).rsqrt()  # (B, 1, N)
     found = []
-    for b, region in enumerate(regions):
-        members, owners = _spots(region)  # (J, N), (J, K)
-        means = members @ (factor[b] * unit[b]).mT  # (J, M)
-        gram = means @ core[b] @ means.mT  # (J, J)
-        scale = gram.diagonal().clamp(min=1e-6).rsqrt()
-        correlation = scale[:, None] * (means @ image[b]) * unit[b]  # (J, N)
-        between = scale[:, None] * gram * scale + DOUBT * torch.eye(len(gram)).to(gram)
-        found.append(torch.linalg.solve(between, owners).mT @ correlation)
+    for correlation, between, owners in spot_correlations(spectrum, regions, reach):
+        doubtful = between + DOUBT * torch.eye(len(between)).to(between)
+        found.append(torch.linalg.solve(doubtful, owners).mT @ correlation)
     return torch.stack(found).unflatten(2, spectrum.size)
-
-
-def _spots(region: Tensor) -> tuple[Tensor, Tensor]:
-    """Connected spots of regions (K, H, W): weights (J, N) of unit sum, and the region (J, K) that each belongs to."""
-    from skimage.measure import label
-
-    members, owners = [], []
-    for number, plane in enumerate(region):
-        spots = torch.from_numpy(label((plane.detach() > 0).cpu().numpy(), connectivity=2)).to(plane.device)
-        for spot in range(1, min(int(spots.max()), MAX_SPOTS) + 1):
-            inside = plane * (spots >= spot if spot == MAX_SPOTS else spots == spot)
-            members.append(inside.flatten() / inside.sum())
-            owners.append(number)
-    return torch.stack(members), torch.nn.functional.one_hot(
-        torch.tensor(owners, device=region.device), len(region)
-    ).to(region)
 
 
 def colour_guide(image: Tensor) -> Tensor:
