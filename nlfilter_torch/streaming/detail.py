@@ -1,0 +1,233 @@
+"""Detail sliders for pictures whose factor fits no memory: statistics from passes or a sample, then tile after tile."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch.checks import check_alpha, check_choice, check_count
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.frames import FittedFilter
+from nlfilter_torch.precision import full_precision
+from nlfilter_torch.streaming.rows import KINDS, Picture, RowSource, RowTarget, Tile, stored_as, transparency
+from nlfilter_torch.streaming.sampling import Report, all_blocks, sample_by_influence, take_pilot
+from nlfilter_torch.streaming.statistics import Block, balance_by_passes, sum_up
+
+SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
+TILE_PIXELS = 1 << 17  # longer tiles are no faster
+Statistics = Literal["sample", "full"]
+Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
+
+
+def stream_detail(
+    source: RowSource,
+    target: RowTarget,
+    alpha: Tensor,
+    *,
+    residual: float | None = None,
+    channels: Literal["luminance", "all"] = "luminance",
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+    **options: Any,
+) -> None:
+    """Filter a picture of any size, of which no more than some rows are in memory at once.
+
+    Landmarks, balancing and coefficients are shared by the whole picture; with them, what the filter makes of a pixel
+    depends on the pixel's own patch only. So the rows of a tile are exact: there are no seams, and the size of the
+    tiles makes no difference.
+
+    Args:
+        source: rows (H, W) or (H, W, S) of 8 or 16 bits or floats: a numpy array or memory map, an array of zarr,
+            anything that gives rows for a slice. One or three channels are colours, one more is transparency, which is
+            carried along. Integers count from 0 to 1, whatever their range.
+        target: what takes the rows, in their order, by assignment to a slice, with the source's shape and a dtype of
+            its own.
+        alpha: sliders (k+1,), as of :func:`polynomial_filter`.
+        residual: as of :func:`polynomial_filter`.
+        channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
+        statistics: ``"sample"`` balances the filter and finds its coefficients on a sample of the pixels, in which
+            rare patches come before common ones, after two readings of the source; ``"full"`` on all pixels, in four
+            or five passes that each cost as much as the result.
+        sample: number of pixels of that sample, about; with as many as the picture has, statistics are full.
+        tile_rows: rows that are worked out at once; None is as many as ``memory`` has room for.
+        memory: bytes that may be used, beside those of source and target.
+        report: called with the name of a stage, how much of it is done, and how much there is to do.
+        **options: of :func:`nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are numbers.
+
+    Raises:
+        TypeError, ValueError: if an argument does not fit, or the source changes its size meanwhile.
+        MemoryError: if a single row takes more than ``memory``.
+
+    Example:
+        >>> picture = np.random.default_rng(0).integers(0, 256, (60, 40, 3), np.uint8)
+        >>> edited = np.empty_like(picture)
+        >>> stream_detail(picture, edited, torch.ones(4), num_landmarks=20, tile_rows=16)
+        >>> np.array_equal(edited, picture)
+        True
+    """
+    if tuple(target.shape) != tuple(source.shape):
+        raise ValueError(
+            f"target must have the shape of the source, {tuple(source.shape)}, got {tuple(target.shape)}; "
+            "make one of that shape"
+        )
+    rows = detail_rows(
+        source,
+        alpha,
+        kind=np.dtype(target.dtype).name,
+        residual=residual,
+        channels=channels,
+        statistics=statistics,
+        sample=sample,
+        tile_rows=tile_rows,
+        memory=memory,
+        report=report,
+        **options,
+    )
+    for part, values in rows:
+        target[part] = values.reshape(values.shape[0], *source.shape[1:])
+
+
+def detail_rows(
+    source: RowSource,
+    alpha: Tensor,
+    *,
+    kind: str,
+    residual: float | None = None,
+    channels: Literal["luminance", "all"] = "luminance",
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+    name: str = "source",
+    **options: Any,
+) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """The rows (h, W, S) of :func:`stream_detail` as dtype ``kind``, from the first to the last, as they are asked for.
+
+    Errors call the source ``name``.
+    """
+    picture = Picture(source, name)
+    check_alpha(alpha, dimensions=(1,))
+    check_choice(channels, "channels", ("luminance", "all"))
+    check_choice(statistics, "statistics", ("sample", "full"))
+    check_choice(kind, "dtype of the target", KINDS)
+    check_count(sample, "sample")
+    if residual is not None and not math.isfinite(residual):
+        raise ValueError(f"residual must be finite, got {residual}; pass a number or None")
+    if tile_rows is not None:
+        check_count(tile_rows, "tile_rows")
+    report = report or (lambda stage, done, rows: None)
+    rows = tile_rows or rows_in_memory(picture, memory, len(alpha), **options)
+    fitted = fit_picture(
+        picture,
+        len(alpha) - 1,
+        channels=channels,
+        statistics=statistics,
+        sample=sample,
+        spectral=residual is not None,
+        report=report,
+        **options,
+    )
+
+    def edit(tile: Tile) -> Tensor:
+        return _edit(tile, fitted, alpha, residual, channels)
+
+    yield from work_out(picture, edit, kind, fitted.kernel.patch_weights.shape[0] // 2, rows, report)
+
+
+@torch.no_grad()
+@full_precision
+def fit_picture(
+    picture: Picture,
+    order: int,
+    *,
+    channels: Literal["luminance", "all"],
+    statistics: Statistics,
+    sample: int,
+    spectral: bool,
+    report: Report,
+    **options: Any,
+) -> FittedFilter:
+    """The filter of a picture that is read by rows, as :func:`fit_filter` makes it of an image in memory.
+
+    ``spectral``: a residual is going to be given.
+    """
+
+    def image(colours: Tensor) -> Tensor:
+        return reduce_channels(colours, "luminance") if channels == "luminance" else colours
+
+    pilot = take_pilot(picture, image, report, **options)
+    kernel = pilot.kernel
+    if statistics == "full" or sample >= picture.pixels:
+
+        def blocks(stage: str) -> Iterator[Block]:
+            return all_blocks(picture, kernel, image, report, stage)
+    else:
+        chosen = sample_by_influence(picture, pilot, image, sample, report, spectral=spectral)
+
+        def blocks(stage: str) -> Iterator[Block]:
+            report(stage, 0, 1)
+            return chosen.blocks(kernel)
+
+    balancing = balance_by_passes(lambda: blocks("Balancing"), pilot.balancing)
+    sums = sum_up(lambda: blocks("Summing up"), balancing, order)
+    return FittedFilter(kernel, balancing, sums.coefficients(), sums.explained())
+
+
+def _edit(tile: Tile, fitted: FittedFilter, alpha: Tensor, residual: float | None, channels: str) -> Tensor:
+    """The colours (1, C, h, W) of a tile's rows under the sliders."""
+
+    def edit(image: Tensor) -> Tensor:
+        return fitted(image, alpha, tile.pixels, residual=residual, origin=tile.origin, halo=tile.halo)
+
+    if channels == "all":
+        return edit(tile.pixels)
+    return edit_luminance(tile.inner, lambda _: edit(reduce_channels(tile.pixels, "luminance")))
+
+
+def work_out(
+    picture: Picture, edit: Edit, kind: str, margin: int, rows: int, report: Report
+) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """The edited rows, a tile at a time, with the transparency that they had."""
+    for tile in picture.tiles(margin, rows):
+        report("Filtering", tile.start, picture.size[0])
+        with torch.no_grad():
+            values = stored_as(edit(tile), kind)
+        yield slice(tile.start, tile.start + len(values)), np.concatenate([values, transparency(tile, kind)], axis=2)
+    report("Filtering", picture.size[0], picture.size[0])
+
+
+def rows_in_memory(
+    picture: Picture,
+    memory: int,
+    sliders: int,
+    *,
+    num_landmarks: int = 100,
+    patch_size: int = 5,
+    guide_channels: str = "luminance",
+    **_: Any,
+) -> int:
+    """Rows of a tile that can be worked out in ``memory`` bytes.
+
+    Raises:
+        MemoryError: if there is not one.
+    """
+    check_count(num_landmarks, "num_landmarks")
+    check_count(patch_size, "patch_size")
+    planes = patch_size**2 * (picture.colours if guide_channels == "all" else 1)
+    floats = num_landmarks + planes + (3 * sliders + 8) * picture.colours
+    row = picture.size[1] * floats * (8 if picture.dtype == torch.float64 else 4)
+    if row > memory:
+        raise MemoryError(
+            f"memory must have room for a row of {picture.name} at least, {row / 1e6:.0f} MB, got {memory / 1e6:.0f} "
+            "MB; allow more, or use fewer landmarks"
+        )
+    return max(1, min(memory // (2 * row), TILE_PIXELS // picture.size[1]))

@@ -1,0 +1,156 @@
+"""Pictures that are read by rows: memory maps, arrays of zarr, files of tifffile, anything that can be sliced."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+WHITE = {"uint8": 255, "uint16": 65535}  # what integer channels hold for 1.0
+KINDS = ("uint8", "uint16", "float16", "float32", "float64")
+STATISTICS_PIXELS = 1 << 17  # in a block of a pass; the same for every size of tile, so that sums are equal to the bit
+
+
+class RowSource(Protocol):
+    """Rows (H, W) or (H, W, S) to read; a slice of them is, or can be made, a numpy array."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W) or (H, W, S)."""
+
+    @property
+    def dtype(self) -> Any:
+        """One that numpy knows."""
+
+    def __getitem__(self, rows: slice, /) -> Any:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+
+
+class RowTarget(Protocol):
+    """Rows to write, of the source's shape."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the source."""
+
+    @property
+    def dtype(self) -> Any:
+        """Decides how channels are stored: integers are clipped and rounded."""
+
+    def __setitem__(self, rows: slice, values: Any, /) -> None:
+        """Take these rows."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Some rows of a picture.
+
+    Attributes:
+        start: number of the first of them.
+        pixels: (1, C, h, W), C = 1 or 3, with the rows of the halo. Integers are scaled to [0, 1].
+        halo: how many rows more there are at the top and at the bottom.
+        stored: (h, W, S), the rows themselves as they are stored.
+    """
+
+    start: int
+    pixels: Tensor
+    halo: tuple[int, int]
+    stored: NDArray[Any]
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Row and column of the first pixel of ``pixels``."""
+        return self.start - self.halo[0], 0
+
+    @property
+    def inner(self) -> Tensor:
+        """The pixels (1, C, h, W) of the rows themselves."""
+        return self.pixels[..., self.halo[0] : self.pixels.shape[-2] - self.halo[1], :]
+
+
+class Picture:
+    """A source of rows as the colours of an image, of which no more is in memory than a few rows.
+
+    Attributes:
+        size: (H, W).
+        colours: 1 or 3; one channel more is transparency, which is not looked at.
+        dtype: in which to compute.
+    """
+
+    def __init__(self, source: RowSource, name: str = "source") -> None:
+        """Check the shape and type of ``source``, which errors call ``name``."""
+        self.source, self.name = source, name
+        shape, kind = tuple(source.shape), np.dtype(source.dtype).name
+        if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] > 4):
+            raise ValueError(
+                f"{name} must have the shape (H, W) or (H, W, S) with one to four channels, got {shape}; "
+                "move the channels to the end"
+            )
+        if kind not in KINDS:
+            raise TypeError(f"{name} must hold one of {', '.join(KINDS)}, got {kind}; convert it")
+        self.size = (int(shape[0]), int(shape[1]))
+        self.samples = int(shape[2]) if len(shape) == 3 else 1
+        self.colours = 3 if self.samples >= 3 else 1
+        self.kind = kind
+        self.dtype = torch.float64 if kind == "float64" else torch.float32
+
+    @property
+    def pixels(self) -> int:
+        """How many there are."""
+        return self.size[0] * self.size[1]
+
+    def tile(self, start: int, stop: int, margin: int) -> Tile:
+        """The rows from ``start`` to ``stop`` and up to ``margin`` more on both sides.
+
+        Raises:
+            ValueError: if the source gives other rows than it said it had, or floats that are not finite.
+        """
+        first, last = max(start - margin, 0), min(stop + margin, self.size[0])
+        stored = np.asarray(self.source[first:last])
+        wanted = (last - first, *self.source.shape[1:])
+        if stored.shape != wanted or tuple(self.source.shape[:2]) != self.size:
+            raise ValueError(
+                f"{self.name} must keep its size while it is read, {self.size[0]} rows of {self.size[1]}, but gave "
+                f"{stored.shape} for {wanted}; let nothing write to it meanwhile"
+            )
+        stored = stored.reshape(last - first, self.size[1], self.samples)
+        values: NDArray[np.floating[Any]] = stored[..., : self.colours].astype(
+            np.float64 if self.kind == "float64" else np.float32
+        )
+        if self.kind in WHITE:
+            values = values / np.float32(WHITE[self.kind])
+        elif not np.isfinite(values).all():
+            raise ValueError(f"{self.name} holds NaN or infinite pixels; replace them first")
+        planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
+        halo = (start - first, last - stop)
+        return Tile(start, planes, halo, stored[halo[0] : last - first - halo[1]])
+
+    def tiles(self, margin: int, rows: int) -> Iterator[Tile]:
+        """All rows, ``rows`` of them at once."""
+        for start in range(0, self.size[0], rows):
+            yield self.tile(start, min(start + rows, self.size[0]), margin)
+
+    @property
+    def statistics_rows(self) -> int:
+        """Rows in a block of a pass that gathers statistics."""
+        return max(1, STATISTICS_PIXELS // self.size[1])
+
+
+def stored_as(values: Tensor, kind: str) -> NDArray[Any]:
+    """Channels (1, C, h, W) as rows (h, W, C) of dtype ``kind``; integers are clipped and rounded."""
+    rows: NDArray[Any] = values[0].permute(1, 2, 0).numpy(force=True)
+    if kind in WHITE:
+        rows = np.rint(rows.clip(0, 1) * WHITE[kind])
+    return np.ascontiguousarray(rows.astype(kind))
+
+
+def transparency(tile: Tile, kind: str) -> NDArray[Any]:
+    """The channels (h, W, 0 or 1) of a tile that are no colours, as dtype ``kind``."""
+    extra = tile.stored[..., 3 if tile.stored.shape[2] >= 3 else 1 :]
+    if extra.dtype.name == kind:
+        return extra
+    values = torch.from_numpy(np.ascontiguousarray(extra.astype(np.float64)).transpose(2, 0, 1))[None]
+    return stored_as(values / WHITE.get(extra.dtype.name, 1), kind)

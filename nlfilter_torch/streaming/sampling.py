@@ -1,0 +1,283 @@
+"""A picture to the kernel of its filter and to a sample of its pixels, reading it once or twice, by rows."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlfilter_torch.bandwidth import bandwidth_of_gradient, gradients
+from nlfilter_torch.blocks import CACHED
+from nlfilter_torch.checks import check_choice, check_count, check_positive, warn
+from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, unit_window
+from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.landmarks import Sampling, candidate_pixels, condense, stratified
+from nlfilter_torch.newton import SMALLEST_AFFINITY
+from nlfilter_torch.nystrom import Affinity, Completion, nystrom_factor, whitener
+from nlfilter_torch.spectrum import CUT
+from nlfilter_torch.streaming.rows import Picture, Tile
+from nlfilter_torch.streaming.statistics import Block, start_balancing, sum_up
+
+PILOT = 1 << 17  # pixels of the first sample: their factor, 52 MB at m = 100, is balanced in memory
+CHUNK = 1 << 16  # pixels of a sample whose factor is there at once
+SKETCHED = 16  # random projections; they tell squared lengths to a third
+EVEN = 0.1  # share of a sample that is spread evenly over the picture
+
+Report = Callable[[str, int, int], None]
+Image = Callable[[Tensor], Tensor]  # colours (1, C, H, W) to what is filtered
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Some pixels of a picture.
+
+    Attributes:
+        features: (1, D, n).
+        image: (1, C, n), what is filtered.
+        weights: (1, n), how many pixels each of them stands for.
+    """
+
+    features: Tensor
+    image: Tensor
+    weights: Tensor
+
+    def blocks(self, kernel: Kernel) -> Iterator[Block]:
+        """Factor and diagonal of the sample, a chunk at a time."""
+        for features, image, weights in zip(
+            self.features.split(CHUNK, dim=2),
+            self.image.split(CHUNK, dim=2),
+            self.weights.split(CHUNK, dim=1),
+            strict=True,
+        ):
+            columns = nystrom_factor(features, kernel.landmarks, kernel.whitening, kernel.completion)
+            yield Block(*columns, image, weights)
+
+
+def all_blocks(picture: Picture, kernel: Kernel, image: Image, report: Report, stage: str) -> Iterator[Block]:
+    """Factor and diagonal of every pixel of a picture."""
+    margin = kernel.patch_weights.shape[0] // 2
+    for tile in picture.tiles(margin, picture.statistics_rows):
+        columns = kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
+        report(stage, tile.start, picture.size[0])
+        yield Block(*columns, image(tile.inner).flatten(2), torch.ones_like(columns[1]))
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A first look at a picture: its kernel, an even sample of its pixels and the balancing that they suggest.
+
+    Attributes:
+        kernel: landmarks, bandwidths and window.
+        sample: even over the picture.
+        balancing: the moment t (1, M, 1) of balancing, as the sample has it.
+        seed: for further samples.
+    """
+
+    kernel: Kernel
+    sample: Sample
+    balancing: Tensor
+    seed: int
+
+
+def take_pilot(
+    picture: Picture,
+    image: Image,
+    report: Report,
+    *,
+    patch_size: int = 5,
+    photometric_bandwidth: float | Literal["auto"] = "auto",
+    spatial_bandwidth: float | None = None,
+    num_landmarks: int = 100,
+    landmarks: Sampling = "kmeans",
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "luminance",
+    generator: torch.Generator | None = None,
+) -> Pilot:
+    """Bandwidth, landmarks and a first balancing, in one reading of the picture.
+
+    Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
+    """
+    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"))
+    check_choice(completion, "completion", ("diagonal", "none"))
+    check_count(num_landmarks, "num_landmarks")
+    window = unit_window(patch_size, None).to(picture.dtype)
+    if isinstance(photometric_bandwidth, str):
+        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
+    else:
+        check_positive(photometric_bandwidth, "photometric_bandwidth")
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth")
+    if num_landmarks > picture.pixels:
+        warn(
+            f"num_landmarks must be at most the number of pixels, {picture.pixels}, got {num_landmarks}; "
+            "using every pixel"
+        )
+        num_landmarks = picture.pixels
+
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    candidates = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
+    rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # the landmarks need what is in the generator
+    even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
+    wanted = torch.cat([candidates, even])
+    patches, values = [], []
+    slope = 0.0
+    for tile, chosen in _visit(picture, max(patch_size // 2, 1), wanted.sort().values, report, "Looking"):
+        guide = reduce_channels(tile.pixels, guide_channels)
+        patches.append(_patches(guide, tile, chosen, patch_size))
+        values.append(image(tile.inner).flatten(2)[:, :, chosen])
+        if photometric_bandwidth == "auto":
+            slope += float(gradients(guide, tile.halo).double().mean((0, 1)).sum())
+    if isinstance(photometric_bandwidth, str):
+        photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels)))
+    order = torch.empty_like(wanted)
+    order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
+    recipe = (window, photometric_bandwidth, spatial_bandwidth)
+    features = _scaled(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
+    points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
+    kernel = Kernel(*recipe, guide_channels, points, whitener(points), completion)
+    weight = picture.pixels / len(even)
+    sample = Sample(
+        features[:, :, len(candidates) :],
+        torch.cat(values, dim=2)[:, :, order[len(candidates) :]],
+        torch.full((1, len(even)), weight, dtype=picture.dtype),
+    )
+    columns = nystrom_factor(sample.features, kernel.landmarks, kernel.whitening, completion)
+    return Pilot(kernel, sample, start_balancing(*columns, weight), rest.initial_seed())
+
+
+def sample_by_influence(
+    picture: Picture, pilot: Pilot, image: Image, count: int, report: Report, *, spectral: bool
+) -> Sample:
+    """About ``count`` pixels, rare ones more likely than common ones.
+
+    A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
+    of a photograph off by two grey levels and more. The influence of a pixel is its own share of what W makes of it,
+    ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members. What
+    projects on eigenvectors (``spectral``) divides by small eigenvalues, and pixels that these depend on come in, too.
+    """
+    kernel, generator = pilot.kernel, np.random.default_rng(pilot.seed)
+    size = kernel.patch_weights.shape[0]
+    even = EVEN * count / picture.pixels
+    influence = Influence.of(pilot, spectral=spectral)
+    rate = _rate(influence(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
+    patches, values, weights, places = [], [], [], []
+    for tile in picture.tiles(size // 2, picture.statistics_rows):
+        report("Sampling", tile.start, picture.size[0])
+        guide = reduce_channels(tile.pixels, kernel.guide_channels)
+        features = kernel.features(tile.pixels, origin=tile.origin, halo=tile.halo)
+        likely = (even + rate * influence(features)).clamp(max=1.0)
+        drawn = torch.from_numpy(generator.random(likely.numel())) < likely
+        chosen = drawn.nonzero().squeeze(1)
+        patches.append(_patches(guide, tile, chosen, size))
+        values.append(image(tile.inner).flatten(2)[:, :, chosen])
+        weights.append(likely[chosen].reciprocal())
+        places.append(chosen + tile.start * picture.size[1])
+    recipe = (kernel.patch_weights, kernel.photometric_bandwidth, kernel.spatial_bandwidth)
+    features = _scaled(torch.cat(patches, dim=2), torch.cat(places), picture, *recipe)
+    return Sample(features, torch.cat(values, dim=2), torch.cat(weights).to(picture.dtype)[None])
+
+
+def _visit(picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str) -> Iterator[tuple[Tile, Tensor]]:
+    """All tiles of a pass, each with those of the sorted ``pixels`` that lie in it, as counted from its first one."""
+    width, rows = picture.size[1], picture.statistics_rows
+    for tile in picture.tiles(margin, rows):
+        report(stage, tile.start, picture.size[0])
+        bounds = torch.tensor([tile.start, tile.start + tile.stored.shape[0]]) * width
+        first, last = torch.searchsorted(pixels, bounds).tolist()
+        yield tile, pixels[first:last] - tile.start * width
+
+
+def _patches(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
+    """The patches (1, C p^2, n), without weights, around some pixels of a tile with the guide (1, C, H, W)."""
+    padded = pad_border(guide, size // 2)[..., tile.halo[0] :, :]
+    columns, stride = guide.shape[-1], padded.shape[-1]
+    corners = chosen // columns * stride + chosen % columns
+    offsets = torch.arange(size)
+    places = (offsets[:, None] * stride + offsets).reshape(-1, 1) + corners  # (p^2, n)
+    return padded[0].flatten(1)[:, places].flatten(0, 1)[None]
+
+
+def _scaled(
+    patches: Tensor,
+    pixels: Tensor,
+    picture: Picture,
+    window: Tensor,
+    photometric_bandwidth: float | Tensor,
+    spatial_bandwidth: float | Tensor | None,
+) -> Tensor:
+    """Features (1, D, n), as :func:`extract_features` gives them, from patches (1, C p^2, n) and pixels' indices."""
+    channels = patches.shape[1] // window.numel()
+    scale = (window / channels).sqrt() / torch.as_tensor(photometric_bandwidth, dtype=window.dtype)
+    features = patches * scale.reshape(1, 1, -1, 1).expand(1, channels, -1, 1).reshape(1, -1, 1)
+    if spatial_bandwidth is None:
+        return features
+    places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]]).to(features)
+    return torch.cat([features, places[None] / torch.as_tensor(spatial_bandwidth).to(features)], dim=1)
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How much single pixels matter to sums over all of them, roughly and without the whitening of every pixel.
+
+    Lengths of M-vectors are estimated from a few random projections of them, which are projections of the affinities.
+
+    Attributes:
+        kernel: whose affinities they are.
+        direction: (1, M, 1), whose product with the affinities of a pixel is ``u . t``.
+        sketches: (J k, M): k random projections of u for every measure of length.
+        scales: (J,): of the measures, which are added up.
+    """
+
+    kernel: Kernel
+    direction: Tensor
+    sketches: Tensor
+    scales: Tensor
+
+    @staticmethod
+    def of(pilot: "Pilot", *, spectral: bool) -> "Influence":
+        """The influence on W, and as much again that on projections on its eigenvectors if they are needed."""
+        kernel, generator = pilot.kernel, torch.Generator().manual_seed(pilot.seed)
+        marks = kernel.landmarks.shape[2]
+        measures = [torch.eye(marks, dtype=torch.float64)]
+        if spectral:
+            gram = sum_up(lambda: pilot.sample.blocks(kernel), pilot.balancing, 1).grams[0, 0]
+            values, vectors = torch.linalg.eigh(gram)
+            values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
+            measures.append(values.rsqrt()[:, None] * vectors.mT)
+        whitening = kernel.whitening[0].double()
+        draws = torch.randn(SKETCHED, marks, generator=generator, dtype=torch.float64) / SKETCHED**0.5
+        sketches = torch.cat([draws @ measure @ whitening for measure in measures]).to(kernel.landmarks)
+        direction = (whitening.mT @ pilot.balancing).to(kernel.landmarks)  # u . t = c . direction
+        influence = Influence(kernel, direction, sketches, torch.ones(len(measures)).to(sketches))
+        lengths = influence.measure(pilot.sample.features)
+        return replace(influence, scales=1 / lengths.mean(1))
+
+    def __call__(self, features: Tensor) -> Tensor:
+        """Of pixels with the features (1, D, n): (n,) in float64."""
+        return self.scales.double() @ self.measure(features).double()
+
+    def measure(self, features: Tensor) -> Tensor:
+        """Squared lengths (J, n) of the pixels' columns of F: ``d^2 |u|^2``, and ``F^T G^-1 F`` if that is needed."""
+        affinity = Affinity(self.kernel.landmarks, self.kernel.completion == "diagonal")
+        found = []
+        for part in features.split(CACHED, dim=2):
+            near, _ = affinity(part, features.new_empty(1, self.direction.shape[1], part.shape[2]))
+            lengths = (self.sketches @ near[0]).square().unflatten(0, (-1, SKETCHED)).sum(1)  # (J, n)
+            total = (self.direction.mT @ near)[0].clamp(min=SMALLEST_AFFINITY)
+            missed = (1 - lengths[:1]).clamp(min=0.0)
+            scaling = 2 / (total + torch.sqrt(total.square() + 4 * missed))
+            found.append(scaling.square() * lengths)
+        return torch.cat(found, dim=1)
+
+
+def _rate(influence: Tensor, weight: float, even: float, count: int) -> float:
+    """The factor of the influence at which about ``count`` pixels are drawn, from that of an even sample."""
+    low, high = 0.0, 1 / max(float(influence.min()), 1e-12)
+    for _ in range(60):
+        middle = (low + high) / 2
+        expected = weight * float((even + middle * influence).clamp(max=1.0).sum())
+        low, high = (middle, high) if expected < count else (low, middle)
+    return low

@@ -1,0 +1,129 @@
+"""Blocks of pixels to the few sums over all of them that a filter consists of, in passes, with no vector of pixels.
+
+With ``u`` the columns of the factor and ``c`` the diagonal, balancing is the equation ``t = sum_i u_i d_i(t)`` for the
+moment t (M numbers), since the scaling ``d_i`` of a pixel is a closed form of ``u_i . t`` and ``c_i``. Its Jacobian
+``I + F diag(1 / (1 + r)) F^T`` is symmetric with eigenvalues in [1, 2] and is summed up in the same pass, so that
+Newton's method needs two or three passes. With t known, one pass more gives ``G_j = F diag(r^j) F^T`` and ``b_i =
+F r^i y``, and from them all coefficients of ``W^i y = F^T c_i + r W^(i-1) y``: ``c_1 = b_0``, ``c_(i+1) = sum_j G_j
+c_(i-j) + b_i``.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.blocks import moment, pixel_blocks
+from nlfilter_torch.checks import warn
+from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.sinkhorn import balance
+from nlfilter_torch.spectrum import whiten_gram
+
+CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
+MAX_PASSES = 12
+ALARM = 1e-3
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some pixels: factor (1, M, n), diagonal (1, n), image (1, C, n), and how many pixels each stands for, (1, n)."""
+
+    factor: Tensor
+    diagonal: Tensor
+    image: Tensor
+    weights: Tensor
+
+
+Pass = Callable[[], Iterator[Block]]
+
+
+def start_balancing(factor: Tensor, diagonal: Tensor, weight: float) -> Tensor:
+    """The moment t (1, M, 1), in float64, of an image from a sample whose pixels stand for ``weight`` pixels each."""
+    # With d = e / sqrt(w) the weighted equation is that of the sample alone, for e and a smaller diagonal.
+    scaling = balance(factor, diagonal / weight, tolerance=1e-3).scaling
+    return weight**0.5 * moment(factor, scaling.unsqueeze(1))
+
+
+def balance_by_passes(blocks: Pass, total: Tensor) -> Tensor:
+    """The moment t (1, M, 1) of the pixels in ``blocks``, from a first guess ``total``."""
+    identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
+    change = float("inf")
+    for _ in range(MAX_PASSES):
+        sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1).clone()
+        tolerance = 0.0
+        for block in blocks():
+            tolerance = CONVERGED[block.factor.dtype]
+            scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor))
+            remainder = scaling * (scaling * block.diagonal)
+            sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
+            weights = scaling * (block.weights / (1 + remainder)).sqrt()
+            jacobian += _grams(block.factor, weights, remainder, 1)[:, 0]
+        step = torch.linalg.solve(jacobian, sums - total)
+        total = total + step
+        change = float(step.norm() / total.norm())
+        if change <= tolerance:
+            return total
+    if change > ALARM:
+        warn(
+            f"balancing still changed by {change:.1e} after {MAX_PASSES} passes; "
+            "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
+        )
+    return total
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What a pass over a balanced image leaves.
+
+    Attributes:
+        grams: ``F diag(r^j) F^T``, (1, J, M, M), float64.
+        moments: ``F r^i y``, (1, k, M, C), float64.
+        dtype: of the factor.
+    """
+
+    grams: Tensor
+    moments: Tensor
+    dtype: torch.dtype
+
+    def coefficients(self) -> Tensor:
+        """The c_i of ``W^i y = F^T c_i + r W^(i-1) y`` for i = 1 ... k, (1, k, M, C)."""
+        found = [self.moments[:, 0]]
+        for i in range(1, self.moments.shape[1]):
+            found.append(self.moments[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
+        return torch.stack(found, dim=1)
+
+    def explained(self) -> Tensor:
+        """The coefficients (1, M, C) of ``V V^T y``."""
+        root = whiten_gram(self.grams[:, :2], self.dtype)[0]
+        return root @ root @ self.moments[:, 0]
+
+
+def sum_up(blocks: Pass, total: Tensor, order: int) -> Sums:
+    """One pass over pixels whose balancing moment is ``total``, for the first ``order`` powers of W."""
+    grams, moments, dtype = torch.zeros(()), torch.zeros(()), total.dtype
+    for block in blocks():
+        scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor))
+        remainder = scaling * (scaling * block.diagonal)
+        grams = grams + _grams(block.factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
+        powers = [(scaling * block.weights).unsqueeze(1) * block.image]
+        for _ in range(order - 1):
+            powers.append(remainder.unsqueeze(1) * powers[-1])
+        sums = moment(block.factor, torch.cat(powers, dim=1))  # (1, M, k C)
+        moments = moments + sums.unflatten(2, (order, -1)).transpose(1, 2)
+        dtype = block.factor.dtype
+    return Sums(grams, moments, dtype)
+
+
+def _grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
+    """``F diag(r^j) F^T`` for F = factor diag(scaling) and j < count, (1, J, M, M) in float64."""
+    batch, marks, pixels = factor.shape
+    total = factor.new_zeros(batch, count, marks, marks, dtype=torch.float64)
+    for part in pixel_blocks(pixels, batch, factor.device):
+        rows = factor[:, :, part] * scaling[:, None, part]
+        weighted = rows
+        for j in range(count):
+            total[:, j] += weighted @ rows.mT
+            if j + 1 < count:
+                weighted = weighted * remainder[:, None, part]
+    return total

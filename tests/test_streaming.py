@@ -1,0 +1,275 @@
+"""Pictures that are read by rows: the same result as in memory, whatever the tiles, and errors that name their cause."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch import nonlocal_operator, polynomial_filter
+from nlfilter_torch import landmarks as landmarks_module
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.landmarks import candidate_pixels
+from nlfilter_torch.streaming import sampling, stream_detail
+from nlfilter_torch.streaming.statistics import balance_by_passes
+
+Array = NDArray[Any]
+ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
+LEVEL = 1 / 255
+
+
+def cat(height: int, width: int) -> Array:
+    """(height, width, 3) of a photograph with fur, floats in [0, 1]."""
+    return skimage.data.chelsea()[20 : 20 + height, 90 : 90 + width].astype(np.float32) / np.float32(255)
+
+
+def in_memory(picture: Array, alpha: Tensor = ALPHA, residual: float | None = None, **options: Any) -> Array:
+    """What `nlfilter-torch detail` makes of a picture that fits the memory."""
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    operator = nonlocal_operator(image, tolerance=1e-6, **options)
+    edited = edit_luminance(image, lambda planes: polynomial_filter(operator, planes, alpha, residual=residual))
+    return edited[0].permute(1, 2, 0).numpy()
+
+
+def streamed(picture: Array, alpha: Tensor = ALPHA, *, kind: str | None = None, **options: Any) -> Array:
+    edited = np.empty(picture.shape, kind or picture.dtype)
+    stream_detail(picture, edited, alpha, **options)
+    return edited
+
+
+@dataclass
+class Rows:
+    """A source that keeps an account of what is read of it, and gives only few rows at once."""
+
+    picture: Array
+    most: int
+    read: int = 0
+    shape: tuple[int, ...] = field(init=False)
+    dtype: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.shape, self.dtype = self.picture.shape, self.picture.dtype
+
+    def __getitem__(self, rows: slice) -> Array:
+        assert rows.stop - rows.start <= self.most
+        self.read += rows.stop - rows.start
+        return self.picture[rows]
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples and blocks in proportion to a small picture."""
+    monkeypatch.setattr(sampling, "PILOT", 2000)
+    monkeypatch.setattr(sampling, "CHUNK", 1500)
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 2500)
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"residual": 1.0},
+        {"spatial_bandwidth": 30.0},
+        {"landmarks": "uniform"},
+        {"landmarks": "random", "patch_size": 1},
+        {"guide_channels": "all", "photometric_bandwidth": 0.1, "patch_size": 3},
+        {"completion": "none"},
+        {"alpha": torch.tensor([2.0, 1.0])},
+        {"alpha": torch.tensor([1.5, 2.0, 0.5, 2.0, 1.0, 1.0])},
+    ],
+)
+def test_full_passes_are_the_filter_in_memory(options: dict[str, Any]) -> None:
+    picture = cat(83, 121)
+    edited = streamed(picture, statistics="full", tile_rows=7, num_landmarks=50, **options)
+    assert np.abs(edited - in_memory(picture, num_landmarks=50, **options)).max() < 1e-5
+
+
+def test_float64_is_worked_out_in_float64() -> None:
+    picture = cat(40, 50).astype(np.float64)
+    edited = streamed(picture, statistics="full", num_landmarks=40)
+    assert np.abs(edited - in_memory(picture, num_landmarks=40)).max() < 1e-7
+
+
+def test_all_channels_on_request() -> None:
+    picture = cat(50, 60)
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    operator = nonlocal_operator(image, num_landmarks=40)
+    wanted = polynomial_filter(operator, image, ALPHA)[0].permute(1, 2, 0).numpy()
+    edited = streamed(picture, statistics="full", channels="all", num_landmarks=40)
+    assert np.abs(edited - wanted).max() < 1e-5
+
+
+def test_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "PILOT", 1 << 14)
+    picture = cat(270, 350)
+    edited = streamed(picture, sample=1 << 15)
+    difference = np.abs(edited - in_memory(picture)).max()
+    assert 1e-5 < difference < LEVEL
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> None:
+    picture = sampling.Picture(cat(90, 120))
+
+    def image(colours: Tensor) -> Tensor:
+        return reduce_channels(colours, "luminance")
+
+    pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=30)
+    for spectral in (False, True):
+        chosen = sampling.sample_by_influence(picture, pilot, image, 3000, lambda *_: None, spectral=spectral)
+        assert 2500 < chosen.weights.numel() < 3500
+        assert abs(float(chosen.weights.sum()) / picture.pixels - 1) < 0.1
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("statistics", ["sample", "full"])
+def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
+    picture = cat(150, 67)
+    first, *others = (
+        streamed(picture, statistics=statistics, sample=4000, num_landmarks=50, tile_rows=rows)
+        for rows in (1, 16, 64, 4096)
+    )
+    assert max(np.abs(other - first).max() for other in others) < 1e-6
+
+
+def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 600)
+    picture = cat(90, 60)
+    source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
+    stream_detail(source, edited, ALPHA, tile_rows=10, sample=2000, num_landmarks=30)
+    assert source.read <= 3 * 90 * 14 // 10  # the pilot, the sample and the result, each with its halo
+    np.testing.assert_array_equal(edited, streamed(picture, tile_rows=10, sample=2000, num_landmarks=30))
+
+
+def test_memory_gives_the_size_of_tiles() -> None:
+    picture = cat(60, 80)
+    tiles = []
+    for memory in (100_000, 1_000_000):
+        source = Rows(picture, most=10**6)
+        stages: list[str] = []
+        stream_detail(source, np.empty_like(picture), ALPHA, memory=memory, report=lambda s, *_: stages.append(s))
+        tiles.append(stages.count("Filtering") - 1)
+    assert tiles[0] == 60 > tiles[1] > 1
+    with pytest.raises(MemoryError, match="memory must have room for a row of source"):
+        streamed(picture, memory=1000)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_ones_give_the_picture_back_with_its_transparency(kind: str, channels: int) -> None:
+    draw = np.random.default_rng(0).random((30, 20, channels))
+    picture = (draw if kind == "float32" else draw * np.iinfo(kind).max).astype(kind)
+    edited = streamed(picture, torch.ones(3), num_landmarks=20)
+    np.testing.assert_allclose(edited, picture, rtol=0, atol=2e-6 if kind == "float32" else 0)
+    if channels == 1:
+        np.testing.assert_allclose(streamed(picture[..., 0], torch.ones(3), num_landmarks=20), edited[..., 0])
+
+
+def test_depth_is_that_of_the_target() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (30, 20, 4), np.uint8)
+    deep = streamed(picture, torch.ones(2), kind="uint16", num_landmarks=20)
+    np.testing.assert_array_equal(deep, picture.astype(np.uint16) * 257)
+    floats = streamed(deep, torch.ones(2), kind="float32", num_landmarks=20)
+    np.testing.assert_allclose(floats, picture / 255.0, atol=2e-6)
+
+
+def test_equal_seeds_give_equal_pictures() -> None:
+    picture = cat(40, 60)
+
+    def edited(seed: int) -> Array:
+        return streamed(picture, sample=1000, num_landmarks=20, generator=torch.Generator().manual_seed(seed))
+
+    np.testing.assert_array_equal(edited(1), edited(1))
+    assert not np.array_equal(edited(1), edited(2))
+
+
+def test_report_tells_every_stage_and_its_end() -> None:
+    seen: list[tuple[str, int, int]] = []
+    streamed(cat(40, 60), sample=1000, num_landmarks=20, tile_rows=25, report=lambda *step: seen.append(step))
+    stages = list(dict.fromkeys(stage for stage, _, _ in seen))
+    assert stages == ["Looking", "Sampling", "Balancing", "Summing up", "Filtering"]
+    assert seen[-3:] == [("Filtering", 0, 40), ("Filtering", 25, 40), ("Filtering", 40, 40)]
+
+
+def test_random_landmarks_of_many_pixels_are_distinct(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(landmarks_module, "MANY", 400)
+    chosen = candidate_pixels((21, 20), 30, "random", torch.Generator().manual_seed(0))
+    assert len(chosen) == len(set(chosen.tolist())) == 30
+    assert 0 <= int(chosen.min()) < int(chosen.max()) < 420
+
+
+def test_more_landmarks_than_pixels_are_reduced() -> None:
+    picture = cat(5, 6)
+    with pytest.warns(UserWarning, match="at most the number of pixels, 30, got 50"):
+        edited = streamed(picture, num_landmarks=50)
+    with pytest.warns(UserWarning, match="at most the number of pixels"):
+        wanted = in_memory(picture, num_landmarks=50)
+    assert np.abs(edited - wanted).max() < 1e-5
+
+
+def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.streaming.statistics.MAX_PASSES", 1)
+    picture = sampling.Picture(cat(30, 40))
+
+    def image(colours: Tensor) -> Tensor:
+        return reduce_channels(colours, "luminance")
+
+    pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=20)
+    with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
+        balance_by_passes(lambda: pilot.sample.blocks(pilot.kernel), 9 * pilot.balancing)
+
+
+class Shrinking(Rows):
+    """A file that someone cuts short after it was looked at."""
+
+    def __getitem__(self, rows: slice) -> Array:
+        return super().__getitem__(rows)[: 5 if self.read > 40 else None]
+
+
+def test_source_that_changes_its_size_is_named() -> None:
+    source = Shrinking(cat(40, 30), most=100)
+    with pytest.raises(ValueError, match="source must keep its size while it is read, 40 rows of 30"):
+        stream_detail(source, np.empty_like(source.picture), ALPHA, num_landmarks=20, tile_rows=10)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "error", "message"),
+    [
+        (lambda p: p[..., :0], {}, ValueError, r"source must have the shape \(H, W\) or \(H, W, S\)"),
+        (lambda p: np.concatenate([p, p], axis=2), {}, ValueError, "one to four channels"),
+        (lambda p: p.astype(np.int32), {}, TypeError, "source must hold one of uint8, .* got int32"),
+        (lambda p: np.where(p > 0.5, np.nan, p), {}, ValueError, "source holds NaN or infinite pixels"),
+        (lambda p: p, {"statistics": "some"}, ValueError, "statistics must be one of"),
+        (lambda p: p, {"channels": "red"}, ValueError, "channels must be one of"),
+        (lambda p: p, {"sample": 0}, ValueError, "sample must be at least 1"),
+        (lambda p: p, {"tile_rows": 0}, ValueError, "tile_rows must be at least 1"),
+        (lambda p: p, {"residual": float("nan")}, ValueError, "residual must be finite"),
+        (lambda p: p, {"alpha": torch.ones(1, 3)}, ValueError, "alpha must have shape"),
+        (lambda p: p, {"num_landmarks": 0}, ValueError, "num_landmarks must be at least 1"),
+        (lambda p: p, {"photometric_bandwidth": -1.0}, ValueError, "photometric_bandwidth must be positive"),
+        (lambda p: p, {"photometric_bandwidth": "wide"}, ValueError, "photometric_bandwidth must be one of"),
+        (lambda p: p, {"spatial_bandwidth": 0.0}, ValueError, "spatial_bandwidth must be positive"),
+        (lambda p: p, {"landmarks": "best"}, ValueError, "landmarks must be one of"),
+        (lambda p: p, {"completion": "all"}, ValueError, "completion must be one of"),
+        (lambda p: p, {"guide_channels": "red"}, ValueError, "guide_channels must be one of"),
+        (lambda p: p, {"patch_size": 4}, ValueError, "patch_size must be odd"),
+        (lambda p: p, {"tolerance": 1e-3}, TypeError, "tolerance"),
+    ],
+)
+def test_what_cannot_be_used_is_named(change: Any, options: dict[str, Any], error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        streamed(change(cat(20, 30)), **options)
+
+
+def test_target_must_fit() -> None:
+    picture = cat(20, 30)
+    with pytest.raises(ValueError, match="target must have the shape of the source"):
+        stream_detail(picture, np.empty((20, 30), np.float32), ALPHA)
+    with pytest.raises(ValueError, match="dtype of the target must be one of"):
+        stream_detail(picture, np.empty((20, 30, 3), np.int64), ALPHA)
