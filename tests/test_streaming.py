@@ -1,4 +1,4 @@
-"""Pictures that are read by rows: the same result as in memory, whatever the tiles, and errors that name their cause."""
+"""Pictures that are read by rows: the result of one in memory, whatever the tiles, and errors that name their cause."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch import landmarks as landmarks_module
+from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.landmarks import candidate_pixels
@@ -149,13 +149,13 @@ def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_memory_gives_the_size_of_tiles() -> None:
     picture = cat(60, 80)
-    tiles = []
-    for memory in (100_000, 1_000_000):
-        source = Rows(picture, most=10**6)
+
+    def tiles(memory: int) -> int:
         stages: list[str] = []
-        stream_detail(source, np.empty_like(picture), ALPHA, memory=memory, report=lambda s, *_: stages.append(s))
-        tiles.append(stages.count("Filtering") - 1)
-    assert tiles[0] == 60 > tiles[1] > 1
+        streamed(picture, memory=memory, report=lambda stage, *_: stages.append(stage))
+        return stages.count("Filtering") - 1
+
+    assert tiles(100_000) == 60 > tiles(1_000_000) > 1
     with pytest.raises(MemoryError, match="memory must have room for a row of source"):
         streamed(picture, memory=1000)
 
