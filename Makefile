@@ -59,9 +59,14 @@ bench-quick: $(VENV)/.installed-test
 train: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.train_denoiser --out out/denoiser
 
-# The pictures of the README.
+# The pictures of the README and of the pages of docs.
 pictures: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.detail_pictures docs
+	$(BIN)/python -m benchmarks.guide_pictures docs/pictures
+
+# The documentation as a website in out/docs; whatever its generator would warn of is an error.
+docs: $(VENV)/.installed-test
+	$(BIN)/python -m sphinx -E -W --keep-going -b html -d out/doctrees docs out/docs
 
 # Every notebook from the script it is paired with; those with pictures, run, are put into out/notebooks.
 notebooks: $(VENV)/.installed-test

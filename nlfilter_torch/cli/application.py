@@ -8,6 +8,8 @@ import typer
 
 from nlfilter_torch import __version__
 from nlfilter_torch.cli.abstract import abstract
+from nlfilter_torch.cli.app import app as app_verb
+from nlfilter_torch.cli.apply import apply
 from nlfilter_torch.cli.batch import batch
 from nlfilter_torch.cli.colorize import colorize
 from nlfilter_torch.cli.defocus import defocus
@@ -25,6 +27,7 @@ from nlfilter_torch.cli.tone import tone
 NAME = "nlfilter-torch"
 
 app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app.command(name="app")(app_verb)
 app.command()(detail)
 app.command()(sharpen)
 app.command()(tone)
@@ -33,6 +36,7 @@ app.command()(recolor)
 app.command()(colorize)
 app.command()(defocus)
 app.command()(abstract)
+app.command()(apply)
 app.command()(fit)
 app.command()(presets)
 app.command()(batch)

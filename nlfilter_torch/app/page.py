@@ -1,0 +1,360 @@
+"""The editor's page: a large picture, the controls beside it, and what happens when one of them is moved."""
+
+import asyncio
+import secrets
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from nicegui import events, ui
+
+from nlfilter_torch.app import drawing
+from nlfilter_torch.app.panel import BRUSHES, Brush, Panel
+from nlfilter_torch.app.session import Session
+from nlfilter_torch.app.style import CSS
+from nlfilter_torch.brush import Stroke
+from nlfilter_torch.recipe import Recipe
+
+EXPECTED = (ValueError, OSError, MemoryError)  # of a file or a value that cannot be used; their text says why
+PATIENCE = 0.3  # seconds until the page says that it is at work
+INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # response of the sliders in the region, and elsewhere
+EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
+
+
+class Editor:
+    """One tab of the browser and the session that it shows.
+
+    Args:
+        session: of editing.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.brush = Brush()
+        self.pictures: dict[str, bytes] = {}
+        self._token = secrets.token_urlsafe(16)
+        self._frame = 0
+        self._step = "detail"  # whose controls are shown
+        self._line: list[tuple[float, float]] = []  # of the stroke that is being painted
+        self._wanted: list[str | None] = []  # the last step of the picture to draw next; the newest counts
+        self._drawing = False
+        self._jobs: set[asyncio.Future[None]] = set()
+
+    def build(self, image: Path | None) -> None:
+        """Lay the page out, and open a photograph if there is one."""
+        EDITORS[self._token] = self
+        self._client = ui.context.client
+        self._client.on_delete(lambda: EDITORS.pop(self._token, None))
+        ui.add_css(CSS)
+        self._build_header()
+        with ui.element("div").classes("desk"):
+            with ui.element("div").classes("easel"):
+                self._build_picture()
+            with ui.column().classes("panel"):
+                self._panel = Panel(self)
+        ui.keyboard(on_key=self._key)
+        if image is not None:
+            self._client.on_connect(lambda: self._begin(image))
+
+    @property
+    def recipe(self) -> Recipe:
+        """The edit as it is."""
+        return self.session.recipe
+
+    # Layout
+
+    def _build_header(self) -> None:
+        with ui.header().classes("items-center no-wrap q-px-md q-py-none topbar"):
+            ui.label("nlfilter-torch").classes("text-weight-medium text-body1")
+            self._title = ui.label("").classes("hint q-ml-sm")
+            ui.space()
+            with ui.row().classes("items-center gap-2 no-wrap") as self._working:
+                ui.spinner(size="20px", color="white")
+                self._doing = ui.label("").classes("hint")
+            self._working.set_visibility(False)
+            photographs = self._upload(self._take_photograph, "image/*")
+            presets = self._upload(self._take_preset, ".json,application/json")
+            _button("Open", "folder_open", "A PNG, JPEG, TIFF or WebP file", js=_pick(photographs))
+            _button("Undo", "undo", "Ctrl+Z", self._undo)
+            _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
+            _button("Load edit", "tune", "An edit saved before, or sliders that fit found", js=_pick(presets))
+            _button("Save edit", "bookmark_add", "For other photographs, and for the command line", self._ask_edit_name)
+            _button("Save photo", "save", "At full size, into a file", self._ask_photo_name).props(
+                "color=primary unelevated", remove="flat"
+            )
+
+    @staticmethod
+    def _upload(action: Callable[[events.UploadEventArguments], Awaitable[None]], accept: str) -> ui.upload:
+        upload = ui.upload(auto_upload=True, on_upload=action)
+        return upload.props(f'accept="{accept}"').classes("hidden")
+
+    def _build_picture(self) -> None:
+        with ui.element("div").classes("canvas"):
+            with ui.element("div").classes("welcome") as self._welcome:
+                ui.icon("photo", size="64px")
+                ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
+                ui.label("PNG, JPEG, TIFF or WebP. It stays on this machine.").classes("hint")
+            self._photo = ui.interactive_image(
+                events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
+            ).classes("photo")
+            with self._photo:
+                self._mask = ui.element("img").classes("over mask").props('alt="mask"')
+                self._before = ui.element("img").classes("over before").props('alt="before"')
+                ui.element("div").classes("edge")
+                ui.label("before").classes("tag")
+            # A pointer that hovers is no news; one that paints is.
+            self._photo.on(
+                "mouse",
+                lambda event: self._pointer(*event.args),
+                js_handler="(e) => { if (e.buttons || e.mouse_event_type != 'pointermove') "
+                "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
+            )
+        self._photo.set_visibility(False)
+        self._welcome.on("pointerdown", lambda: self._complain("open a photograph first; there is nothing to paint on"))
+        with ui.row().classes("bar"):
+            ui.label("Before").classes("hint")
+            wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
+            wipe.props('dense aria-label="Before and after"')
+            wipe.on("update:model-value", js_handler="(v) => document.documentElement.style.setProperty('--wipe', v)")
+            self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self._draw_strokes).props("dense")
+            self._show_mask = ui.checkbox("Mask", value=True, on_change=lambda: self._draw_mask()).props("dense")
+            ui.space()
+            self._size = ui.label("").classes("hint")
+
+    # Changes
+
+    def change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
+        """Change entries of a step; ``complete`` when the pointer has let go."""
+        self.session.set(step, **entries)
+        if complete:
+            self.session.commit()
+            self._panel.follow()
+        self._redraw(None if complete else step)
+
+    def switch(self, step: str) -> None:
+        """Show another step's strokes."""
+        self._step = step
+        self._draw_strokes()
+        self._draw_mask()
+
+    def _undo(self) -> None:
+        if self.session.undo():
+            self._panel.follow()
+            self._redraw()
+
+    def _redo(self) -> None:
+        if self.session.redo():
+            self._panel.follow()
+            self._redraw()
+
+    def _key(self, event: events.KeyEventArguments) -> None:
+        if event.action.keydown and event.modifiers.ctrl and str(event.key).lower() == "z":
+            self._redo() if event.modifiers.shift else self._undo()
+
+    def _pointer(self, kind: str, x: float, y: float) -> None:
+        """A stroke begins, goes on, or ends."""
+        if self._step not in BRUSHES or self.session.opened is None:
+            return
+        if kind == "pointerdown":
+            self._line = [(x, y)]
+        elif not self._line:
+            return
+        elif kind == "pointermove":
+            self._line.append((x, y))
+        else:
+            line, self._line = self._line, []
+            self.session.add_stroke(self._step, line, self.brush.radius[self._step], self.brush.paint(self._step))
+            self._panel.follow()
+            self._redraw()
+        self._draw_strokes()
+
+    # Pictures
+
+    def _redraw(self, upto: str | None = None) -> None:
+        """Draw the picture anew, as soon as the one that is being drawn is done."""
+        self._draw_strokes()
+        if self.session.opened is None:
+            return
+        self._wanted = [upto]
+        if not self._drawing:
+            self._start(self._keep_drawing())
+
+    async def _keep_drawing(self) -> None:
+        self._drawing = True
+        try:
+            while self._wanted:
+                upto = self._wanted.pop()
+                await self._run("Working", partial(self._draw, upto))
+                self._show("after", self._photo)
+                self._draw_response()
+                self._draw_mask(moving=upto is not None)
+        finally:
+            self._drawing = False
+
+    def _draw(self, upto: str | None) -> None:
+        self.pictures["after"] = drawing.picture(self.session.render(upto))
+        mask = self.session.preview.mask(self.recipe.detail)
+        self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
+
+    def _show(self, kind: str, element: ui.element) -> None:
+        self._frame += 1
+        address = f"/picture/{self._token}/{kind}?{self._frame}"
+        if isinstance(element, ui.interactive_image):
+            element.set_source(address)
+        else:
+            element.props(f'src="{address}"')
+
+    def _draw_mask(self, *, moving: bool = False) -> None:
+        """Show the mask, but not over a picture that someone is looking at while moving a slider."""
+        shown = bool(self._show_mask.value and self._step == "detail" and self.pictures.get("mask")) and not moving
+        if shown:
+            self._show("mask", self._mask)
+        self._mask.set_visibility(shown)
+
+    def _draw_strokes(self) -> None:
+        strokes: tuple[Stroke, ...] = ()
+        if self.session.opened is not None and self._show_strokes.value:
+            strokes = getattr(self.recipe, self._step).strokes
+            if self._line:
+                height, width = self.session.preview.size
+                points = tuple((x / width, y / height) for x, y in self._line)
+                strokes += (Stroke(points, self.brush.radius[self._step], self.brush.paint(self._step)),)
+            self._photo.set_content(drawing.strokes_svg(strokes, self.session.preview.size))
+
+    def _draw_response(self) -> None:
+        detail = self.recipe.detail
+        curves = [(OUTSIDE, detail.alpha), *([(INSIDE, detail.inside)] if detail.has_region() else [])]
+        self._panel.draw_response(drawing.response_svg(self.session.preview.layers(detail).eigenvalues, curves))
+
+    # Files
+
+    def _begin(self, image: Path) -> None:
+        if self.session.opened is None:  # a browser that comes back finds its edit as it was
+            self._start(self._open(lambda: self.session.open(image)))
+
+    async def _take_photograph(self, event: events.UploadEventArguments) -> None:
+        content = await event.file.read()
+        event.sender.run_method("reset")
+        self._start(self._open(lambda: self.session.open_bytes(content, event.file.name)))
+
+    async def _open(self, read: Callable[[], None]) -> None:
+        await self._run("Opening", read)
+        opened, preview = self.session.opened, self.session.preview
+        if opened is None:
+            return
+        height, width = opened.photograph.pixels.shape[-2:]
+        self._title.set_text(opened.name)
+        self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
+        self._photo.style(f"width: min(100%, calc((100vh - 130px) * {preview.size[1] / preview.size[0]:.4f}))")
+        self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
+        self._show("before", self._before)
+        self._show("before", self._photo)
+        self._welcome.set_visibility(False)
+        self._photo.set_visibility(True)
+        self._panel.follow()
+        self._redraw()
+
+    async def _take_preset(self, event: events.UploadEventArguments) -> None:
+        content = await event.file.read()
+        event.sender.run_method("reset")
+        try:
+            self.session.load_preset(content, event.file.name)
+        except EXPECTED as error:
+            self._complain(str(error))
+            return
+        self._panel.follow()
+        self._redraw()
+
+    async def _ask_photo_name(self) -> None:
+        if self.session.opened is None:
+            self._complain("open a photograph first; there is nothing to save")
+            return
+        await self._ask("Save the photograph", self.session.suggested_name(), self.session.save)
+
+    async def _ask_edit_name(self) -> None:
+        name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
+        await self._ask("Save the edit", f"{name}.json", self.session.save_preset)
+
+    async def _ask(self, title: str, name: str, save: Callable[[str], Path]) -> None:
+        """Ask for a name, and whether a file of that name may go, and save."""
+        with self._client, ui.dialog() as dialog, ui.card().classes("dialog"):
+            ui.label(title).classes("text-h6")
+            field = ui.input("Name", value=name).props("outlined autofocus").classes("w-full")
+            note = ui.label(f"In {self.session.folder.resolve()}").classes("hint")
+            with ui.row().classes("w-full justify-end"):
+                ui.button("Cancel", on_click=lambda: dialog.submit(None)).props("flat no-caps")
+                ok = ui.button("Save").props("unelevated no-caps color=primary")
+
+            def confirm() -> None:
+                try:
+                    exists = self.session.target(field.value).exists()
+                except EXPECTED as error:
+                    note.set_text(str(error))
+                    return
+                if exists and ok.text != "Replace":
+                    ok.set_text("Replace")
+                    note.set_text("A file of that name is there already.")
+                    return
+                dialog.submit(field.value)
+
+            field.on_value_change(lambda: ok.set_text("Save"))
+            field.on("keydown.enter", confirm)
+            ok.on_click(confirm)
+        chosen = await dialog
+        dialog.delete()
+        if chosen is not None:
+            self._start(self._save(save, chosen))
+
+    async def _save(self, save: Callable[[str], Path], name: str) -> None:
+        path: Path = await self._run("Saving", lambda: save(name))
+        with self._client:
+            ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
+
+    # Work
+
+    def _start(self, work: Awaitable[None]) -> None:
+        """Do something beside what the page does, and say so if it fails."""
+        job = asyncio.ensure_future(work)
+        self._jobs.add(job)
+        job.add_done_callback(self._finish)
+
+    def _finish(self, job: asyncio.Future[None]) -> None:
+        self._jobs.discard(job)
+        error = None if job.cancelled() else job.exception()
+        if isinstance(error, EXPECTED):
+            self._complain(str(error))
+        elif error is not None:
+            self._complain("this failed, and it is not your fault; the terminal that runs the editor shows more")
+            raise error  # for the log
+
+    def _complain(self, sentence: str) -> None:
+        with self._client:
+            ui.notify(sentence, type="negative", position="top", timeout=10000, close_button="OK", multi_line=True)
+
+    async def _run(self, doing: str, work: Callable[[], Any]) -> Any:
+        """Do something in a thread; the page says so if it takes its time."""
+        task = asyncio.ensure_future(asyncio.to_thread(work))
+        done, _ = await asyncio.wait({task}, timeout=PATIENCE)
+        if not done:
+            self._doing.set_text(f"{doing}\u2026")
+            self._working.set_visibility(True)
+            await asyncio.wait({task})
+            self._working.set_visibility(False)
+        return task.result()
+
+
+def _button(
+    label: str, icon: str, tip: str, action: Callable[[], Any] | None = None, *, js: str | None = None
+) -> ui.button:
+    button = ui.button(label, icon=icon, on_click=action).props("flat no-caps dense color=white").classes("q-px-sm")
+    if js is not None:
+        button.on("click", js_handler=js)
+    with button:
+        ui.tooltip(tip)
+    return button
+
+
+def _pick(upload: ui.upload) -> str:
+    """JavaScript that lets the user choose a file for an upload."""
+    return f"() => getElement({upload.id}).$refs.qRef.pickFiles()"

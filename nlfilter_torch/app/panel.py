@@ -1,0 +1,205 @@
+"""The controls beside the picture, a tab for each step of an edit."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from nicegui import ui
+
+from nlfilter_torch.app import controls
+from nlfilter_torch.app.controls import Control, Slider
+from nlfilter_torch.presets import PRESETS, PURPOSES
+from nlfilter_torch.recipe import STEPS, Recipe
+from nlfilter_torch.steps import Detail
+
+COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
+INTRO = {
+    "detail": "Paint on what is to have sliders of its own; all that looks like it follows.",
+    "recolor": "Choose a colour and paint a little of it on a thing; its likes take it.",
+    "colorize": "For grey photographs: paint some colours, and they spread over what looks alike nearby.",
+    "defocus": "Paint some of what is to stay sharp; what is unlike it or far away is blurred.",
+    "abstract": "A painting of the photograph: flat areas with clear outlines.",
+}
+BRUSHES: dict[str, dict[str, str]] = {
+    "detail": {"in": "Edit this", "out": "Not this"},
+    "recolor": {"colour": "Paint", "keep": "Keep as it is"},
+    "colorize": {"colour": "Paint"},
+    "defocus": {"in": "Keep sharp"},
+}
+BANDWIDTH = 20.0  # grey levels, to begin with where the photograph is not asked
+
+
+@dataclass
+class Brush:
+    """What the pointer paints with, for each step.
+
+    Attributes:
+        word: of the stroke; ``colour`` paints with :attr:`colour`.
+        radius: as a share of the short side.
+        colour: for all steps that take one.
+    """
+
+    word: dict[str, str] = field(default_factory=lambda: {step: next(iter(words)) for step, words in BRUSHES.items()})
+    radius: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BRUSHES, 0.02))
+    colour: str = COLOURS[0]
+
+    def paint(self, step: str) -> str:
+        """What a stroke for a step says."""
+        return self.colour if self.word[step] == "colour" else self.word[step]
+
+
+class Desk(Protocol):
+    """What the panel needs of the page."""
+
+    brush: Brush
+
+    @property
+    def recipe(self) -> Recipe:
+        """The edit as it is."""
+        ...
+
+    def change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
+        """Change entries of a step; ``complete`` when the pointer has let go."""
+        ...
+
+    def switch(self, step: str) -> None:
+        """Show another step's strokes."""
+        ...
+
+
+class Panel:
+    """Tabs with sliders, brushes and presets; built into the element that is open.
+
+    Args:
+        desk: the page.
+    """
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        self._following = False
+        self._sliders: list[Slider] = []
+        self._layout: tuple[int, bool] = (0, False)
+        with ui.tabs(on_change=lambda event: desk.switch(event.value)).classes("w-full") as tabs:
+            tabs.props("dense no-caps align=justify")
+            for step in STEPS:
+                ui.tab(step, label=step.capitalize())
+        with ui.tab_panels(tabs, value="detail", animated=False, keep_alive=True).classes("w-full bg-transparent"):
+            for step in STEPS:
+                with ui.tab_panel(step).classes("gap-1"):
+                    if step == "detail":
+                        self._build_detail()
+                    else:
+                        ui.label(INTRO[step]).classes("hint")
+                        self._sliders += [self._slider(control) for control in controls.OF_STEP[step]]
+                        self._build_brush(step)
+        self.follow()
+
+    def follow(self) -> None:
+        """Show the edit as it is."""
+        detail = self._desk.recipe.detail
+        self._following = True
+        if self._layout != (len(detail.alpha), detail.has_region()):
+            self._layout = (len(detail.alpha), detail.has_region())
+            self._build_detail_sliders(detail)
+        for slider in (*self._sliders, *self._detail_sliders):
+            slider.follow()
+        automatic = isinstance(detail.bandwidth, str)
+        self._automatic.set_value(automatic)
+        self._bandwidth.set_visibility(not automatic)
+        if not isinstance(detail.bandwidth, str):
+            self._bandwidth.set_value(detail.bandwidth)
+        self._following = False
+
+    def draw_response(self, svg: str) -> None:
+        """Show the response of the sliders."""
+        self._response.set_content(svg)
+
+    def _slider(self, control: Control, suffix: str = "") -> Slider:
+        return Slider(control, lambda: self._desk.recipe, self._desk.change, suffix)
+
+    def _build_detail(self) -> None:
+        names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
+        self._presets = ui.select(names, label="Start from", on_change=lambda event: self._choose(event.value))
+        self._presets.props('dense outlined options-dense aria-label="Preset"').classes("w-full")
+        self._box = ui.column().classes("w-full gap-1")
+        self._response = ui.html("", sanitize=False).classes("w-full q-mt-sm")
+        self._response.tooltip("What the sliders do to each eigenvalue of the filter; each dot is one of them.")
+        with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):
+            label = ui.label("Detail is").classes("text-no-wrap")
+            label.tooltip(
+                "How different two spots may be and still count as alike, in grey levels of 255. Small values touch "
+                "fine texture only, large ones treat much as detail."
+            )
+            self._automatic = ui.checkbox("as the photo suggests", value=True).props("dense")
+            self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
+            self._bandwidth = ui.slider(min=2, max=80, step=1, value=BANDWIDTH)
+            self._bandwidth.props('dense label aria-label="Bandwidth"').classes("col")
+            self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
+        self._build_brush("detail")
+
+    def _build_detail_sliders(self, detail: Detail) -> None:
+        self._box.clear()
+        self._detail_sliders = []
+        with self._box:
+            if detail.has_region():
+                ui.label("In the region").classes("group")
+                inside = controls.detail_sliders("inside", len(detail.inside))
+                self._detail_sliders += [self._slider(control, " in the region") for control in inside]
+                self._detail_sliders.append(self._slider(controls.SPREAD))
+                ui.label("Elsewhere").classes("group")
+            outside = controls.detail_sliders("alpha", len(detail.alpha))
+            self._detail_sliders += [self._slider(control) for control in outside]
+
+    def _build_brush(self, step: str) -> None:
+        if step not in BRUSHES:
+            return
+        brush = self._desk.brush
+        ui.label("Brush").classes("group")
+        if step == "detail":
+            ui.label(INTRO[step]).classes("hint")
+        with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
+            words = ui.toggle(BRUSHES[step], value=brush.word[step]).props("dense no-caps unelevated")
+            words.on_value_change(lambda event: brush.word.update({step: event.value}))
+            ui.space()
+            clear = ui.button("Clear strokes", on_click=lambda: self._desk.change(step, {"strokes": ()}, True))
+            clear.props("flat dense no-caps")
+        if "colour" in BRUSHES[step]:
+            self._build_colours(brush)
+        with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):
+            ui.label("Size").tooltip("Radius of the brush, in hundredths of the short side")
+            size = ui.slider(min=0.5, max=10, step=0.5, value=100 * brush.radius[step])
+            size.props('dense label aria-label="Brush size"')
+            size.on_value_change(lambda event: brush.radius.update({step: event.value / 100}))
+
+    @staticmethod
+    def _build_colours(brush: Brush) -> None:
+        def choose(value: object) -> None:
+            if isinstance(value, str) and len(value) == 7 and value.startswith("#"):
+                brush.colour = value.lower()
+
+        field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: choose(event.value))
+        field.props("dense outlined").classes("w-full q-mt-xs")
+        with ui.row().classes("gap-2 q-mt-xs"):
+            for colour in COLOURS:
+                ui.button(on_click=_setter(field.set_value, colour)).props(
+                    f'round dense unelevated size=sm aria-label="{colour}"'
+                ).style(f"background: {colour} !important")
+
+    def _choose(self, name: str | None) -> None:
+        if name is None:
+            return
+        self._presets.set_value(None)  # so that the same one can be chosen again
+        found = Detail.of(PRESETS[name])
+        entries = {entry: getattr(found, entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
+        entries["inside"] = self._desk.recipe.detail.inside
+        if len(found.alpha) != len(entries["inside"]):
+            entries["inside"] = found.inside
+        self._desk.change("detail", entries, True)
+
+    def _set_bandwidth(self, value: float | str) -> None:
+        if not self._following:
+            self._desk.change("detail", {"bandwidth": value}, True)
+
+
+def _setter(function: Callable[[str], object], value: str) -> Callable[[], object]:
+    return lambda: function(value)

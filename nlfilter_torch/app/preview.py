@@ -1,0 +1,234 @@
+"""A small picture that shows what an edit makes of a large photograph, quickly enough to move a slider by.
+
+A filter of a reduced picture is another filter: its patches are larger parts of the scene, and neighbouring pixels
+differ by more. The preview therefore takes every n-th patch of the photograph itself, and filters the reduced picture
+by how alike those are. Against the reduced result of the whole photograph, that halves the error of the other way.
+
+Whatever is slow is held here, each with the settings that it came from: the layers that the sliders weigh, the spectrum
+that masks come from, and the picture after each further step.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.bandwidth import estimate_bandwidth
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, unit_window
+from nlfilter_torch.filtering import detail_layers
+from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.landmarks import choose_landmarks
+from nlfilter_torch.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.sinkhorn import balance
+from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.steps import Detail, Step
+
+PIXELS = 1_000_000  # of a preview, at most
+MASK_BANDWIDTH = 25 / 255  # of the masks of nlfilter_torch.edits.enhance
+
+
+def stride_for(height: int, width: int, pixels: int = PIXELS) -> int:
+    """Every how many pixels a preview has one, so that it has no more than ``pixels``.
+
+    >>> stride_for(4000, 6000), stride_for(600, 800)
+    (5, 1)
+    """
+    return max(1, math.ceil(math.sqrt(height * width / pixels)))
+
+
+def reduce(image: Tensor, stride: int) -> Tensor:
+    """Means over squares of ``stride`` pixels, (B, C, H // stride, W // stride)."""
+    return F.avg_pool2d(image, stride) if stride > 1 else image
+
+
+def sampled_operator(
+    guide: Tensor, stride: int, detail: Detail, *, bandwidth: float | Tensor, channels: GuideChannels, patch_size: int
+) -> NonlocalOperator:
+    """The filter of every ``stride``-th pixel of a guide, by the patches around it in the guide itself.
+
+    With ``stride`` 1 it is :func:`nonlocal_operator`, and with any other a sample of it: the same pixels are alike.
+    """
+    generator = torch.Generator().manual_seed(0)
+    if stride == 1:
+        return nonlocal_operator(
+            guide,
+            patch_size=patch_size,
+            photometric_bandwidth=bandwidth,
+            spatial_bandwidth=detail.spatial_bandwidth,
+            num_landmarks=detail.landmarks,
+            landmarks=detail.sampling,  # type: ignore[arg-type]  # checked there
+            guide_channels=channels,
+            generator=generator,
+        )
+    weights = unit_window(patch_size, None).to(guide)
+    reduced = reduce_channels(guide, channels)
+    size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
+    # The sample of a square is the pixel in its middle.
+    first, margin = (stride - 1) // 2, patch_size // 2
+    padded = pad_border(reduced, margin)[..., first:, first:]
+    patches = F.unfold(padded, patch_size, stride=stride).unflatten(1, (reduced.shape[1], -1))  # (1, C, p^2, L)
+    rows = (padded.shape[-2] - patch_size) // stride + 1
+    patches = patches.unflatten(3, (rows, -1))[..., : size[0], : size[1]].flatten(3)
+    scale = (weights.flatten() / reduced.shape[1]).sqrt() / torch.as_tensor(bandwidth).to(guide).reshape(-1, 1)
+    features = (patches * scale.view(1, 1, -1, 1)).flatten(1, 2)  # (1, C p^2, N)
+    if detail.spatial_bandwidth is not None:
+        axes = [torch.arange(n, dtype=guide.dtype) * stride / detail.spatial_bandwidth for n in size]
+        features = torch.cat([features, torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(1)[None]], dim=1)
+    count = min(detail.landmarks, features.shape[2])
+    points = choose_landmarks(features, size, count, detail.sampling, generator)  # type: ignore[arg-type]
+    kernel = Kernel(
+        weights, bandwidth, detail.spatial_bandwidth, channels, points, whitener(points), completion="diagonal"
+    )
+    factor, diagonal = nystrom_factor(features, points, kernel.whitening, kernel.completion)
+    balancing = balance(factor, diagonal)
+    return NonlocalOperator(factor, diagonal, balancing.scaling, size, kernel, balancing.residual, balancing.steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What the detail sliders weigh: layers (1, k+1, 1, h, w) of the luminance, and the filter's eigenvalues (R,)."""
+
+    key: tuple[object, ...]
+    layers: Tensor
+    eigenvalues: Tensor
+
+
+class MaskMaker:
+    """:func:`diffusion_mask` for one region after the other of the same picture, at a fraction of its time.
+
+    The squared distance of pixels to a region's mean is a quadratic form of their columns of the factor: with the norms
+    held, a new region costs one product of the factor with a vector.
+    """
+
+    def __init__(self, spectrum: Spectrum, key: tuple[object, ...]) -> None:
+        self.key = key
+        self._spectrum = spectrum
+        self._time: float | None = None
+
+    def _prepare(self, time: float) -> None:
+        """Hold the quadratic form and the norms for a diffusion time."""
+        if time == self._time:
+            return
+        spectrum = self._spectrum
+        core = spectrum.gain(lambda eigenvalues: eigenvalues.pow(2 * time)).to(spectrum.factor)
+        self._norms = torch.cat(
+            [(block * (core @ block)).sum(1) for block in spectrum.factor.split(1 << 15, dim=2)], dim=1
+        )
+        self._norms *= spectrum.scaling.square()  # |x_i|^2 of the diffusion map, (1, N)
+        self._core, self._time = core, time
+
+    def _distances(self, region: Tensor) -> Tensor:
+        """Squared distances (1, N) of all pixels to the mean of a region (1, 1, h, w)."""
+        spectrum = self._spectrum
+        weights = region.flatten() / region.sum()
+        inside = weights.nonzero().squeeze(1)
+        mean = spectrum.factor[:, :, inside] @ (weights * spectrum.scaling[0])[inside].unsqueeze(1)  # (1, M, 1)
+        product = (mean.mT @ self._core) @ spectrum.factor  # (1, 1, N)
+        square = mean.mT @ self._core @ mean
+        return (self._norms - 2 * product[:, 0] * spectrum.scaling + square[:, 0]).clamp(min=0.0)
+
+    def mask(self, region: Tensor, negative: Tensor | None, time: float, width: float = 4.0) -> Tensor:
+        """The mask (1, 1, h, w) of a region; arguments as those of :func:`diffusion_mask`."""
+        self._prepare(time)
+        scale = region.numel() / width
+        exponents = scale * self._distances(region)
+        mask = torch.exp(-exponents.clamp(max=60.0))
+        if negative is not None:
+            mask = mask * torch.sigmoid((scale * self._distances(negative) - exponents).clamp(min=-20.0))
+        return mask.view_as(region)
+
+
+class Preview:
+    """A photograph, reduced, under any edit.
+
+    Args:
+        photograph: (1, C, H, W), in [0, 1] but for files of floats.
+        pixels: of the preview, at most.
+    """
+
+    def __init__(self, photograph: Tensor, pixels: int = PIXELS) -> None:
+        self.stride = stride_for(photograph.shape[-2], photograph.shape[-1], pixels)
+        self.photograph = photograph
+        self.pixels = reduce(photograph.float(), self.stride)
+        self._layers: Layers | None = None
+        self._masks: MaskMaker | None = None
+        self._mask: tuple[tuple[object, ...], Tensor] | None = None
+        self._steps: dict[int, tuple[object, Tensor]] = {}
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the preview."""
+        return (self.pixels.shape[-2], self.pixels.shape[-1])
+
+    def layers(self, detail: Detail) -> Layers:
+        """The layers for a filter's settings; slow when these have changed."""
+        key = (*detail.preset.options().items(), len(detail.alpha))
+        if self._layers is None or self._layers.key != key:
+            luminance = reduce_channels(self.photograph.float(), "luminance")
+            bandwidth = detail.preset.options()["photometric_bandwidth"]
+            operator = sampled_operator(
+                luminance,
+                self.stride,
+                detail,
+                bandwidth=estimate_bandwidth(luminance) if bandwidth == "auto" else bandwidth,
+                channels="luminance",
+                patch_size=detail.patch_size,
+            )
+            layers = detail_layers(operator, reduce_channels(self.pixels, "luminance"), order=len(detail.alpha) - 1)
+            self._layers = Layers(key, layers, operator.spectrum().eigenvalues[0])
+        return self._layers
+
+    def mask(self, detail: Detail) -> Tensor | None:
+        """Where the sliders inside hold, (1, 1, h, w), or None without strokes; slow the first time only."""
+        if not detail.has_region():
+            return None
+        key = (detail.strokes, detail.spread, detail.landmarks, detail.spatial_bandwidth)
+        if self._mask is None or self._mask[0] != key:
+            if self._masks is None or self._masks.key != key[2:]:
+                spread = Detail(landmarks=detail.landmarks, spatial_bandwidth=detail.spatial_bandwidth)
+                operator = sampled_operator(
+                    self.photograph.float(),
+                    self.stride,
+                    spread,
+                    bandwidth=MASK_BANDWIDTH,
+                    channels="all",
+                    patch_size=5,
+                )
+                self._masks = MaskMaker(operator.spectrum(), key[2:])
+            inner, outer = detail.regions(self.size)
+            self._mask = (key, self._masks.mask(inner, outer, detail.spread))
+        return self._mask[1]
+
+    def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
+        """The preview under an edit, (1, 1 or 3, h, w) in [0, 1].
+
+        Args:
+            recipe: the edit.
+            upto: name of the last step that counts; None is all of them.
+        """
+        result = self.pixels
+        key: tuple[object, ...] = ()
+        for number, (name, step) in enumerate(zip(recipe.names, recipe.steps, strict=True)):
+            if step.changes():
+                result, key = self._after(number, step, result, key)
+            if name == upto:
+                break
+        return result.clamp(0, 1)
+
+    def _after(
+        self, number: int, step: Step, image: Tensor, key: tuple[object, ...]
+    ) -> tuple[Tensor, tuple[object, ...]]:
+        """The picture after a step, from the picture before it and the key of that."""
+        key = (*key, step)
+        if isinstance(step, Detail):
+            layers, mask = self.layers(step).layers, self.mask(step)
+            return edit_luminance(image, lambda _: step.blend(layers, mask)), key
+        held = self._steps.get(number)
+        if held is None or held[0] != key:
+            held = self._steps[number] = (key, step.apply(image.clamp(0, 1)))
+        return held[1], key

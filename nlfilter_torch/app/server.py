@@ -1,0 +1,85 @@
+"""The editor's server: one page, one session for each tab, pictures by an address that only that tab knows.
+
+NiceGUI carries the page rather than Gradio. Gradio 6.31 refuses Pillow 13, which this package reads pictures with; its
+ImageEditor sends whole bitmaps, and in a trial with headless Chromium its change event had not come three seconds after
+a stroke. NiceGUI gives the pointer's events in pixels of the picture, which is all that a brush needs, takes a slider's
+moves in order over one connection, and ships every script and font that it uses.
+"""
+
+import socket
+import sys
+from pathlib import Path
+
+from fastapi import Response
+from nicegui import app, ui
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+from nlfilter_torch.app.page import EDITORS, Editor
+from nlfilter_torch.app.session import Session
+
+TITLE = "nlfilter-torch"
+LOCAL = ("127.0.0.1", "localhost", "::1")
+
+
+def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
+    """Run the editor until it is interrupted.
+
+    Args:
+        image: to begin with, or None.
+        folder: where it saves.
+        host: address to listen on.
+        port: 0 for a free one.
+        open_page: open it in the browser.
+
+    Raises:
+        ValueError: if the address cannot be listened on.
+    """
+    port = _check_address(host, port)
+    if host in LOCAL:
+        # A page from elsewhere must not reach the editor by a name of its own for this machine.
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost", "[::1]"])
+
+    @app.get("/picture/{token}/{kind}")
+    def _picture(token: str, kind: str) -> Response:
+        editor = EDITORS.get(token)
+        content = None if editor is None else editor.pictures.get(kind)
+        if content is None:
+            return Response(status_code=404)
+        media_type = "image/png" if kind == "mask" else "image/jpeg"
+        return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
+
+    @ui.page("/", title=TITLE)
+    def _page() -> None:
+        Editor(Session(folder)).build(image)
+
+    shown = f"[{host}]" if ":" in host else host
+    app.on_startup(lambda: print(f"Editor at http://{shown}:{port}/ - Ctrl+C ends it", flush=True))
+    ui.run(
+        host=host,
+        port=port,
+        title=TITLE,
+        dark=True,
+        reload=False,
+        show=open_page,
+        tailwind=True,
+        binding_refresh_interval=None,
+        show_welcome_message=False,
+        favicon="\U0001f39a\ufe0f",
+        uvicorn_logging_level="warning",
+    )
+
+
+def _check_address(host: str, port: int) -> int:
+    """The port to listen on; raises ValueError where that is not possible."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        if sys.platform != "win32":
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise ValueError(
+                f"cannot listen on --host {host} --port {port} ({error.strerror or error}); "
+                "use --port 0 for a free port, or another address"
+            ) from error
+        return int(probe.getsockname()[1])

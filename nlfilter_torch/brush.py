@@ -1,0 +1,142 @@
+"""Strokes of a brush as lines with a width, kept as shares of the picture, and the pixels that they cover.
+
+A preview and the photograph it stands for are thus painted alike.
+"""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.presets import is_number
+
+COLOUR = re.compile(r"#[0-9a-f]{6}")
+SMALLEST = 0.75  # pixels; the least radius, at which a dot still covers a pixel
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A line drawn with a round brush.
+
+    Attributes:
+        points: (x, y) as shares of the picture's width and height, at least one.
+        radius: of the brush, as a share of the picture's short side.
+        paint: what the stroke says: a colour ``#rrggbb``, or a word of the edit that it belongs to.
+    """
+
+    points: tuple[tuple[float, float], ...]
+    radius: float
+    paint: str
+
+    def entries(self) -> dict[str, Any]:
+        """The stroke as JSON has it."""
+        return {"paint": self.paint, "radius": self.radius, "points": [list(point) for point in self.points]}
+
+    @staticmethod
+    def from_entries(value: Any, words: tuple[str, ...], place: str) -> "Stroke":
+        """Check what JSON holds.
+
+        Args:
+            value: what should be a stroke.
+            words: that may stand in place of a colour; the word ``colour`` allows any colour.
+            place: what errors call it.
+
+        Raises:
+            ValueError: if ``value`` is no stroke.
+        """
+        if not isinstance(value, dict) or set(value) != {"points", "radius", "paint"}:
+            raise ValueError(f"{place} must hold strokes with points, radius and paint, got {value!r}; correct it")
+        points, radius, paint = value["points"], value["radius"], value["paint"]
+        if not (isinstance(points, list) and points and all(map(_is_point, points))):
+            raise ValueError(f"points of a stroke in {place} must be pairs of numbers, got {points!r}; correct them")
+        if not (is_number(radius) and 0 < radius <= 1):
+            raise ValueError(f"radius of a stroke in {place} must be in (0, 1], got {radius!r}; correct it")
+        is_colour = "colour" in words and isinstance(paint, str) and COLOUR.fullmatch(paint)
+        if not is_colour and (paint not in words or paint == "colour"):
+            wanted = ", ".join("a colour such as #c04020" if word == "colour" else word for word in words)
+            raise ValueError(f"paint of a stroke in {place} must be one of {wanted}, got {paint!r}; correct it")
+        return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), paint)
+
+
+def _is_point(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(is_number(v) and abs(v) <= 2 for v in value)
+
+
+def cover(stroke: Stroke, size: tuple[int, int]) -> Tensor:
+    """The pixels that a stroke covers, (H, W) bool.
+
+    >>> cover(Stroke(((0.5, 0.5),), 0.1, "in"), (5, 5)).int()
+    tensor([[0, 0, 0, 0, 0],
+            [0, 0, 0, 0, 0],
+            [0, 0, 1, 0, 0],
+            [0, 0, 0, 0, 0],
+            [0, 0, 0, 0, 0]], dtype=torch.int32)
+    """
+    height, width = size
+    radius = max(stroke.radius * min(size), SMALLEST)
+    covered = torch.zeros(size, dtype=torch.bool)
+    # Coordinates in which the centre of the first pixel is 0.
+    points = [(x * width - 0.5, y * height - 0.5) for x, y in stroke.points]
+    for (x0, y0), (x1, y1) in pairwise(points if len(points) > 1 else points * 2):
+        top, bottom = _span(y0, y1, radius, height)
+        left, right = _span(x0, x1, radius, width)
+        if top >= bottom or left >= right:
+            continue
+        y = torch.arange(top, bottom, dtype=torch.float32).unsqueeze(1) - y0
+        x = torch.arange(left, right, dtype=torch.float32) - x0
+        dx, dy = x1 - x0, y1 - y0
+        along = ((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12)).clamp(0, 1)  # nearest point of the line
+        covered[top:bottom, left:right] |= (x - along * dx).square() + (y - along * dy).square() <= radius * radius
+    return covered
+
+
+def _span(a: float, b: float, radius: float, length: int) -> tuple[int, int]:
+    return max(0, int(min(a, b) - radius)), min(length, int(max(a, b) + radius) + 2)
+
+
+def mask_of(strokes: Iterable[Stroke], size: tuple[int, int]) -> Tensor:
+    """All pixels that strokes cover, (1, 1, H, W) float32 of zeros and ones."""
+    covered = torch.zeros(size, dtype=torch.bool)
+    for stroke in strokes:
+        covered |= cover(stroke, size)
+    return covered[None, None].float()
+
+
+def paint(strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Colours (1, 3, H, W) and mask (1, 1, H, W) of strokes of colour; later ones cover earlier ones."""
+    colours, painted = torch.zeros(3, *size), torch.zeros(size, dtype=torch.bool)
+    for stroke in strokes:
+        covered = cover(stroke, size)
+        colours[:, covered] = colour_of(stroke.paint).unsqueeze(1)
+        painted |= covered
+    return colours[None], painted[None, None].float()
+
+
+def colour_of(paint: str) -> Tensor:
+    """RGB (3,) in [0, 1] of ``#rrggbb``.
+
+    >>> colour_of("#ff0033")
+    tensor([1.0000, 0.0000, 0.2000])
+    """
+    return torch.tensor([int(paint[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+
+
+def thin(points: Iterable[tuple[float, float]], spacing: float) -> tuple[tuple[float, float], ...]:
+    """Points without those that lie closer than ``spacing`` to the one kept before; the last is always kept.
+
+    >>> thin([(0.0, 0.0), (0.01, 0.0), (0.1, 0.0), (0.11, 0.0)], 0.05)
+    ((0.0, 0.0), (0.1, 0.0), (0.11, 0.0))
+    """
+    kept: list[tuple[float, float]] = []
+    last = None
+    for point in points:
+        last = (round(point[0], 4), round(point[1], 4))
+        if not kept or max(abs(last[0] - kept[-1][0]), abs(last[1] - kept[-1][1])) >= spacing:
+            kept.append(last)
+    if last is not None and kept[-1] != last:
+        kept.append(last)
+    return tuple(kept)

@@ -1,0 +1,220 @@
+"""Whole edits: what they do to an image, their files, and the verb that applies them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import skimage.data
+import torch
+
+from nlfilter_torch import abstract, colorize, defocus, enhance, recolor
+from nlfilter_torch.brush import Stroke, cover, mask_of, paint, thin
+from nlfilter_torch.cli import main
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.edits.enhance import colour_masks
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.filtering import polynomial_filter
+from nlfilter_torch.operator import nonlocal_operator
+from nlfilter_torch.presets import PRESETS
+from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, Recolor
+
+SIZE = (48, 64)
+LINE = ((0.25, 0.25), (0.5, 0.25))
+IN, OUT = Stroke(LINE, 0.05, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
+BLUE, KEEP = Stroke(LINE, 0.05, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
+ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
+WHOLE = Recipe(
+    Detail(ALPHA, INSIDE, 0.7, (IN, OUT), 30.0),
+    Colorize((BLUE,), 0.5),
+    Recolor((BLUE, KEEP), 0.5, 20.0),
+    Defocus((IN,), 4.0),
+    Abstract(0.1, 0.5, 3.0, 5),
+)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> torch.Tensor:
+    """(1, 3, 48, 64) in [0, 1]: a piece of the cat."""
+    return torch.from_numpy(skimage.data.chelsea()[80:128, 120:184].copy()).permute(2, 0, 1)[None].float() / 255
+
+
+def seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def test_a_stroke_covers_what_is_nearer_than_its_radius() -> None:
+    covered = cover(IN, SIZE)
+    y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    across = torch.maximum((16 - x).clamp(min=0), (x - 32).clamp(min=0))
+    assert torch.equal(covered, torch.hypot(across, y - 12) <= 0.05 * 48)
+    dot = cover(Stroke(((0.5, 0.5),), 1e-6, "in"), (49, 65))
+    assert dot.sum() == 1
+    assert dot[24, 32]
+
+
+def test_strokes_that_leave_the_picture_cover_what_is_in_it() -> None:
+    crossing = cover(Stroke(((-0.5, 0.5), (1.5, 0.5)), 0.05, "in"), SIZE)
+    assert torch.equal(crossing.any(1).nonzero().flatten(), torch.arange(22, 26))
+    assert crossing[22:26].all()
+    assert not cover(Stroke(((1.5, 1.5),), 0.05, "in"), SIZE).any()
+
+
+def test_a_larger_picture_is_painted_alike() -> None:
+    small, large = mask_of([IN], SIZE), mask_of([IN], (480, 640))
+    assert (torch.nn.functional.avg_pool2d(large, 10) - small).abs().mean() < 0.01
+
+
+def test_later_paint_covers_earlier() -> None:
+    colours, painted = paint([BLUE, replace(BLUE, paint="#ff0000", points=LINE[:1])], SIZE)
+    assert torch.equal(colours[0, :, 12, 16], torch.tensor([1.0, 0.0, 0.0]))
+    assert torch.allclose(colours[0, :, 12, 30], torch.tensor([0x20, 0x40, 0xE0]) / 255)
+    assert torch.equal(painted, mask_of([BLUE], SIZE))
+
+
+def test_thinning_keeps_the_ends() -> None:
+    line = [(i / 1000, 0.0) for i in range(501)]
+    kept = thin(line, 0.1)
+    assert kept[0] == (0.0, 0.0)
+    assert kept[-1] == (0.5, 0.0)
+    assert len(kept) == 6
+
+
+def test_detail(pixels: torch.Tensor) -> None:
+    wanted = enhance(pixels, torch.tensor(ALPHA), photometric_bandwidth=30 / 255, generator=seeded())
+    assert torch.equal(Recipe(Detail(ALPHA, bandwidth=30.0)).apply(pixels), wanted)
+
+
+def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
+    found = Recipe(WHOLE.detail).apply(pixels)
+    mask = colour_masks(pixels, mask_of([IN], SIZE), negative=mask_of([OUT], SIZE), time=0.7, generator=seeded())
+    operator = nonlocal_operator(
+        reduce_channels(pixels, "luminance"), photometric_bandwidth=30 / 255, generator=seeded()
+    )
+
+    def edit(luminance: torch.Tensor) -> torch.Tensor:
+        inside, outside = (polynomial_filter(operator, luminance, torch.tensor(a)) for a in (INSIDE, ALPHA))
+        return mask * inside + (1 - mask) * outside
+
+    assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
+    # The same sliders on both sides are those of the whole.
+    same = Recipe(replace(WHOLE.detail, inside=ALPHA)).apply(pixels)
+    assert torch.allclose(same, Recipe(Detail(ALPHA, bandwidth=30.0)).apply(pixels), atol=1e-5)
+
+
+def test_colours(pixels: torch.Tensor) -> None:
+    strokes, painted = paint([BLUE], SIZE)
+    grey = reduce_channels(pixels, "luminance")
+    wanted = colorize(grey, strokes, painted, strength=0.5, generator=seeded())
+    for image in (pixels, grey):
+        assert torch.equal(Recipe(colorize=WHOLE.colorize).apply(image), wanted)
+    kept = recolor(
+        pixels,
+        strokes,
+        painted,
+        keep=mask_of([KEEP], SIZE),
+        reach=0.5,
+        photometric_bandwidth=0.2,
+        generator=seeded(),
+    )
+    assert torch.equal(Recipe(recolor=WHOLE.recolor).apply(pixels), kept)
+    with pytest.raises(ValueError, match="recolor needs a colour photograph"):
+        Recipe(recolor=WHOLE.recolor).apply(grey)
+
+
+def test_blur_and_painting(pixels: torch.Tensor) -> None:
+    blurred = defocus(pixels, mask_of([IN], SIZE), radius=0.04 * 48, generator=seeded())
+    assert torch.equal(Recipe(defocus=WHOLE.defocus).apply(pixels), blurred)
+    for line, width in ((3.0, 0.3), (20.0, 0.96)):  # lines get no thinner than what a pixel can show
+        step = replace(WHOLE.abstract, width=line)
+        wanted = abstract(pixels, power=0.1, edges=0.5, edge_width=width, tones=5, generator=seeded())
+        assert torch.equal(Recipe(abstract=step).apply(pixels), wanted)
+
+
+def test_steps_follow_one_another(pixels: torch.Tensor) -> None:
+    both = Recipe(Detail(INSIDE), defocus=WHOLE.defocus).apply(pixels)
+    first = Recipe(Detail(INSIDE)).apply(pixels).clamp(0, 1)
+    assert torch.equal(both, Recipe(defocus=WHOLE.defocus).apply(first))
+
+
+def test_what_changes_nothing_is_left_out(pixels: torch.Tensor) -> None:
+    idle = Recipe(Detail(inside=INSIDE), recolor=Recolor((KEEP,)))
+    assert idle.apply(pixels) is pixels
+    assert Recipe.from_json(idle.to_json(), "edit.json") == Recipe()
+
+
+def test_files_hold_the_whole_edit() -> None:
+    assert Recipe.from_json(WHOLE.to_json(), "edit.json") == WHOLE
+    assert set(json.loads(WHOLE.to_json())) == {"detail", "colorize", "recolor", "defocus", "abstract"}
+
+
+def test_presets_are_edits(tmp_path: Path) -> None:
+    crisp = PRESETS["crisp"]
+    assert Recipe.find("crisp") == Recipe(Detail.of(crisp))
+    path = tmp_path / "look.json"
+    path.write_text(crisp.to_json())
+    assert Recipe.find(str(path)) == Recipe(Detail.of(crisp))
+    assert Recipe.find("crisp").to_json() == crisp.to_json()  # so that detail --preset takes it too
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("{", "it is not JSON"),
+        ("[1]", "it must hold steps out of detail"),
+        ('{"detial": {}}', "it must hold steps out of detail"),
+        ('{"detail": 1}', "detail in edit.json must hold entries in braces"),
+        ('{"detail": {"power": 1}}', "must hold no other entries than alpha"),
+        ('{"abstract": {"strokes": []}}', "must hold no other entries than power, edges, width, tones, got strokes"),
+        ('{"abstract": {"tones": 2.5}}', "tones of abstract in edit.json must be a whole number"),
+        ('{"recolor": {"reach": 1}}', "reach of recolor in edit.json must be a number from 0 to 0.999, got 1"),
+        ('{"detail": {"inside": [1, 1]}}', "inside of detail in edit.json must have as many numbers as alpha"),
+        ('{"defocus": {"strokes": {}}}', "strokes of defocus in edit.json must be a list"),
+        ('{"defocus": {"strokes": [{"points": []}]}}', "must hold strokes with points, radius and paint"),
+        (
+            '{"defocus": {"strokes": [{"points": [], "radius": 0.1, "paint": "in"}]}}',
+            "points of a stroke in defocus in edit.json must be pairs of numbers",
+        ),
+        (
+            '{"defocus": {"strokes": [{"points": [[0, NaN]], "radius": 0.1, "paint": "in"}]}}',
+            "points of a stroke in defocus in edit.json must be pairs of numbers",
+        ),
+        (
+            '{"defocus": {"strokes": [{"points": [[0, 0]], "radius": 2, "paint": "in"}]}}',
+            r"radius of a stroke in defocus in edit.json must be in \(0, 1\], got 2",
+        ),
+        (
+            '{"recolor": {"strokes": [{"points": [[0, 0]], "radius": 0.1, "paint": "blue"}]}}',
+            "must be one of a colour such as #c04020, keep, got 'blue'",
+        ),
+    ],
+)
+def test_files_that_hold_no_edit(text: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        Recipe.from_json(text, "edit.json")
+
+
+def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
+    photo, edit, out = tmp_path / "in.png", tmp_path / "edit.json", tmp_path / "out.png"
+    write_photograph(Photograph(pixels), photo)
+    recipe = Recipe(Detail(ALPHA, INSIDE, strokes=(IN,)), defocus=WHOLE.defocus)
+    edit.write_text(recipe.to_json())
+    assert main(["apply", str(photo), str(out), "--preset", str(edit)]) == 0
+    assert (read_photograph(out).pixels - recipe.apply(pixels).clamp(0, 1)).abs().max() < 0.6 / 255
+
+    assert main(["apply", str(photo), str(out), "--preset", "crisp", "--depth", "16"]) == 0
+    assert main(["detail", str(photo), str(tmp_path / "same.png"), "--preset", "crisp", "--depth", "16"]) == 0
+    assert torch.equal(read_photograph(out).pixels, read_photograph(tmp_path / "same.png").pixels)
+
+
+def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["apply", "in.png", str(tmp_path / "out.png"), "--preset", "nothing"]) == 2
+    assert "nothing does not exist" in capsys.readouterr().err
+
+
+def test_more_memory_is_asked_for_by_hungrier_steps() -> None:
+    assert (Recipe().landmarks, Recipe().factors) == (100, 1)
+    assert Recipe(WHOLE.detail).factors == Recipe(colorize=WHOLE.colorize).factors == 2
+    assert (WHOLE.landmarks, WHOLE.factors) == (200, 3)
