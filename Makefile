@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c const
 PINS := pyproject.toml constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types chromium bench bench-quick train pictures notebooks clean
+.PHONY: demo test lint types chromium bench bench-quick train pictures notebooks docs clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
@@ -54,6 +54,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.report out/quick/speed.json
 	$(BIN)/python -m benchmarks.memory --side 128 --repeats 1
 	$(BIN)/python -m benchmarks.tables --long-side 64
+	$(BIN)/python -m benchmarks.distributed --ranks 2 --widths 64 --landmarks 20
 
 # A denoiser trained from nothing, and judged: weights, figures and a picture in out/denoiser.
 train: $(VENV)/.installed-test

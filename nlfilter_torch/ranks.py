@@ -62,7 +62,7 @@ def name_the_missing(group: Any) -> str:
     The ranks that are there all see the exchange fail, and leave a note in the store through which they once met.
     """
     ranks = dist.get_process_group_ranks(group)
-    notes = {rank: f"nlfilter/{rank} is here" for rank in ranks}
+    notes = {rank: f"nlfilter/{group.group_name}/{rank} is here" for rank in ranks}
     try:
         store = dist.distributed_c10d._get_default_store()
         store.set(notes[dist.get_rank()], "")
