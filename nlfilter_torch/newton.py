@@ -20,7 +20,8 @@ from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 
 PER_LANDMARK = 160  # pixels of the sample; its Jacobian is then within sqrt(1 / 160) = 8 % of the true one
-EXPLORED = 8192  # pixels that the first guess of the row sums comes from
+EXPLORED = 8192  # pixels that the first guess comes from
+GUESSES = 3  # steps that it takes towards their fixed point; more gain nothing for the pixels that are not among them
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly and on no period of the image
 LARGEST = 2.0  # K has a unit diagonal and its entries are not negative but for errors, so that no d exceeds 1
 SMALLEST_AFFINITY = 1e-12
@@ -98,21 +99,20 @@ def _columns(factor: Tensor, chosen: Tensor) -> Tensor:
     return torch.stack([columns.index_select(1, picked) for columns, picked in zip(factor, chosen, strict=True)])
 
 
-def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
-    """``(K 1)^(-1/2)`` with the sum over a few thousand pixels for that over all, and its exact moment."""
+def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
+    """A first t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
     pixels = factor.shape[2]
-    few = factor
+    few, rest = factor, diagonal
     if pixels > 2 * EXPLORED:
         steps = torch.arange(EXPLORED, dtype=torch.float64, device=factor.device) * GOLDEN
-        few = factor.index_select(2, (steps.frac() * pixels).long().sort().values)
-    total = reduce_sum(few.sum(2, keepdim=True) * (pixels / few.shape[2]), shard)
-    scaling, found = torch.empty_like(diagonal), total.new_zeros(total.shape, dtype=torch.float64)
-    for block in pixel_blocks(pixels, factor.shape[0], factor.device, length=SWEPT):
-        columns = factor[:, :, block]
-        sums = (total.mT @ columns).squeeze(1) + diagonal[:, block]
-        scaling[:, block] = sums.clamp_(min=1.0).rsqrt_()  # no row of K sums to less than its unit diagonal
-        found += columns @ scaling[:, block].unsqueeze(2)
-    return scaling, reduce_sum(found, shard)
+        chosen = (steps.frac() * pixels).long().sort().values
+        few, rest = factor.index_select(2, chosen), diagonal[:, chosen]
+    sample = Sample(few, rest, torch.full_like(rest, pixels / few.shape[2]), shard)
+    sums = (sample.moment(torch.ones_like(rest)).to(few).mT @ few).squeeze(1) + rest
+    total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
+    for _ in range(GUESSES):
+        total = (total + sample.moment(sample.scaling(total))) / 2
+    return total
 
 
 def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
@@ -132,7 +132,7 @@ def solve(
     """Scaling (B, N), its moment (B, M, 1) and residual (B,), the sweeps, and an estimate of J^-1, (B, M, M)."""
     watched = factor.device.type == "cpu"
     count = -(-PER_LANDMARK * factor.shape[1] // (1 if shard is None else len(shard.rows)))  # of the sample, here
-    scaling, found = _guess(factor, diagonal, shard)
+    scaling, found = _sweep(factor, diagonal, _guess(factor, diagonal, shard), shard)
     total = found
     worst, slow, gain = 1.0, 0, 1.0
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
