@@ -65,7 +65,11 @@ class Photograph:
         return replace(self, pixels=pixels.detach().to(self.pixels))
 
 
-def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0) -> Photograph:
+class TooLarge(MemoryError):
+    """A picture that takes more memory than there is to edit it whole."""
+
+
+def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int | None = None) -> Photograph:
     """Read an image file.
 
     Args:
@@ -73,6 +77,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0) -> Photograph
             or (TIFF) floats. Of a TIFF with several pages, and of a JPEG with several pictures, the first.
         bytes_per_pixel: Memory that is going to be needed for each pixel in float32, checked before anything is
             decoded; twice as much for a file of 64-bit floats, which are not cut to 32.
+        memory: Bytes that may be used; None is what is free.
 
     Returns:
         The photograph, turned upright.
@@ -80,20 +85,10 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0) -> Photograph
     Raises:
         FileNotFoundError: No file is there.
         ValueError: The file is empty, damaged, not an image, or an image of a kind that is not handled.
-        MemoryError: ``bytes_per_pixel`` for each pixel is more than the memory at hand.
+        TooLarge: ``bytes_per_pixel`` for each pixel is more than the memory at hand, a MemoryError.
     """
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; check the name and the folder")
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder, not an image file; name a file in it")
-    with path.open("rb") as stream:
-        head = stream.read(32)
-    if not head:
-        raise ValueError(f"{path} is empty; copy it again from where it came")
-    read = _read_tiff if tiff.is_tiff(head) else _read_by_pillow
-    channels, orientation, icc, exif = read(path, head, bytes_per_pixel)
-    channels = exif_tags.upright(channels, orientation)  # (H, W, S)
+    channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
 
     dtype = channels.dtype
     if dtype.name not in BITS:
@@ -109,6 +104,31 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0) -> Photograph
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
     return Photograph(planes[:, :colours], dtype.name, alpha, icc, exif)  # type: ignore[arg-type]
+
+
+def first_bytes(path: Path) -> bytes:
+    """What tells the kind of an image file.
+
+    Raises:
+        FileNotFoundError, ValueError: see :func:`read_photograph`.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; check the name and the folder")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, not an image file; name a file in it")
+    with path.open("rb") as stream:
+        head = stream.read(32)
+    if not head:
+        raise ValueError(f"{path} is empty; copy it again from where it came")
+    return head
+
+
+def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tuple[Pixels, bytes | None, bytes | None]:
+    """Upright channels (H, W, S) as they are stored, profile and EXIF; see :func:`read_photograph`."""
+    head = first_bytes(path)
+    read = _read_tiff if tiff.is_tiff(head) else _read_by_pillow
+    channels, orientation, icc, exif = read(path, head, bytes_per_pixel, memory)
+    return exif_tags.upright(channels, orientation), icc, exif
 
 
 def write_photograph(photograph: Photograph, path: str | Path) -> None:
@@ -129,18 +149,22 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     if photograph.depth in WHITE:
         values = np.rint(values.clip(0, 1) * WHITE[photograph.depth])
     channels = np.ascontiguousarray(values.astype(dtype))
+    with open_beside(path) as stream:
+        encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif)
+
+
+def encode(stream: BinaryIO, kind: str, channels: Pixels, alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
+    """Write channels (H, W, S), as they are to be stored, as an image file of a type of :data:`DEPTHS`."""
     if channels.shape[2] == 1:
         channels = channels[..., 0]
-    with open_beside(path) as stream:
-        if kind == "TIFF":
-            tiff.write(stream, channels, photograph.alpha is not None, photograph.icc, photograph.exif)
-        elif photograph.depth == "uint16":
-            stream.write(_encode_deep_png(channels, photograph))
-        else:
-            options: dict[str, object] = dict(ENCODING.get(kind, {}))
-            metadata = {"icc_profile": photograph.icc, "exif": photograph.exif}
-            options |= {name: block for name, block in metadata.items() if block is not None}
-            Image.fromarray(channels).save(stream, format=kind, **options)
+    if kind == "TIFF":
+        tiff.write(stream, channels, alpha, icc, exif)
+    elif channels.dtype == np.uint16:
+        stream.write(_encode_deep_png(channels, icc, exif))
+    else:
+        options: dict[str, object] = dict(ENCODING.get(kind, {}))
+        options |= {name: block for name, block in (("icc_profile", icc), ("exif", exif)) if block is not None}
+        Image.fromarray(channels).save(stream, format=kind, **options)
 
 
 def check_output(path: str | Path, photograph: Photograph) -> str:
@@ -148,18 +172,23 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
 
     Call it before long work, so that the sentence comes at once.
     """
+    return check_type(path, photograph.depth, photograph.alpha is not None)
+
+
+def check_type(path: str | Path, depth: str, alpha: bool) -> str:
+    """:func:`check_output` for a picture of that depth, with or without alpha."""
     path = Path(path)
     check_file(path)
     kind = SUFFIXES.get(path.suffix.lower())
     if kind is None:
         raise ValueError(f"{path} must end in .png, .jpg, .webp or .tif, got {path.suffix!r}; choose one of these")
-    if photograph.depth not in DEPTHS[kind]:
-        others = " or ".join(name for name, depths in DEPTHS.items() if photograph.depth in depths)
+    if depth not in DEPTHS[kind]:
+        others = " or ".join(name for name, depths in DEPTHS.items() if depth in depths)
         raise ValueError(
-            f"{path} cannot hold this picture: {kind} has no {BITS[photograph.depth]} a channel; "
+            f"{path} cannot hold this picture: {kind} has no {BITS[depth]} a channel; "
             f"write a {others} file or choose a depth of {BITS[DEPTHS[kind][-1]]}"
         )
-    if photograph.alpha is not None and kind == "JPEG":
+    if alpha and kind == "JPEG":
         raise ValueError(f"{path} cannot hold this picture: JPEG has no alpha channel; write a PNG, TIFF or WebP file")
     return kind
 
@@ -200,26 +229,39 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     # Opened by hand, not by tempfile: the file must get the usual permissions, and live on the same file system.
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    beside = name_beside(path)
     try:
         with beside.open("x+b") as stream:
             yield stream
         beside.replace(path)
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        # A full disk or a quota: the system says what, but not where.
+        raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
         beside.unlink(missing_ok=True)
 
 
-def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
-    """Raise MemoryError if ``width * height * bytes_per_pixel`` is more than the memory that is free."""
-    needed, free = width * height * bytes_per_pixel, psutil.virtual_memory().available
+def name_beside(path: Path) -> Path:
+    """A name in the same folder that nothing else has, and that no one takes for a finished file."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+
+
+def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:
+    """Raise TooLarge if ``width * height * bytes_per_pixel`` is more than ``memory``; None is what is free."""
+    needed = width * height * bytes_per_pixel
+    free = psutil.virtual_memory().available if memory is None else memory
     if needed > free:
-        raise MemoryError(
+        raise TooLarge(
             f"{path} has {width}x{height} pixels and needs about {needed / 1e9:.1f} GB of memory, "
             f"but {free / 1e9:.1f} GB is free; use fewer landmarks or a smaller picture"
         )
 
 
-def _read_by_pillow(path: Path, head: bytes, bytes_per_pixel: int) -> tuple[Pixels, int, bytes | None, bytes | None]:
+def _read_by_pillow(
+    path: Path, head: bytes, bytes_per_pixel: int, memory: int | None
+) -> tuple[Pixels, int, bytes | None, bytes | None]:
     """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG or WebP file."""
     try:
         with warnings.catch_warnings():
@@ -236,7 +278,7 @@ def _read_by_pillow(path: Path, head: bytes, bytes_per_pixel: int) -> tuple[Pixe
         frames = getattr(image, "n_frames", 1)
         if frames > 1 and image.format != "MPO":
             raise ValueError(f"{path} is an animation of {frames} frames; save one of them as a picture")
-        check_memory(path, *image.size, bytes_per_pixel)
+        check_memory(path, *image.size, bytes_per_pixel, memory)
         try:
             orientation, exif = exif_tags.split(image.getexif())
             if image.format == "PNG" and head[24] == 16:  # the bit depth in its header; Pillow would keep 8 of them
@@ -260,11 +302,14 @@ def _to_plain_mode(image: Image.Image, path: Path) -> Image.Image:
     return image.convert(modes[image.mode])
 
 
-def _read_tiff(path: Path, head: bytes, bytes_per_pixel: int) -> tuple[Pixels, int, bytes | None, bytes | None]:
+def _read_tiff(
+    path: Path, head: bytes, bytes_per_pixel: int, memory: int | None
+) -> tuple[Pixels, int, bytes | None, bytes | None]:
     """(H, W, S) channels, orientation, profile and EXIF of the first page of a TIFF file."""
     try:
         return tiff.read(
-            path, lambda width, height, double: check_memory(path, width, height, bytes_per_pixel * (1 + double))
+            path,
+            lambda width, height, double: check_memory(path, width, height, bytes_per_pixel * (1 + double), memory),
         )
     except tiff.UnhandledTiff as error:
         raise ValueError(f"{path} {error}") from error
@@ -280,13 +325,13 @@ def _damaged(path: Path, error: Exception) -> ValueError:
     )
 
 
-def _encode_deep_png(channels: Pixels, photograph: Photograph) -> bytes:
+def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None) -> bytes:
     """A 16-bit PNG file; profile and EXIF go in right after its header, before the pixels as the format demands."""
     encoded = imagecodecs.png_encode(channels)
     start = 8 + 25  # signature, and the header chunk, whose length is fixed
     chunks = io.BytesIO()
-    if photograph.icc is not None:
-        PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(photograph.icc))
-    if photograph.exif is not None:
-        PngImagePlugin.putchunk(chunks, b"eXIf", photograph.exif.removeprefix(exif_tags.PREFIX))
+    if icc is not None:
+        PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(icc))
+    if exif is not None:
+        PngImagePlugin.putchunk(chunks, b"eXIf", exif.removeprefix(exif_tags.PREFIX))
     return bytes(encoded[:start]) + chunks.getvalue() + bytes(encoded[start:])

@@ -1,7 +1,7 @@
 """TIFF files in and out, by tifffile: any depth, profile and EXIF carried."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +16,8 @@ from nlfilter_torch import exif as exif_tags
 _DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 _FOLDERS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # tags that point at a table of further tags
 _ORIENTATION = int(ExifTags.Base.Orientation)
+TILE = 256  # side of the tiles of a picture that is written by rows
+CLASSIC = 4_000_000_000  # bytes of pixels, compressed or not, that a TIFF file of the usual kind is trusted with
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
 
 
@@ -37,43 +39,111 @@ def read(
     """
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
-        kinds = tifffile.PHOTOMETRIC
-        by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
-        handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
-        if page.photometric not in handled:
-            name = getattr(page.photometric, "name", page.photometric)
-            raise UnhandledTiff(f"is stored in {name} colours, which are not handled; convert it to grey or RGB")
-        bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
-        if page.dtype is None or bits != 8 * page.dtype.itemsize:
-            raise UnhandledTiff(
-                f"has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats"
-            )
-        check_size(page.imagewidth, page.imagelength, page.dtype.itemsize == 8)
+        check_page(page)
+        check_size(page.imagewidth, page.imagelength, page.dtype == np.float64)
         channels = np.asarray(page.asarray())
         if page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
-        elif page.axes == "YX":
-            channels = channels[..., None]
-        elif page.axes != "YXS":
-            raise UnhandledTiff(f"has the axes {page.axes}, which are not those of a picture; save a plain picture")
-        colours = channels.shape[2] - len(page.extrasamples)
-        if colours not in (1, 3) or len(page.extrasamples) > 1:
-            raise UnhandledTiff(f"has {channels.shape[2]} channels; convert it to grey or RGB, with or without alpha")
-        channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
-        if page.photometric == kinds.MINISWHITE:
-            channels[..., :1] = np.iinfo(channels.dtype).max - channels[..., :1]
-        if _ASSOCIATED in page.extrasamples:
-            channels = _unmultiplied(channels)
-        tag = page.tags.get(_ORIENTATION)
-        orientation = 1 if tag is None else int(tag.value)
-        profile = page.tags.get(34675)
-        icc = None if profile is None else bytes(profile.value)
-        exif = None if file.is_bigtiff else _read_exif(path)
+        channels = plain(page, channels.reshape(page.imagelength, page.imagewidth, -1))
+        orientation, icc, exif = notes(file, path)
     return channels, orientation, icc, exif
+
+
+def check_page(page: Any) -> None:
+    """Raise UnhandledTiff unless a page is a picture in grey or RGB, with or without alpha."""
+    kinds = tifffile.PHOTOMETRIC
+    by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
+    handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
+    if page.photometric not in handled:
+        name = getattr(page.photometric, "name", page.photometric)
+        raise UnhandledTiff(f"is stored in {name} colours, which are not handled; convert it to grey or RGB")
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
+    if page.dtype is None or bits != 8 * page.dtype.itemsize:
+        raise UnhandledTiff(f"has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats")
+    if page.axes not in ("YX", "YXS", "SYX"):
+        raise UnhandledTiff(f"has the axes {page.axes}, which are not those of a picture; save a plain picture")
+    if page.samplesperpixel - len(page.extrasamples) not in (1, 3) or len(page.extrasamples) > 1:
+        raise UnhandledTiff(f"has {page.samplesperpixel} channels; convert it to grey or RGB, with or without alpha")
+
+
+def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
+    """Channels (H, W, S) of a page, or of some of its rows, as they are meant: black is 0, colours without alpha."""
+    channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
+    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+        channels[..., :1] = np.iinfo(channels.dtype).max - channels[..., :1]
+    return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
+
+
+def notes(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes | None]:
+    """Orientation, profile and EXIF (not from a BigTIFF) of the first page of a file."""
+    tags = file.pages.first.tags
+    orientation, profile = tags.get(_ORIENTATION), tags.get(34675)
+    return (
+        1 if orientation is None else int(orientation.value),
+        None if profile is None else bytes(profile.value),
+        None if file.is_bigtiff else _read_exif(path),
+    )
 
 
 def write(stream: BinaryIO, channels: NDArray[Any], alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
     """Write channels, (H, W) or (H, W, S), compressed without loss; ``alpha``: the last of them is one."""
+    _write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, bigtiff=False)
+
+
+def write_rows(
+    stream: BinaryIO,
+    rows: Iterable[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    alpha: bool,
+    icc: bytes | None,
+    exif: bytes | None,
+) -> None:
+    """Write rows (h, W, S) of a picture of ``shape`` as they come, into tiles; a large file becomes a BigTIFF."""
+    height, width, samples = shape
+    plain_shape = (height, width) if samples == 1 else shape
+
+    def tiles() -> Iterator[NDArray[Any]]:
+        for band in bands(rows, TILE):
+            for left in range(0, width, TILE):
+                tile = band[:, left : left + TILE]
+                padding = ((0, TILE - tile.shape[0]), (0, TILE - tile.shape[1]), (0, 0))
+                whole = np.pad(tile, padding)
+                yield whole[..., 0] if samples == 1 else whole
+
+    big = height * width * samples * dtype.itemsize > CLASSIC
+    # Compressing ahead in threads would gather hundreds of megabytes.
+    options = {"tile": (TILE, TILE), "maxworkers": 1, "buffersize": TILE * TILE * samples * dtype.itemsize}
+    _write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, bigtiff=big, **options)
+
+
+def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
+    """Rows (h, W, S) in pieces of any height, as pieces of one ``height`` and a last one that may be lower.
+
+    >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
+    [2, 2, 2, 1]
+    """
+    waiting: list[NDArray[Any]] = []
+    for piece in rows:
+        waiting.append(piece)
+        while sum(map(len, waiting)) >= height:
+            whole = np.concatenate(waiting)
+            waiting = [whole[height:]]
+            yield whole[:height]
+    if waiting and sum(map(len, waiting)):
+        yield np.concatenate(waiting)
+
+
+def _write(
+    stream: BinaryIO,
+    data: Any,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    alpha: bool,
+    icc: bytes | None,
+    exif: bytes | None,
+    **options: Any,
+) -> None:
     tags = Image.Exif()
     if exif is not None:
         tags.load(exif)
@@ -84,17 +154,19 @@ def write(stream: BinaryIO, channels: NDArray[Any], alpha: bool, icc: bytes | No
     start = stream.tell()
     tifffile.imwrite(
         stream,
-        channels,
-        bigtiff=False,
-        photometric="rgb" if channels.ndim == 3 and channels.shape[2] >= 3 else "minisblack",
-        planarconfig="contig" if channels.ndim == 3 else None,
+        data,
+        shape=shape,
+        dtype=dtype,
+        photometric="rgb" if len(shape) == 3 and shape[2] >= 3 else "minisblack",
+        planarconfig="contig" if len(shape) == 3 else None,
         extrasamples=["unassalpha"] if alpha else None,
         compression="zlib",
-        predictor=bool(np.issubdtype(channels.dtype, np.integer)),
+        predictor=bool(np.issubdtype(dtype, np.integer)),
         iccprofile=icc,
         extratags=[(_ORIENTATION, "H", 1, 1, True), *text, *places],
         metadata=None,
         software=False,
+        **options,
     )
     stream.seek(start)
     with tifffile.TiffFile(stream) as file:

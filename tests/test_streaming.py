@@ -87,7 +87,9 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_full_passes_are_the_filter_in_memory(options: dict[str, Any]) -> None:
     picture = cat(83, 121)
     edited = streamed(picture, statistics="full", tile_rows=7, num_landmarks=50, **options)
-    assert np.abs(edited - in_memory(picture, num_landmarks=50, **options)).max() < 1e-5
+    # What the eigenvectors explain is found by dividing by small eigenvalues, whose rounding shows.
+    bound = 1e-5 if "residual" not in options else 5e-5
+    assert np.abs(edited - in_memory(picture, num_landmarks=50, **options)).max() < bound
 
 
 def test_float64_is_worked_out_in_float64() -> None:
