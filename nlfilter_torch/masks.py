@@ -1,5 +1,7 @@
 """Spectrum and regions to masks that reach every similar pixel. Paper: Sec. IV, eq. (15) to (17), Fig. 11; Sec. V-A."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -230,7 +232,13 @@ def filter_regions(
     """
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_same_size(masks, operator.size, "masks", "operator")
+    return blend_regions(
+        image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)
+    )
+
+
+def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
+    """:func:`filter_regions`, where ``edit`` filters the image with sliders (B, k+1, H, W) for every pixel."""
     total = masks.sum(1, keepdim=True)
     inside = compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha)
-    edited = polynomial_filter(operator, image, inside, residual=residual)
-    return torch.lerp(image, edited, total.clamp(max=1.0).to(image))
+    return torch.lerp(image, edit(inside), total.clamp(max=1.0).to(image))
