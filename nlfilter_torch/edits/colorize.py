@@ -15,8 +15,8 @@ from nlfilter_torch.strokes import check_painted, check_share, propagate_strokes
 
 # Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
 # than 0.3 dB.
-LOCALITY = 0.375  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
-NARROW, TOLERANT = 1 / 3, 3.0  # spatial and photometric bandwidths of the second operator, as multiples of the first's
+LOCALITY = 0.5625  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
+NARROW, TOLERANT = 2 / 9, 3.0  # spatial and photometric bandwidths of the second operator, as multiples of the first's
 
 
 @full_precision
@@ -49,7 +49,7 @@ def colorize(
             regression.
         time: diffusion time t > 0 of the pieces. For k-means.
         photometric_bandwidth: in units of the image; how much grey levels may differ under one colour.
-        spatial_bandwidth: in pixels; None is 0.375 of the short side.
+        spatial_bandwidth: in pixels; None is 0.5625 of the short side.
         patch_size: of the patches that are compared.
         num_landmarks: M of the operator.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -101,7 +101,7 @@ def colorize(
         pieces = segment_mask(far, regions, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
     else:
-        chroma = propagate_strokes(far, wanted, painted, strength=strength, smoothness=2.0)
+        chroma = propagate_strokes(far, wanted, painted, strength=strength, reach=0.95, smoothness=2.0)
         near = spectrum(NARROW, TOLERANT, min(patch_size, 3))
         chroma = chroma + propagate_strokes(near, wanted - chroma, painted, strength=0.0, reach=0.5, smoothness=4.0)
     return merge_luminance(luminance, chroma).to(grey.dtype)
