@@ -19,6 +19,7 @@ from PIL import Image
 from nlfilter_torch import folders
 from nlfilter_torch.cli import main
 from nlfilter_torch.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
+from nlfilter_torch.presets import PRESETS
 from nlfilter_torch.ranks import Ranks, connected_ranks
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
@@ -281,7 +282,9 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert main([*arguments, "--workers", "2"]) == 0
     assert (seen["workers"], seen["threads"]) == (2, 3)
     settings = seen["args"][2].keywords
-    assert (settings["alpha"], settings["bandwidth"], settings["seed"]) == ("0.0,0.0,0.0,1.0", "15.0", 5)
+    smooth = PRESETS["smooth"]
+    assert settings["alpha"] == ",".join(map(str, smooth.alpha))
+    assert (settings["bandwidth"], settings["seed"]) == (str(smooth.bandwidth), 5)
     assert json.loads((tmp_path / "out" / RECORD).read_text()) == settings
     assert main(arguments) == 0
     assert (seen["workers"], seen["threads"]) == (6, 1)
