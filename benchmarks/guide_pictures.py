@@ -78,7 +78,7 @@ def bandwidth() -> Figure:
         beta = captured_energy(operator.spectrum(), luminance).item()
         finest[f"{title}, beta {beta:.4f}"] = 0.5 + 4 * detail_layers(operator, luminance)[0, 0]
         edited[title] = edit_luminance(image, lambda planes, w=operator: polynomial_filter(w, planes, ALPHA))
-        print(f"bandwidth {levels:.1f}: beta {beta:.5f}")
+        print(f"bandwidth {levels:.1f}: beta {beta:.4f}")
     panels = {title: crop(panel, WHISKERS) for title, panel in (finest | edited).items()}
     return show_images(panels, columns=4, side=240)
 

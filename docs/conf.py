@@ -1,0 +1,30 @@
+"""How ``make docs`` turns these pages and the docstrings into a website, without a look at the network."""
+
+import nlfilter_torch
+
+project = "nlfilter-torch"
+version = release = nlfilter_torch.__version__
+author = copyright = "The nlfilter-torch maintainers"
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+html_theme = "furo"
+html_title = f"nlfilter-torch {release}"
+html_show_sphinx = False
+html_copy_source = False
+
+myst_heading_anchors = 3
+myst_links_external_new_tab = False
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # the docstrings give shapes and ranges; signatures would drown in unions
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+python_use_unqualified_type_names = True
+
+# A reference from a docstring that leads nowhere is an error, but for other libraries and for what is not public.
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(torch|numpy|matplotlib)\..*"),
+    ("py:mod", r"nlfilter_torch\.\w+"),
+    ("py:class", r"nlfilter_torch\.[a-z_]+\.\w+"),
+]
