@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from benchmarks import edits
 from benchmarks.figures import FIGURES
 from benchmarks.figures.__main__ import main
 
@@ -32,3 +33,20 @@ def test_only_some_and_no_unknown_ones(tmp_path: Path, capsys: pytest.CaptureFix
     with pytest.raises(SystemExit):
         main(["--only", "2,6", "--out", str(tmp_path)])
     assert "got 2" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_every_promise_of_masks_and_edits_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        edits.main(["--out", str(tmp_path / "edits.json")])
+    assert end.value.code == 0, capsys.readouterr().out
+    kept = json.loads((tmp_path / "edits.json").read_text(encoding="utf-8"))
+    assert len(kept) == 16
+    assert all(promise["holds"] for promise in kept)
+    assert "FALLS SHORT" not in capsys.readouterr().out
+
+
+def test_a_promise_that_is_broken_is_told() -> None:
+    assert not edits.Promise("", 1.0, 2.0).holds
+    assert not edits.Promise("", 2.0, 1.0, at_least=True).holds
+    assert not edits.Promise("", 1.0, float("nan")).holds

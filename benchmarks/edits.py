@@ -1,0 +1,173 @@
+"""What masks and edits have to keep, and how well they do: ``python -m benchmarks.edits [--out FILE]``.
+
+One line for every promise, with its limit and what was measured, on photographs that ship with scikit-image. The larger
+comparisons have modules of their own: ``benchmarks.colorize``, ``benchmarks.sharpening``, ``benchmarks.figures``.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import skimage.data
+import torch
+import torch.nn.functional as F
+from skimage.color import rgb2hsv
+from torch import Tensor
+
+from benchmarks.figures.scenes import luminance, scene, spots, strokes
+from nlfilter_torch import (
+    Spectrum,
+    abstract,
+    adjust_tone,
+    defocus,
+    diffusion_mask,
+    filter_frames,
+    nonlocal_operator,
+    recolor,
+)
+from nlfilter_torch.files import open_beside
+
+SUIT = (60, 300, 20, 20)  # column, row, width, height on the astronaut's suit
+TIMES = (0.5, 1.0, 2.0, 5.0)
+STEP = 7  # pixels that the camera moves from frame to frame
+
+
+@dataclass(frozen=True)
+class Promise:
+    """A figure that has to be at least, or at most, its limit."""
+
+    what: str
+    limit: float
+    measured: float
+    at_least: bool = False
+
+    @property
+    def holds(self) -> bool:
+        """Is it kept?"""
+        return self.measured >= self.limit if self.at_least else self.measured <= self.limit
+
+
+def _astronaut(side: int) -> tuple[Tensor, Tensor, Spectrum]:
+    """Photograph, spot on the suit, and the spectrum that compares colours."""
+    image, scale = scene("astronaut", side)
+    operator = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all")
+    return image, spots(image, scale, SUIT), operator.spectrum()
+
+
+def masks() -> Iterator[Promise]:
+    """Of a spot on the astronaut's suit, RGB guide, h = 25/255."""
+    _, spot, whole = _astronaut(512)
+    _, small_spot, preview = _astronaut(256)
+    mask = diffusion_mask(whole, spot)
+    hue, saturation, value = rgb2hsv(skimage.data.astronaut()).transpose(2, 0, 1)
+    below_collar = np.arange(512)[:, None] > 200
+    suit = torch.from_numpy((hue > 0.01) & (hue < 0.08) & (saturation > 0.6) & (value > 0.35) & below_collar)
+    ratio = float(mask[0, 0][suit].mean() / mask[0, 0][~suit].mean())
+    yield Promise("mask at t = 1: mean on the suit, over the mean elsewhere", 3.0, ratio, at_least=True)
+    levels = torch.linspace(0, 1, 21)
+    quantiles = torch.stack([diffusion_mask(preview, small_spot, time=t).flatten().quantile(levels) for t in TIMES])
+    yield Promise(
+        f"least growth of any of 21 quantiles of it, t = {TIMES}",
+        0.0,
+        float(quantiles.diff(dim=0).min()),
+        at_least=True,
+    )
+    yield Promise("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
+    yield Promise("largest value of the mask", 1.0, float(mask.max()))
+    apart = F.avg_pool2d(mask, 2) - diffusion_mask(preview, small_spot)
+    yield Promise("mean difference of the masks at 256 and at 512 pixels", 0.05, float(apart.abs().mean()))
+
+
+def recolouring() -> Iterator[Promise]:
+    """One blue stroke on the suit."""
+    image, scale = scene("astronaut", 256)
+    colours, painted = strokes(image, scale, (SUIT, (0.1, 0.3, 0.9)))
+    edited = recolor(image, colours, painted)
+    change = float(255 * (luminance(edited) - luminance(image)).abs().max())
+    yield Promise("recolor: largest change of luminance, grey levels", 1.0, change)
+    outside = spots(image, scale, (300, 20, 100, 120)).expand_as(image) > 0  # backdrop
+    yield Promise("recolor: largest change of the backdrop, grey levels", 2.0, _levels(edited - image, outside))
+    kept = spots(image, scale, (200, 90, 50, 60))  # face
+    edited = recolor(image, colours, painted, keep=kept)
+    yield Promise(
+        "recolor: largest change of what is to be kept", 2.0, _levels(edited - image, kept.expand_as(image) > 0)
+    )
+
+
+def focusing() -> Iterator[Promise]:
+    """The astronaut stays sharp, the shuttle behind her does not."""
+    image, scale = scene("astronaut", 256)
+    region = spots(image, scale, (188, 60, 60, 60), (40, 260, 32, 160))
+    face, shuttle = spots(image, scale, (180, 88, 72, 80)), spots(image, scale, (380, 0, 132, 240))
+    for aperture in ("disc", "gaussian"):
+        blurred = defocus(image, region, radius=4.0, aperture=aperture)
+        kept = _energy(blurred, face) / _energy(image, face)
+        yield Promise(f"defocus, {aperture}: gradient energy that the face keeps", 0.95, kept, at_least=True)
+        left = _energy(blurred, shuttle) / _energy(image, shuttle)
+        yield Promise(f"defocus, {aperture}: gradient energy left behind it", 0.3, left)
+
+
+def abstraction() -> Iterator[Promise]:
+    """Towards k = 0, and the mean under contrast."""
+    image = scene("chelsea", 256)[0]
+    for power, limit in ((0.0, 0.01), (1e-5, 0.1)):
+        change = float(255 * (abstract(image, power=power) - image).square().mean().sqrt())
+        yield Promise(f"abstract, k = {power:g}: RMS change, grey levels", limit, change)
+    drift = adjust_tone(image, contrast=1.4, clarity=3.0).mean((2, 3)) - image.mean((2, 3))
+    yield Promise("tone, contrast 1.4: drift of the mean, grey levels", 0.1, float(255 * drift.abs().max()))
+
+
+def pan() -> Iterator[Promise]:
+    """Ten frames of a camera that moves over the astronaut, edited together and each alone."""
+    whole = scene("astronaut", 512)[0]
+    film = [whole[..., 60 + STEP * i : 160 + STEP * i, 130 + STEP * i : 250 + STEP * i] for i in range(10)]
+    alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
+    together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
+    each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
+    yield Promise(
+        "flicker of a pan of ten frames, over that of frames edited alone", 0.25, _flicker(together) / _flicker(each)
+    )
+
+
+def _levels(difference: Tensor, where: Tensor) -> float:
+    return float(255 * difference[where].abs().max())
+
+
+def _energy(image: Tensor, where: Tensor) -> float:
+    rows, columns = image.diff(dim=2)[..., :-1], image.diff(dim=3)[..., :-1, :]
+    return float(((rows.square() + columns.square()) * where[..., :-1, :-1]).sum())
+
+
+def _flicker(edited: list[Tensor]) -> float:
+    pairs = [(a[..., STEP:, STEP:] - b[..., :-STEP, :-STEP]).abs().mean() for a, b in pairwise(edited)]
+    return float(torch.stack(pairs).mean())
+
+
+TOPICS: tuple[Callable[[], Iterator[Promise]], ...] = (masks, recolouring, focusing, abstraction, pan)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print a line for every promise; exit with 1 if one is broken."""
+    parser = argparse.ArgumentParser(description="What masks and edits have to keep, and how well they do.")
+    parser.add_argument("--out", type=Path, help="also write them as JSON")
+    options = parser.parse_args(arguments)
+    kept = []
+    print(f"{'':66}{'limit':>12}{'measured':>12}")
+    for topic in TOPICS:
+        for promise in topic():
+            kept.append(asdict(promise) | {"holds": promise.holds})
+            sign = ">=" if promise.at_least else "<="
+            verdict = "" if promise.holds else "  FALLS SHORT"
+            print(f"{promise.what:66}{sign + f' {promise.limit:g}':>12}{promise.measured:12.4g}{verdict}", flush=True)
+    if options.out is not None:
+        with open_beside(options.out) as stream:
+            stream.write((json.dumps(kept, indent=1) + "\n").encode())
+    raise SystemExit(not all(promise["holds"] for promise in kept))
+
+
+if __name__ == "__main__":
+    main()
