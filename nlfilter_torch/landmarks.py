@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.sharding import Shard, from_first, gather_columns
+from nlfilter_torch.sharding import Shard, from_first, gather_columns, reduce_sum
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
@@ -139,10 +139,11 @@ def assign(points: Tensor, centres: Tensor) -> Tensor:
     return score.max(dim=2).indices
 
 
-def cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
+def cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor, shard: Shard | None = None) -> Tensor:
     """Mean (B, D, K) of the points (B, D, S) of every cluster; an empty one takes its column of ``fallback``."""
     members = points.new_zeros(points.shape[0], fallback.shape[2], points.shape[2])
     members.scatter_(1, assignment.unsqueeze(1), 1.0)
-    sizes = members.sum(2).unsqueeze(1)  # (B, 1, K)
-    means = points @ members.mT / sizes.clamp(min=1.0)  # a product, not an index_add: deterministic on every device
+    sizes = reduce_sum(members.sum(2).unsqueeze(1), shard)  # (B, 1, K)
+    sums = reduce_sum(points @ members.mT, shard)  # a product, not an index_add: deterministic on every device
+    means = sums / sizes.clamp(min=1.0)
     return torch.where(sizes > 0, means, fallback)

@@ -10,7 +10,7 @@ from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.landmarks import assign, cluster_means
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import Shard, check_whole, reduce_sum, replicate
+from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import Spectrum
 
 ITERATIONS = 20  # of k-means, which starts close to its end
@@ -139,17 +139,18 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
             positive.
     """
     check_positive(time, "time")
-    check_whole(spectrum.shard, "segment_mask")
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions")  # (B, K, N)
         coordinates = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
-        centres = (weights @ coordinates.mT).mT  # (B, M, K)
+        centres = reduce_sum(weights @ coordinates.mT, spectrum.shard).mT  # (B, M, K)
         assignment = assign(coordinates, centres)
         for _ in range(ITERATIONS):
-            centres = cluster_means(coordinates, assignment, centres)
+            centres = cluster_means(coordinates, assignment, centres, spectrum.shard)
             previous, assignment = assignment, assign(coordinates, centres)
-            if coordinates.device.type == "cpu" and torch.equal(previous, assignment):
+            if coordinates.device.type != "cpu":  # a look would be a wait
+                continue
+            if not reduce_max((previous != assignment).any().to(coordinates), spectrum.shard):
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
     return mask.unflatten(2, spectrum.size).to(regions.dtype)

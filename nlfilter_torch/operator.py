@@ -24,7 +24,7 @@ from nlfilter_torch.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.nystrom import Completion, nystrom_factor, whitener
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
-from nlfilter_torch.sharding import Shard, check_whole, meet, replicate, with_halo
+from nlfilter_torch.sharding import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import Spectrum, compute_spectrum
 
@@ -156,34 +156,31 @@ class NonlocalOperator:
     @full_precision
     @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
-        """Measure how good the operator is. Costs several times as much as the spectrum.
-
-        Raises:
-            ValueError: if other ranks have a part of the image.
-        """
-        check_whole(self.shard, "diagnostics")
+        """Measure how good the operator is. Costs several times as much as the spectrum."""
         spectrum = self.spectrum()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]
         image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
-        residual = (image - spectrum.eigenvalues[:, :, None, None] * vectors).flatten(2).norm(dim=2)
+        error = (image - spectrum.eigenvalues[:, :, None, None] * vectors).square().sum((2, 3))
+        residual = reduce_sum(error, self.shard).sqrt()
         flat = vectors.flatten(2)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
-        total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1)).to(self.factor)
+        total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1), self.shard).to(self.factor)
         kernel_sums = (total.mT @ self.factor).squeeze(1) + self.diagonal
         bandwidth = torch.as_tensor(self.kernel.photometric_bandwidth).reshape(-1).expand(self.factor.shape[0])
+        share = (self.scaling * (self.scaling * self.diagonal)).sum(1)
         return Diagnostics(
-            pixels=self.factor.shape[2],
+            pixels=spectrum.pixels,
             num_landmarks=self.factor.shape[1],
             rank=spectrum.support.sum(1).tolist(),
             photometric_bandwidth=bandwidth.tolist(),
             balancing_steps=self.balancing_steps,
-            row_sum_residual=(self.row_sums() - 1).abs().amax((1, 2, 3)).tolist(),
-            smallest_row_sum=kernel_sums.amin(1).tolist(),
+            row_sum_residual=reduce_max((self.row_sums() - 1).abs().amax((1, 2, 3)), self.shard).tolist(),
+            smallest_row_sum=(-reduce_max(-kernel_sums.amin(1), self.shard)).tolist(),
             largest_eigenvalue=spectrum.largest.tolist(),
             eigenvector_residual=residual.amax(1).tolist(),
-            orthogonality=(flat @ flat.mT - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(self.scaling * (self.scaling * self.diagonal)).mean(1).tolist(),
+            orthogonality=(reduce_sum(flat @ flat.mT, self.shard) - occupied).abs().amax((1, 2)).tolist(),
+            diagonal_share=(reduce_sum(share, self.shard) / spectrum.pixels).tolist(),
         )
 
 

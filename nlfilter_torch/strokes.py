@@ -14,7 +14,7 @@ from torch import Tensor
 from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import check_image, check_positive, check_same_size, check_unit_range
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import check_whole
+from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import Spectrum
 
 SPOT = 25 / 38400  # share of the image that a dab of a brush covers: 5x5 pixels of 160x240
@@ -60,18 +60,19 @@ def propagate_strokes(
         >>> propagate_strokes(spectrum, strokes, painted)[0, 0, 2, ::5].round(decimals=1).abs()
         tensor([0., 0., 1., 1.])
     """
-    check_whole(spectrum.shard, "propagate_strokes")
+    shard = spectrum.shard
     batch = spectrum.factor.shape[0]
     images = max(batch, strokes.shape[0], stroke_mask.shape[0])
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum")
-    check_painted(stroke_mask)
+    check_painted(stroke_mask, shard=shard)
     check_share(strength, "strength")
     check_share(reach, "reach", below=True)
     check_positive(smoothness, "smoothness")
 
-    factor, pixels = spectrum.factor, spectrum.factor.shape[2]
+    strength, reach, smoothness = (replicate(value, shard) for value in (strength, reach, smoothness))
+    factor = spectrum.factor
     weights = stroke_mask.to(factor).flatten(2)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
     if not weights.requires_grad:  # the weight of an unpainted pixel has a derivative, but no effect
@@ -80,18 +81,20 @@ def propagate_strokes(
     walk = _per_image(reach, spectrum.root).squeeze(2)  # (B or 1, 1)
     core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues))  # (B, M, M), float64
 
-    spot = SPOT * pixels
-    weights = _raise_dots(factor, weights, core, spot)
-    gram = moment(factor * weights, factor) @ core
-    variance = gram.diagonal(dim1=1, dim2=2).sum(1) / weights.double().sum((1, 2))  # of a painted pixel, on average
+    spot = SPOT * spectrum.pixels
+    weights = _raise_dots(factor, weights, core, spot, shard)
+    gram = moment(factor * weights, factor, shard) @ core
+    painted_weight = reduce_sum(weights.double().sum((1, 2)), shard)
+    variance = gram.diagonal(dim1=1, dim2=2).sum(1) / painted_weight  # of a painted pixel, on average
     noise = _per_image(smoothness, gram) * (NOISE * spot * variance).reshape(-1, 1, 1)
     known = torch.cat([values, torch.ones_like(values[:, :1])], dim=1).expand(images, -1, -1)
-    target = moment(factor.expand(images, -1, -1), weights * known)  # (B, M, C+1)
+    target = moment(factor.expand(images, -1, -1), weights * known, shard)  # (B, M, C+1)
     solution = core @ torch.linalg.solve(gram + noise * torch.eye(gram.shape[1]).to(gram), target)
 
     # The last column extends a stroke of ones: how far each pixel is reached at all. Generalised least squares tells
     # the mean from what both leave unexplained on the strokes, and unreached pixels get their part of it.
-    unexplained = (weights * known).double().sum(2) - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
+    sums = reduce_sum((weights * known).double().sum(2), shard)
+    unexplained = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
     mean = unexplained[:, :-1] / unexplained[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
     weights_of_pixels = (solution[:, :, :-1] - solution[:, :, -1:] * share).mT.to(factor)  # (B, C, M)
@@ -99,10 +102,10 @@ def propagate_strokes(
     return spread.unflatten(2, spectrum.size).to(strokes.dtype)
 
 
-def check_painted(stroke_mask: Tensor, name: str = "stroke_mask") -> None:
+def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shard | None = None) -> None:
     """Raise unless every image of ``stroke_mask`` (B, 1, H, W) holds a painted pixel and all values are in [0, 1]."""
     check_unit_range(stroke_mask, name)
-    empty = stroke_mask.detach().amax((1, 2, 3)) <= 0
+    empty = reduce_max(stroke_mask.detach().amax((1, 2, 3)), shard) <= 0
     if bool(empty.any()):
         raise ValueError(
             f"{name} must hold a painted pixel in every image, got none in image(s) "
@@ -120,16 +123,18 @@ def check_share(value: float | Tensor, name: str, *, below: bool = False) -> Non
         raise ValueError(f"{name} must be in [0, 1{')' if below else ']'}, got {values.tolist()}; clamp it")
 
 
-def _raise_dots(factor: Tensor, weights: Tensor, core: Tensor, spot: float) -> Tensor:
+def _raise_dots(factor: Tensor, weights: Tensor, core: Tensor, spot: float, shard: Shard | None) -> Tensor:
     """Weights (B, 1, n) under which painted pixels that few others resemble count like a whole spot.
 
     A dot that someone sets with care must not drown among broad strokes, nor in a large photograph.
     """
     if spot <= 1:
         return weights
-    gram = core @ moment(factor * weights, factor) @ core
+    gram = core @ moment(factor * weights, factor, shard) @ core
     variance = (factor * (core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
-    typical = (weights * variance).sum(2, keepdim=True) / weights.sum(2, keepdim=True)
+    typical = reduce_sum((weights * variance).sum(2, keepdim=True), shard) / reduce_sum(
+        weights.sum(2, keepdim=True), shard
+    )
     likes = (factor * (gram.to(factor) @ factor)).sum(1, keepdim=True) / (
         variance * typical
     )  # sum of squared correlations
