@@ -330,7 +330,7 @@ class Editor:
 
     def _complain(self, sentence: str) -> None:
         with self._client:
-            ui.notify(sentence, type="negative", position="top", timeout=10000, close_button="OK", multi_line=True)
+            ui.notify(sentence, type="negative", position="bottom", timeout=10000, close_button="OK", multi_line=True)
 
     async def _run(self, doing: str, work: Callable[[], Any]) -> Any:
         """Do something in a thread; the page says so if it takes its time."""

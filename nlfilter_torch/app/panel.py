@@ -120,7 +120,7 @@ class Panel:
     def _build_detail(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
         self._presets = ui.select(names, label="Start from", on_change=lambda event: self._choose(event.value))
-        self._presets.props('dense outlined options-dense aria-label="Preset"').classes("w-full")
+        self._presets.props("dense outlined options-dense").classes("w-full")
         self._box = ui.column().classes("w-full gap-1")
         self._response = ui.html("", sanitize=False).classes("w-full q-mt-sm")
         self._response.tooltip("What the sliders do to each eigenvalue of the filter; each dot is one of them.")

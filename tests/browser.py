@@ -1,0 +1,128 @@
+"""A headless Chromium and an editor of its own for tests."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+TIMEOUT = 15_000  # milliseconds; a machine may be busy
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A browser that is closed in the end."""
+    with sync_playwright() as playwright:
+        # As root, as in most containers, Chromium has no sandbox; it opens nothing but this machine's own pages here.
+        options = ["--no-sandbox"] if os.geteuid() == 0 else []
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield browser
+        browser.close()
+
+
+class Editor:
+    """``nlfilter-torch app`` as a process of its own."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        command = [sys.executable, "-m", "nlfilter_torch", "app", "--no-open", *arguments]
+        # NiceGUI would take the process for a test of its own if pytest's variables reached it.
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+        environment = inherited | {"OMP_NUM_THREADS": "1"}
+        self.log = folder / "log.txt"
+        with self.log.open("w") as stream:
+            self.process = subprocess.Popen(
+                command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=stream, text=True
+            )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        found = re.search(r"http://\S+/", line)
+        if found is None:
+            self.stop()
+            raise RuntimeError(self.log.read_text())
+        self.url = found[0]
+
+    def stop(self) -> None:
+        """End the process as Ctrl+C does."""
+        self.process.terminate()
+        self.process.wait(30)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+class Tab:
+    """A page of the editor, and what a person does there."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        page.set_default_timeout(TIMEOUT)
+        expect.set_options(timeout=TIMEOUT)
+        self.photo = page.locator(".photo > img").first
+        self.mask = page.get_by_alt_text("mask")
+
+    def slider(self, name: str) -> Locator:
+        """The slider of that label."""
+        return self.page.get_by_role("slider", name=name, exact=True)
+
+    def source(self) -> str:
+        """Address of the picture that is shown; a new one for each."""
+        return self.photo.get_attribute("src") or ""
+
+    def wait_for_picture(self, other_than: str = "") -> None:
+        """Wait until a picture is there that has another address, and nothing is at work."""
+        self.page.wait_for_function(
+            """old => { const image = document.querySelector('.photo > img');
+            return image && image.getAttribute('src') && image.getAttribute('src') != old && image.complete
+            && image.naturalWidth > 0; }""",
+            arg=other_than,
+        )
+
+    def open(self, path: Path) -> None:
+        """Choose a photograph."""
+        self._choose("Open", path)
+
+    def load_edit(self, path: Path) -> None:
+        """Choose an edit."""
+        self._choose("Load edit", path)
+
+    def _choose(self, button: str, path: Path) -> None:
+        with self.page.expect_file_chooser() as chooser:
+            self.page.get_by_role("button", name=button, exact=True).click()
+        chooser.value.set_files(path)
+
+    def drag(self, slider: Locator, start: float, end: float, *, steps: int = 4, release: bool = True) -> None:
+        """Drag a slider from one share of its length to another."""
+        box = slider.bounding_box()
+        assert box is not None
+        y = box["y"] + box["height"] / 2
+        self.page.mouse.move(box["x"] + start * box["width"], y)
+        self.page.mouse.down()
+        self.page.mouse.move(box["x"] + end * box["width"], y, steps=steps)
+        if release:
+            self.page.mouse.up()
+
+    def paint(self, *points: tuple[float, float], release: bool = True) -> None:
+        """Draw a line through points given as shares of the picture."""
+        box = self.photo.bounding_box()
+        assert box is not None
+        at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
+        self.page.mouse.move(*at[0])
+        self.page.mouse.down()
+        for point in at[1:]:
+            self.page.mouse.move(*point, steps=4)
+        if release:
+            self.page.mouse.up()
+
+    def save(self, button: str, name: str) -> None:
+        """Save under a name, and wait until that is done."""
+        self.page.get_by_role("button", name=button, exact=True).click()
+        self.page.get_by_label("Name").fill(name)
+        self.page.get_by_role("button", name="Save", exact=True).click()
+        self.page.get_by_text("Saved ").and_(self.page.get_by_text(name)).wait_for()
