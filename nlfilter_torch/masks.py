@@ -13,6 +13,7 @@ from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import Spectrum
 
+FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
 ITERATIONS = 20  # of k-means, which starts close to its end
 
 
@@ -84,8 +85,7 @@ def diffusion_mask(
     basis = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
     scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(basis).reshape(-1, 1, 1)
     exponents = scale * _squared_distances(basis, weights, spectrum.shard)  # (B, K, N)
-    # Far pixels would underflow to 0, where a product of masks loses what it stands for.
-    mask = torch.exp(-exponents.clamp(max=60.0))
+    mask = torch.exp(-exponents.clamp(max=FARTHEST))
     if negative is not None:
         others = region_weights(spectrum, negative, name="negative")
         if others.shape[1] not in (1, weights.shape[1]):
@@ -100,7 +100,11 @@ def diffusion_mask(
 
 def _squared_distances(coordinates: Tensor, weights: Tensor, shard: Shard | None) -> Tensor:
     """Squared distances (B, K, N) of all pixels to the weighted means of regions (B, K, N), coordinates (B, M, N)."""
-    centres = reduce_sum(weights @ coordinates.mT, shard)  # (B, K, M)
+    return squared_distances(coordinates, reduce_sum(weights @ coordinates.mT, shard))
+
+
+def squared_distances(coordinates: Tensor, centres: Tensor) -> Tensor:
+    """Squared distances (B, K, N) of all pixels with coordinates (B, M, N) to centres (B, K, M)."""
     return torch.stack([(coordinates - c.unsqueeze(2)).square().sum(1) for c in centres.unbind(1)], dim=1)
 
 

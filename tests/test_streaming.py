@@ -13,8 +13,10 @@ from torch import Tensor
 from nlfilter_torch import landmarks as landmarks_module
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.edits.enhance import colour_masks
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.landmarks import candidate_pixels
+from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.streaming import sampling, stream_detail
 from nlfilter_torch.streaming.statistics import balance_by_passes
 
@@ -115,6 +117,53 @@ def test_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 1e-5 < difference < LEVEL
 
 
+def spots(height: int, width: int) -> Array:
+    """Two regions (height, width, 2), one of them of half weight."""
+    regions = np.zeros((height, width, 2), np.float32)
+    regions[10:20, 15:30, 0] = 1
+    regions[30:40, 60:70, 1] = 0.5
+    return regions
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("alpha", [ALPHA, torch.stack([ALPHA, torch.tensor([0.2, 0.5, 1.0, 1.0])])])
+def test_regions_are_those_in_memory(alpha: Tensor) -> None:
+    picture, regions = cat(60, 90), spots(60, 90)
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    options: dict[str, Any] = {"num_landmarks": 50, "spatial_bandwidth": 60.0}
+    masks = colour_masks(image, torch.from_numpy(regions).permute(2, 0, 1)[None], time=0.7, width=3.0, **options)
+    operator = nonlocal_operator(reduce_channels(image, "luminance"), **options)
+    wanted = edit_luminance(image, lambda planes: filter_regions(operator, planes, masks, alpha.expand(2, -1)))
+    edited = streamed(picture, alpha, regions=regions, time=0.7, width=3.0, statistics="full", tile_rows=17, **options)
+    assert np.abs(edited - wanted[0].permute(1, 2, 0).numpy()).max() < 2e-5
+
+
+def test_regions_of_a_sample_are_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "PILOT", 1 << 13)
+    picture, regions = cat(200, 260), spots(200, 260)
+    full, some = (
+        streamed(picture, regions=regions, statistics=statistics, sample=1 << 15, num_landmarks=30)
+        for statistics in ("full", "sample")
+    )
+    assert 0 < np.abs(full - some).max() < 3 * LEVEL  # with a thirtieth of the sample of a large picture
+    assert np.abs(full - picture).max() > 10 * LEVEL
+
+
+@pytest.mark.parametrize(
+    ("regions", "alpha", "message"),
+    [
+        (np.ones((20, 30), np.float32), ALPHA, r"regions must have the shape \(20, 30, 'K'\)"),
+        (np.ones((20, 31, 1), np.float32), ALPHA, r"regions must have the shape \(20, 30, 'K'\)"),
+        (np.zeros((20, 30, 1), np.float32), ALPHA, "regions must each hold a pixel"),
+        (-np.ones((20, 30, 1), np.float32), ALPHA, "regions must be non-negative"),
+        (np.ones((20, 30, 2), np.float32), ALPHA[None], "alpha must have a row for each of the 2 regions, got 1"),
+    ],
+)
+def test_regions_that_cannot_be_used_are_named(regions: Array, alpha: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        streamed(cat(20, 30), alpha, regions=regions, num_landmarks=20)
+
+
 @pytest.mark.usefixtures("small_blocks")
 def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> None:
     picture = sampling.Picture(cat(90, 120))
@@ -124,9 +173,11 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> 
 
     pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=30)
     for spectral in (False, True):
-        chosen = sampling.sample_by_influence(picture, pilot, image, 3000, lambda *_: None, spectral=spectral)
-        assert 2500 < chosen.weights.numel() < 3500
-        assert abs(float(chosen.weights.sum()) / picture.pixels - 1) < 0.1
+        parts = sampling.sample_by_influence(picture, pilot, image, 3000, lambda *_: None, spectral=spectral)
+        assert len(parts) > 1
+        weights = sampling.Sample.together(parts).weights
+        assert 2500 < weights.numel() < 3500
+        assert abs(float(weights.sum()) / picture.pixels - 1) < 0.1
 
 
 @pytest.mark.usefixtures("small_blocks")

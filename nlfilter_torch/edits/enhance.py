@@ -12,6 +12,7 @@ from nlfilter_torch.masks import diffusion_mask, filter_regions
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 
+MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
 SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter
 
 
@@ -25,7 +26,7 @@ def enhance(
     residual: float | Tensor | None = None,
     time: float | Tensor = 1.0,
     width: float | Tensor = 4.0,
-    mask_bandwidth: float | Tensor = 25 / 255,
+    mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
     **options: Any,
 ) -> Tensor:
     """Move the detail sliders of a photograph, each region's own sliders for all that looks like it.
@@ -86,7 +87,7 @@ def colour_masks(
     negative: Tensor | None = None,
     time: float | Tensor = 1.0,
     width: float | Tensor = 4.0,
-    mask_bandwidth: float | Tensor = 25 / 255,
+    mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
     **options: Any,
 ) -> Tensor:
     """Diffusion masks (B, K, H, W) by colour, as :func:`enhance` uses them, with its arguments."""

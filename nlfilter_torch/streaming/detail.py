@@ -9,18 +9,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_choice, check_count
+from nlfilter_torch.checks import check_alpha, check_choice, check_count, check_positive
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
-from nlfilter_torch.precision import full_precision
+from nlfilter_torch.masks import blend_regions
+from nlfilter_torch.streaming.fitting import FittedMasks, Statistics, fit_masks, fit_picture
 from nlfilter_torch.streaming.rows import KINDS, Picture, RowSource, RowTarget, Tile, stored_as, transparency
-from nlfilter_torch.streaming.sampling import Report, all_blocks, sample_by_influence, take_pilot
-from nlfilter_torch.streaming.statistics import Block, balance_by_passes, sum_up
+from nlfilter_torch.streaming.sampling import Report
 
 SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
-Statistics = Literal["sample", "full"]
 Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
 
 
@@ -28,8 +27,11 @@ def stream_detail(
     source: RowSource,
     target: RowTarget,
     alpha: Tensor,
+    regions: RowSource | None = None,
     *,
     residual: float | None = None,
+    time: float = 1.0,
+    width: float = 4.0,
     channels: Literal["luminance", "all"] = "luminance",
     statistics: Statistics = "sample",
     sample: int = SAMPLE,
@@ -50,8 +52,13 @@ def stream_detail(
             carried along. Integers count from 0 to 1, whatever their range.
         target: what takes the rows, in their order, by assignment to a slice, with the source's shape and a dtype of
             its own.
-        alpha: sliders (k+1,), as of :func:`polynomial_filter`.
+        alpha: sliders (k+1,), as of :func:`polynomial_filter`; with regions (K, k+1), a row for each, or (k+1,) for
+            all.
+        regions: rows (H, W, K), non-negative weights of the pixels of K regions: all that looks like them is edited,
+            as by :func:`enhance`. None edits the whole picture.
         residual: as of :func:`polynomial_filter`.
+        time: diffusion time of the masks that grow from the regions; larger reaches further.
+        width: squared diffusion distance at which a mask has fallen to 1/e.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
         statistics: ``"sample"`` balances the filter and finds its coefficients on a sample of the pixels, in which
             rare patches come before common ones, after two readings of the source; ``"full"`` on all pixels, in four
@@ -81,8 +88,11 @@ def stream_detail(
     rows = detail_rows(
         source,
         alpha,
+        regions,
         kind=np.dtype(target.dtype).name,
         residual=residual,
+        time=time,
+        width=width,
         channels=channels,
         statistics=statistics,
         sample=sample,
@@ -98,9 +108,12 @@ def stream_detail(
 def detail_rows(
     source: RowSource,
     alpha: Tensor,
+    regions: RowSource | None = None,
     *,
     kind: str,
     residual: float | None = None,
+    time: float = 1.0,
+    width: float = 4.0,
     channels: Literal["luminance", "all"] = "luminance",
     statistics: Statistics = "sample",
     sample: int = SAMPLE,
@@ -115,7 +128,9 @@ def detail_rows(
     Errors call the source ``name``.
     """
     picture = Picture(source, name)
-    check_alpha(alpha, dimensions=(1,))
+    check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
+    check_positive(time, "time")
+    check_positive(width, "width")
     check_choice(channels, "channels", ("luminance", "all"))
     check_choice(statistics, "statistics", ("sample", "full"))
     check_choice(kind, "dtype of the target", KINDS)
@@ -125,10 +140,28 @@ def detail_rows(
     if tile_rows is not None:
         check_count(tile_rows, "tile_rows")
     report = report or (lambda stage, done, rows: None)
-    rows = tile_rows or rows_in_memory(picture, memory, len(alpha), **options)
+    rows = tile_rows or rows_in_memory(picture, memory, alpha.shape[-1], regions is not None, **options)
+    generator, masks = options.get("generator"), None
+    if regions is not None:
+        if alpha.ndim == 2 and len(alpha) != regions.shape[-1]:
+            raise ValueError(
+                f"alpha must have a row for each of the {regions.shape[-1]} regions, got {len(alpha)}; add or drop some"
+            )
+        alpha = alpha.expand(regions.shape[-1], -1)
+        own = {} if generator is None else {"generator": generator.clone_state()}  # as if each were made alone
+        masks = fit_masks(
+            picture,
+            regions,
+            time=time,
+            width=width,
+            statistics=statistics,
+            sample=sample,
+            report=report,
+            **options | own,
+        )
     fitted = fit_picture(
         picture,
-        len(alpha) - 1,
+        alpha.shape[-1] - 1,
         channels=channels,
         statistics=statistics,
         sample=sample,
@@ -138,59 +171,29 @@ def detail_rows(
     )
 
     def edit(tile: Tile) -> Tensor:
-        return _edit(tile, fitted, alpha, residual, channels)
+        return _edit(tile, fitted, masks, alpha, residual, channels)
 
     yield from work_out(picture, edit, kind, fitted.kernel.patch_weights.shape[0] // 2, rows, report)
 
 
-@torch.no_grad()
-@full_precision
-def fit_picture(
-    picture: Picture,
-    order: int,
-    *,
+def _edit(
+    tile: Tile,
+    fitted: FittedFilter,
+    masks: FittedMasks | None,
+    alpha: Tensor,
+    residual: float | None,
     channels: Literal["luminance", "all"],
-    statistics: Statistics,
-    sample: int,
-    spectral: bool,
-    report: Report,
-    **options: Any,
-) -> FittedFilter:
-    """The filter of a picture that is read by rows, as :func:`fit_filter` makes it of an image in memory.
-
-    ``spectral``: a residual is going to be given.
-    """
-
-    def image(colours: Tensor) -> Tensor:
-        return reduce_channels(colours, "luminance") if channels == "luminance" else colours
-
-    pilot = take_pilot(picture, image, report, **options)
-    kernel = pilot.kernel
-    if statistics == "full" or sample >= picture.pixels:
-
-        def blocks(stage: str) -> Iterator[Block]:
-            return all_blocks(picture, kernel, image, report, stage)
-    else:
-        chosen = sample_by_influence(picture, pilot, image, sample, report, spectral=spectral)
-
-        def blocks(stage: str) -> Iterator[Block]:
-            report(stage, 0, 1)
-            return chosen.blocks(kernel)
-
-    balancing = balance_by_passes(lambda: blocks("Balancing"), pilot.balancing)
-    sums = sum_up(lambda: blocks("Summing up"), balancing, order)
-    return FittedFilter(kernel, balancing, sums.coefficients(), sums.explained())
-
-
-def _edit(tile: Tile, fitted: FittedFilter, alpha: Tensor, residual: float | None, channels: str) -> Tensor:
+) -> Tensor:
     """The colours (1, C, h, W) of a tile's rows under the sliders."""
+    image = tile.pixels if channels == "all" else reduce_channels(tile.pixels, "luminance")
 
-    def edit(image: Tensor) -> Tensor:
-        return fitted(image, alpha, tile.pixels, residual=residual, origin=tile.origin, halo=tile.halo)
+    def filtered(sliders: Tensor) -> Tensor:
+        return fitted(image, sliders, tile.pixels, residual=residual, origin=tile.origin, halo=tile.halo)
 
-    if channels == "all":
-        return edit(tile.pixels)
-    return edit_luminance(tile.inner, lambda _: edit(reduce_channels(tile.pixels, "luminance")))
+    def edit(inner: Tensor) -> Tensor:
+        return filtered(alpha) if masks is None else blend_regions(inner, masks(tile), alpha, filtered)
+
+    return edit(tile.inner) if channels == "all" else edit_luminance(tile.inner, edit)
 
 
 def work_out(
@@ -209,6 +212,7 @@ def rows_in_memory(
     picture: Picture,
     memory: int,
     sliders: int,
+    masked: bool,
     *,
     num_landmarks: int = 100,
     patch_size: int = 5,
@@ -224,6 +228,8 @@ def rows_in_memory(
     check_count(patch_size, "patch_size")
     planes = patch_size**2 * (picture.colours if guide_channels == "all" else 1)
     floats = num_landmarks + planes + (3 * sliders + 8) * picture.colours
+    if masked:  # coordinates, their differences from a centre, and features in colour
+        floats = max(floats, 3 * num_landmarks + patch_size**2 * picture.colours)
     row = picture.size[1] * floats * (8 if picture.dtype == torch.float64 else 4)
     if row > memory:
         raise MemoryError(

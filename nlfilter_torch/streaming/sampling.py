@@ -43,6 +43,12 @@ class Sample:
     image: Tensor
     weights: Tensor
 
+    @staticmethod
+    def together(parts: list["Sample"]) -> "Sample":
+        """Several samples as one."""
+        features, images, weights = zip(*((part.features, part.image, part.weights) for part in parts), strict=True)
+        return Sample(torch.cat(features, dim=2), torch.cat(images, dim=2), torch.cat(weights, dim=1))
+
     def blocks(self, kernel: Kernel) -> Iterator[Block]:
         """Factor and diagonal of the sample, a chunk at a time."""
         for features, image, weights in zip(
@@ -150,8 +156,8 @@ def take_pilot(
 
 def sample_by_influence(
     picture: Picture, pilot: Pilot, image: Image, count: int, report: Report, *, spectral: bool
-) -> Sample:
-    """About ``count`` pixels, rare ones more likely than common ones.
+) -> list[Sample]:
+    """About ``count`` pixels in several parts, rare ones more likely than common ones.
 
     A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
     of a photograph off by two grey levels and more. The influence of a pixel is its own share of what W makes of it,
@@ -163,7 +169,9 @@ def sample_by_influence(
     even = EVEN * count / picture.pixels
     influence = Influence.of(pilot, spectral=spectral)
     rate = _rate(influence(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
-    patches, values, weights, places = [], [], [], []
+    recipe = (kernel.patch_weights, kernel.photometric_bandwidth, kernel.spatial_bandwidth)
+    done: list[Sample] = []
+    waiting: list[Sample] = []  # of single tiles, much smaller than a chunk
     for tile in picture.tiles(size // 2, picture.statistics_rows):
         report("Sampling", tile.start, picture.size[0])
         guide = reduce_channels(tile.pixels, kernel.guide_channels)
@@ -171,13 +179,14 @@ def sample_by_influence(
         likely = (even + rate * influence(features)).clamp(max=1.0)
         drawn = torch.from_numpy(generator.random(likely.numel())) < likely
         chosen = drawn.nonzero().squeeze(1)
-        patches.append(_patches(guide, tile, chosen, size))
-        values.append(image(tile.inner).flatten(2)[:, :, chosen])
-        weights.append(likely[chosen].reciprocal())
-        places.append(chosen + tile.start * picture.size[1])
-    recipe = (kernel.patch_weights, kernel.photometric_bandwidth, kernel.spatial_bandwidth)
-    features = _scaled(torch.cat(patches, dim=2), torch.cat(places), picture, *recipe)
-    return Sample(features, torch.cat(values, dim=2), torch.cat(weights).to(picture.dtype)[None])
+        patches, places = _patches(guide, tile, chosen, size), chosen + tile.start * picture.size[1]
+        values = image(tile.inner).flatten(2)[:, :, chosen]
+        weights = likely[chosen].reciprocal().to(picture.dtype)[None]
+        waiting.append(Sample(_scaled(patches, places, picture, *recipe), values, weights))
+        if sum(part.weights.numel() for part in waiting) >= CHUNK:
+            done.append(Sample.together(waiting))
+            waiting = []
+    return [*done, Sample.together(waiting)] if waiting else done
 
 
 def _visit(picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str) -> Iterator[tuple[Tile, Tensor]]:

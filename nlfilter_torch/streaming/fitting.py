@@ -1,0 +1,166 @@
+"""A picture that is read by rows to the filter and the masks of the whole, a few M-vectors each."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlfilter_torch.edits.enhance import MASK_BANDWIDTH, SHARED
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.frames import FittedFilter
+from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.masks import FARTHEST, squared_distances
+from nlfilter_torch.matrix_function import SymmetricMatrix
+from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.precision import full_precision
+from nlfilter_torch.spectrum import whiten_gram
+from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
+from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
+from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, sum_up
+
+Statistics = Literal["sample", "full"]
+MASK_SHARE = 2  # patches in colour are three times as large
+
+
+@torch.no_grad()
+@full_precision
+def fit_picture(
+    picture: Picture,
+    order: int,
+    *,
+    channels: Literal["luminance", "all"],
+    statistics: Statistics,
+    sample: int,
+    spectral: bool,
+    report: Report,
+    **options: Any,
+) -> FittedFilter:
+    """The filter of a picture, as :func:`fit_filter` makes it of an image in memory.
+
+    ``spectral``: a residual is going to be given.
+    """
+
+    def image(colours: Tensor) -> Tensor:
+        return reduce_channels(colours, "luminance") if channels == "luminance" else colours
+
+    kernel, balancing, sums = _gather(picture, image, order, statistics, sample, spectral, report, **options)
+    return FittedFilter(kernel, balancing, sums.coefficients(), sums.explained())
+
+
+@dataclass(frozen=True, eq=False)
+class FittedMasks:
+    """Diffusion masks of regions of a picture, at any of its tiles. Paper: eq. (15) to (17).
+
+    Attributes:
+        kernel: of the operator that compares colours.
+        balancing: its moment t, (1, M, 1).
+        core: (1, M, M), from a column of F to coordinates of the diffusion map.
+        centres: of the regions in these coordinates, (1, K, M).
+        scale: of squared distances: the number of pixels over the width.
+    """
+
+    kernel: Kernel
+    balancing: Tensor
+    core: Tensor
+    centres: Tensor
+    scale: float
+
+    def __call__(self, tile: Tile) -> Tensor:
+        """Masks (1, K, h, W) in (0, 1]."""
+        coordinates = self.core.to(tile.pixels) @ _columns(tile, self.kernel, self.balancing)
+        exponents = self.scale * squared_distances(coordinates, self.centres.to(coordinates))
+        return torch.exp(-exponents.clamp(max=FARTHEST)).unflatten(2, (tile.inner.shape[-2], tile.inner.shape[-1]))
+
+
+@torch.no_grad()
+@full_precision
+def fit_masks(
+    picture: Picture,
+    regions: RowSource,
+    *,
+    time: float,
+    width: float,
+    statistics: Statistics,
+    sample: int,
+    report: Report,
+    **options: Any,
+) -> FittedMasks:
+    """The masks of regions, rows (H, W, K) of weights, as :func:`enhance` has them.
+
+    Raises:
+        ValueError: if a region does not fit, is negative or empty.
+    """
+    if tuple(regions.shape[:2]) != picture.size or len(regions.shape) != 3:
+        raise ValueError(
+            f"regions must have the shape {(*picture.size, 'K')}, the picture's and the number of regions, got "
+            f"{tuple(regions.shape)}; resize them"
+        )
+    shared = {name: value for name, value in options.items() if name in SHARED}
+    shared |= {"photometric_bandwidth": MASK_BANDWIDTH, "guide_channels": "all"}
+    count = max(1, sample // MASK_SHARE)
+    kernel, balancing, sums = _gather(picture, lambda c: c, 1, statistics, count, True, report, **shared)
+    root, inner, ranks = whiten_gram(sums.grams, sums.dtype)
+    ritz = SymmetricMatrix.of(inner)
+    support = torch.arange(inner.shape[1]) < ranks.unsqueeze(1)
+    core = ritz.apply(lambda eigenvalues: eigenvalues.clamp(max=1.0).pow(time), support) @ root
+    centres = core @ _region_means(picture, regions, kernel, balancing, report)
+    return FittedMasks(kernel, balancing, core, centres.mT, picture.pixels / width)
+
+
+def _region_means(picture: Picture, regions: RowSource, kernel: Kernel, balancing: Tensor, report: Report) -> Tensor:
+    """The mean column of F over each region, (1, M, K) in float64."""
+    margin, rows = kernel.patch_weights.shape[0] // 2, picture.statistics_rows
+    total = torch.zeros(1, balancing.shape[1], regions.shape[2], dtype=torch.float64)
+    weight = torch.zeros(regions.shape[2], dtype=torch.float64)
+    for start in range(0, picture.size[0], rows):
+        report("Finding regions", start, picture.size[0])
+        stop = min(start + rows, picture.size[0])
+        weights = torch.from_numpy(np.array(regions[start:stop], np.float32)).flatten(0, 1)  # (n, K)
+        if bool((weights < 0).any()) or not bool(torch.isfinite(weights).all()):
+            raise ValueError("regions must be non-negative and finite, got others; clamp them at 0")
+        if not bool((weights > 0).any()):
+            continue
+        columns = _columns(picture.tile(start, stop, margin), kernel, balancing)
+        total += (columns @ weights.to(columns)).double()
+        weight += weights.double().sum(0)
+    if not bool((weight > 0).all()):
+        raise ValueError("regions must each hold a pixel of positive weight, got an empty one; select some pixels")
+    return total / weight
+
+
+def _columns(tile: Tile, kernel: Kernel, balancing: Tensor) -> Tensor:
+    """F (1, M, n) of the rows of a tile."""
+    factor, diagonal = kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
+    return factor * scaling_from_moment(factor, diagonal, balancing.to(factor)).unsqueeze(1)
+
+
+def _gather(
+    picture: Picture,
+    image: Image,
+    order: int,
+    statistics: Statistics,
+    sample: int,
+    spectral: bool,
+    report: Report,
+    **options: Any,
+) -> tuple[Kernel, Tensor, Sums]:
+    """Kernel, moment t of balancing, and the sums for the first ``order`` powers of W."""
+    pilot = take_pilot(picture, image, report, **options)
+    kernel = pilot.kernel
+    blocks: Callable[[str], Iterator[Block]]
+    if statistics == "full" or sample >= picture.pixels:
+
+        def blocks(stage: str) -> Iterator[Block]:
+            return all_blocks(picture, kernel, image, report, stage)
+    else:
+        chosen = sample_by_influence(picture, pilot, image, sample, report, spectral=spectral)
+
+        def blocks(stage: str) -> Iterator[Block]:
+            report(stage, 0, 1)
+            return (block for part in chosen for block in part.blocks(kernel))
+
+    balancing = balance_by_passes(lambda: blocks("Balancing"), pilot.balancing)
+    return kernel, balancing, sum_up(lambda: blocks("Summing up"), balancing, order)
