@@ -45,7 +45,7 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     region = spots(portrait, scale, *PORTRAIT)
     panels = {
         "(a) photograph and spots": marked(portrait, region),
-        "(b) focus map": _map(portrait, region),
+        "(b) focus map": default_map(portrait, region),
         "(c) Gaussian blur": defocus(portrait, region, aperture="gaussian"),
         "(d) blur of a lens": defocus(portrait, region),
     }
@@ -57,7 +57,7 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     true = blur_by(image, ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1), RADIUS * min(image.shape[-2:]), "disc")
     panels |= {
         "(e) photograph and spots": marked(image, region),
-        "(f) focus map": _map(image, region),
+        "(f) focus map": default_map(image, region),
         "(g) blur of a lens": lens,
         "(h) by the true depth": true,
     }
@@ -73,7 +73,7 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     return show_images(panels, columns=4, side=round(0.9 * SIDE)), numbers
 
 
-def _map(image: Tensor, region: Tensor) -> Tensor:
+def default_map(image: Tensor, region: Tensor) -> Tensor:
     """The map that the defaults of defocus make."""
     operator = nonlocal_operator(
         image,

@@ -1,0 +1,104 @@
+"""The README's pictures of edits, before and after: ``python -m benchmarks.gallery [FOLDER]``.
+
+Each has three panels: what is given, with strokes or spots painted on it, what the edit makes of them, and its result.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.figures.colours import BLUE, TRUE, reached
+from benchmarks.figures.focus import PORTRAIT, WIDE, default_map
+from benchmarks.figures.scenes import luminance, marked, painted_over, scene, spots, strokes
+from nlfilter_torch import abstract, colorize, defocus, enhance, recolor
+from nlfilter_torch.edits.enhance import colour_masks
+from nlfilter_torch.pictures import save_figure, show_images
+
+SIDE = 270  # of a panel
+SIZE = 640  # of a photograph
+ALPHA = (3.0, 3.0, 4.0, 1.0)
+
+
+def detail() -> dict[str, Tensor]:
+    """Detail of a suit."""
+    image, scale = scene("astronaut", SIZE)
+    spot = spots(image, scale, (60, 300, 20, 20))
+    wide = (..., slice(130, 130 + round(512 / WIDE)), slice(None))
+    panels = {
+        "A spot (yellow)": marked(image, spot),
+        "What is like it": colour_masks(image, spot, time=2.0),
+        "Detail there, nowhere else": enhance(image, torch.tensor(ALPHA), spot, time=2.0),
+    }
+    return {title: panel[wide] for title, panel in panels.items()}
+
+
+def recolouring() -> dict[str, Tensor]:
+    """A red motorcycle to a blue one."""
+    image, scale = scene("motorcycle", SIZE)
+    colours, painted = strokes(image, scale, ((350, 205, 40, 20), BLUE))
+    edited = recolor(image, colours, painted)
+    return {
+        "A stroke of blue": painted_over(image, colours, painted),
+        "What it reaches": reached(image, edited),
+        "recolor": edited,
+    }
+
+
+def colourising() -> dict[str, Tensor]:
+    """A cup of coffee from its grey values and a few strokes."""
+    image, scale = scene("coffee", SIZE)
+    painted = spots(image, scale, *TRUE)
+    grey = luminance(image)
+    return {
+        "Strokes on a grey photograph": painted_over(grey, image, painted),
+        "colorize": colorize(grey, image * painted, painted),
+        "As it was in colour": image,
+    }
+
+
+def focusing() -> dict[str, Tensor]:
+    """A portrait."""
+    image, scale = scene("astronaut", SIZE)
+    image = image[..., : round(image.shape[-1] / WIDE), :]
+    region = spots(image, scale, *PORTRAIT)
+    return {
+        "Spots to stay sharp": marked(image, region),
+        "What does": default_map(image, region),
+        "defocus": defocus(image, region),
+    }
+
+
+def abstraction() -> dict[str, Tensor]:
+    """A cat, painted."""
+    image = scene("chelsea", SIZE)[0]
+    return {
+        "A photograph": image,
+        "abstract": abstract(image),
+        "with lines and tones": abstract(image, edges=0.8, tones=8),
+    }
+
+
+EDITS: dict[str, Callable[[], dict[str, Tensor]]] = {
+    "detail": detail,
+    "recolor": recolouring,
+    "colorize": colourising,
+    "defocus": focusing,
+    "abstract": abstraction,
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write a picture for every edit."""
+    parser = argparse.ArgumentParser(description="The README's pictures of edits.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where the pictures go")
+    folder = parser.parse_args(arguments).folder
+    folder.mkdir(exist_ok=True)
+    for name, panels in EDITS.items():
+        save_figure(show_images(panels(), columns=3, side=SIDE), folder / f"edit-{name}.png")
+
+
+if __name__ == "__main__":
+    main()
