@@ -64,15 +64,22 @@ class Affinity:
         self.floor = SMALLEST_EXPONENT if complete else PLAIN_EXPONENT
         self.centre = landmarks.mean(dim=2, keepdim=True)  # distances are formed near the origin, where they are exact
         self.landmarks = landmarks - self.centre  # (B, D, M)
-        self.doubled = 2.0 * self.landmarks.mT
-        self.norms = self.landmarks.square().sum(1).unsqueeze(2)  # (B, M, 1)
+        # -|x - z|^2 is one product, (2 z, -|z|^2, -1) with (x, 1, |x|^2).
+        norms = self.landmarks.square().sum(1, keepdim=True)
+        self.rows = torch.cat([2.0 * self.landmarks, -norms, -torch.ones_like(norms)], dim=1).mT  # (B, M, D + 2)
+        self.columns = landmarks.new_empty(0, 0, 0)
 
     def __call__(self, features: Tensor, out: Tensor) -> tuple[Tensor, Tensor]:
-        """The affinities (B, M, n) of features (B, D, n), in ``out``, and the features relative to the centre."""
-        centred = features - self.centre
-        torch.bmm(self.doubled, centred, out=out)
-        out.sub_(self.norms).sub_(centred.square().sum(1, keepdim=True))
-        return out.clamp_(self.floor, 0.0).exp_(), centred
+        """The affinities (B, M, n) of features (B, D, n), in ``out``, and the features relative to the centre.
+
+        Both are overwritten by the next call.
+        """
+        batch, size, count = features.shape
+        if self.columns.shape[2] != count:
+            self.columns = features.new_ones(batch, size + 2, count)
+        centred = torch.sub(features, self.centre, out=self.columns[:, :size])
+        torch.sum(centred.square(), 1, out=self.columns[:, size + 1])
+        return torch.bmm(self.rows, self.columns, out=out).clamp_(self.floor, 0.0).exp_(), centred
 
 
 class _NystromFactor(torch.autograd.Function):
