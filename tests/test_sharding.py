@@ -6,6 +6,7 @@ Three processes are started once; groups of one, two and three of them take turn
 import os
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -135,11 +136,36 @@ def fitted(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     return {"layers": layers, "rows second": second[0], "second alpha": second[1]}
 
 
+def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
+    """Strokes, regions and the figures of an operator; some ranks have nothing painted."""
+    guide = picture("coffee", HEIGHT, WIDTH, dtype)[:, :, rows].clone().requires_grad_()
+    operator = nonlocal_operator(guide, photometric_bandwidth=0.2, spatial_bandwidth=8.0, num_landmarks=15, group=group)
+    spectrum = operator.spectrum()
+    painted = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=dtype)
+    painted[..., 3:5, 2:9], painted[..., 14, 12] = 1, 0.5
+    values = noise(1, 2, HEIGHT, WIDTH, dtype=dtype)[:, :, rows].requires_grad_()
+    leaves = {name: torch.tensor(0.8, dtype=dtype, requires_grad=True) for name in ("strength", "reach", "smoothness")}
+    spread = propagate_strokes(spectrum, values, painted[:, :, rows], **leaves)
+    spread.pow(2).sum().backward()
+    regions = torch.cat([painted, painted.flip(2, 3)], dim=1)
+    figures = [
+        v for value in asdict(operator.diagnostics()).values() for v in (value if isinstance(value, list) else [value])
+    ]
+    found = {"rows spread": spread, "rows guide": guide.grad, "rows values": values.grad}
+    found |= {name: leaf.grad for name, leaf in leaves.items()}
+    found |= {
+        "rows segments": segment_mask(spectrum, regions[:, :, rows]),
+        "figures": torch.tensor(figures, dtype=dtype),
+    }
+    return {name: value.detach() for name, value in found.items() if value is not None}
+
+
 # Some gradients of the options are off by 1e-4 and more in float32, in one process too: whitening amplifies rounding.
 PROBLEMS: dict[str, tuple[Problem, torch.dtype, float]] = {
     "filtering": (filtering, torch.float64, 1e-9),
     "filtering in float32": (filtering, torch.float32, 1e-5),
     "options": (options, torch.float64, 1e-9),
+    "painting": (painting, torch.float64, 1e-9),
     "fitted": (fitted, torch.float64, 1e-9),
     "fitted in float32": (fitted, torch.float32, 1e-5),
 }
@@ -149,12 +175,8 @@ def refusals(group: Any, rank: int) -> dict[str, str]:
     """What is refused, and how."""
     rows = noise(1, 1, 5, 6)
     operator = nonlocal_operator(rows, num_landmarks=5, group=group)
-    spectrum = operator.spectrum()
     calls: dict[str, Callable[[], object]] = {
         "to_dense": operator.to_dense,
-        "diagnostics": operator.diagnostics,
-        "segment_mask": lambda: segment_mask(spectrum, rows),
-        "propagate_strokes": lambda: propagate_strokes(spectrum, rows, torch.ones_like(rows)),
         "fit_alpha": lambda: fit_alpha(operator, rows, rows),
         "width": lambda: nonlocal_operator(rows[..., : 6 - rank], num_landmarks=5, group=group),
         "dtype": lambda: nonlocal_operator(rows if rank else rows.float(), num_landmarks=5, group=group),
@@ -293,7 +315,7 @@ def test_what_is_sent_does_not_grow_with_the_image(folder: Path) -> None:
 def test_refusals_in_shards(folder: Path) -> None:
     for found in load(folder, "end"):
         said = found["refusals"]
-        for name in ("to_dense", "diagnostics", "segment_mask", "propagate_strokes", "fit_alpha"):
+        for name in ("to_dense", "fit_alpha"):
             assert said[name].startswith(f"{name} needs the whole image on one rank, got one that is spread over 3")
         for name, got in (("width", "[1, 1, 5, 64] on rank 1"), ("dtype", "[1, 1, 6, 64] on rank 1")):
             assert said[name].startswith("guide must have the batch, channels, width and dtype of the other ranks'")
