@@ -55,7 +55,7 @@ def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
     padded = F.pad(guide, (1, 1, 1, 1), mode="replicate")
     down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-    return torch.hypot(down, right)[:, :, halo[0] : guide.shape[2] - halo[1]] / 2
+    return (down.square() + right.square()).sqrt()[:, :, halo[0] : guide.shape[2] - halo[1]] / 2
 
 
 def bandwidth_of_gradient(mean: Tensor) -> Tensor:
