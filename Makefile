@@ -6,7 +6,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c const
 PINS := pyproject.toml constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types chromium bench bench-quick train pictures notebooks docs clean
+.PHONY: demo test lint types chromium bench bench-quick train pictures figures notebooks docs clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
@@ -63,7 +63,12 @@ train: $(VENV)/.installed-test
 # The pictures of the README and of the pages of docs.
 pictures: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.detail_pictures docs
+	$(BIN)/python -m benchmarks.gallery docs
 	$(BIN)/python -m benchmarks.guide_pictures docs/pictures
+
+# Counterparts of the paper's figures and Table I in out/figures, with their numbers, in a few minutes.
+figures: $(VENV)/.installed-test
+	$(BIN)/python -m benchmarks.figures --out out/figures
 
 # The documentation as a website in out/docs; whatever its generator would warn of is an error.
 docs: $(VENV)/.installed-test

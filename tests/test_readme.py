@@ -22,17 +22,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_python_blocks_run_in_order(folder: Path) -> None:
-    assert [kind for kind, _ in README.blocks()].count("python") == 3
+    assert [kind for kind, _ in README.blocks()].count("python") == 4
     names = README.run_python()
     with Image.open(folder / "crisp.png") as crisp:
         assert crisp.size == (150, 100)
     assert names["layers"].shape == (1, 4, 3, 100, 150)  # type: ignore[attr-defined]
     assert names["mask"].shape == (1, 1, 100, 150)  # type: ignore[attr-defined]
+    for edit in ("repainted", "crisper", "portrait", "painting"):
+        assert names[edit].shape == (1, 3, 100, 150)  # type: ignore[attr-defined]
 
 
 def test_commands_run(folder: Path) -> None:
     ours = README.commands("nlfilter-torch")
-    assert len(ours) == 6
+    assert len(ours) == 14
     for arguments in ours:
         assert main(arguments) == 0
     made = {path.name for path in folder.iterdir()}
