@@ -17,7 +17,7 @@ from nlfilter_torch.filtering import detail_layers
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import check_whole
+from nlfilter_torch.sharding import Shard, check_whole, reduce_max, reduce_sum
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
@@ -81,7 +81,8 @@ def fit_alpha(
         >>> [round(a, 2) for a in fit_alpha(operator, image, edited, order=2)[0].tolist()]
         [3.0, 1.0, 1.2]
     """
-    check_whole(operator.shard, "fit_alpha")
+    if loss is not None:
+        check_whole(operator.shard, "a loss")
     check_count(order, "order")
     check_image(image, "image")
     check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
@@ -89,7 +90,7 @@ def fit_alpha(
     check_same_size(target, operator.size, "target", "image")
     _check_not_negative(ridge, "ridge")
     if rounding is None:
-        rounding = HALF_LEVEL if _is_rounded(target) else 0.0
+        rounding = HALF_LEVEL if _is_rounded(target, operator.shard) else 0.0
     _check_not_negative(rounding, "rounding")
 
     layers = detail_layers(operator, image.to(operator.factor), order=order).double()  # (B, k+1, C, H, W)
@@ -97,10 +98,11 @@ def fit_alpha(
         layers=layers.flatten(2),
         edit=(target.double() - layers.sum(1)).flatten(1),
         dead_zone=_dead_zone(target.detach().double().flatten(1), rounding) if rounding > 0.0 else None,
-        weights=_pixel_weights(mask, layers).flatten(1),
+        weights=_pixel_weights(mask, layers, operator.shard).flatten(1),
         ridge=ridge,
         shared=shared,
         precision=operator.factor.dtype,
+        shard=operator.shard,
     )
     change = problem.fit()
     if loss is not None:
@@ -115,10 +117,10 @@ def _check_not_negative(value: float, name: str) -> None:
         raise ValueError(f"{name} must be at least 0 and finite, got {value}; 0.0 is plain least squares")
 
 
-def _is_rounded(target: Tensor) -> bool:
+def _is_rounded(target: Tensor, shard: Shard | None) -> bool:
     """Does ``target`` hold nothing but multiples of 1/255?"""
     levels = target.detach().double() * 255
-    return bool(((levels - levels.round()).abs() < OFF_LEVEL).all())
+    return bool(reduce_max((levels - levels.round()).abs().max(), shard) < OFF_LEVEL)
 
 
 def _dead_zone(target: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
@@ -140,6 +142,7 @@ class _Problem:
         ridge: see :func:`fit_alpha`.
         shared: one change for all images.
         precision: dtype in which the layers were worked out.
+        shard: of the images, where other ranks have the rest of them.
     """
 
     layers: Tensor
@@ -149,6 +152,7 @@ class _Problem:
     ridge: float
     shared: bool
     precision: torch.dtype
+    shard: Shard | None
 
     def fit(self) -> Tensor:
         """Change (B, k+1) of least squares, with the dead zone.
@@ -182,14 +186,16 @@ class _Problem:
         return values.mean(0, keepdim=True) if self.shared else values
 
     def _cost(self, change: Tensor) -> Tensor:
-        return self._pool((self.weights * self._errors(change).square()).sum(1)) + self.ridge * change.square().sum(1)
+        squares = reduce_sum((self.weights * self._errors(change).square()).sum(1), self.shard)
+        return self._pool(squares) + self.ridge * change.square().sum(1)
 
     def _step(self, change: Tensor) -> Tensor:
         """Newton's step (B, k+1): from anywhere to the solution where all errors count."""
         errors = self._errors(change)
         counted = self.weights if self.dead_zone is None else self.weights * (errors != 0.0)
-        products = self._pool((self.layers * counted.unsqueeze(1)) @ self.layers.mT)  # (B, k+1, k+1)
-        slope = self._pool((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2)) - self.ridge * change
+        products = reduce_sum((self.layers * counted.unsqueeze(1)) @ self.layers.mT, self.shard)  # (B, k+1, k+1)
+        slope = reduce_sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2), self.shard)
+        products, slope = self._pool(products), self._pool(slope) - self.ridge * change
         scale, inverse = self._inverse(products)
         return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)
 
@@ -238,16 +244,17 @@ class _Problem:
         return change_of(coefficients.detach())
 
 
-def _pixel_weights(mask: Tensor | None, layers: Tensor) -> Tensor:
+def _pixel_weights(mask: Tensor | None, layers: Tensor, shard: Shard | None) -> Tensor:
     """Weights (B, C, H, W) or (1, C, H, W) of the pixels, of unit sum for every image."""
     batch, _, channels, height, width = layers.shape
     if mask is None:
-        return layers.new_full((1, channels, height, width), 1.0 / (channels * height * width))
+        pixels = height * width if shard is None else shard.pixels
+        return layers.new_full((1, channels, height, width), 1.0 / (channels * pixels))
     check_image(mask, "mask", channels=1, batch=batch)
     check_same_size(mask, (height, width), "mask", "image")
     if bool((mask < 0).any()):
         raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
-    total = mask.double().sum((2, 3), keepdim=True)
+    total = reduce_sum(mask.double().sum((2, 3), keepdim=True), shard)
     if bool((total <= 0).any()):
         raise ValueError(
             "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"

@@ -214,7 +214,9 @@ def _overlaps(shard: Shard, margin: int) -> tuple[dict[int, slice], dict[int, sl
     def common(one: range, other: range) -> slice:
         return slice(max(one.start, other.start), min(one.stop, other.stop))
 
-    here, wanted, lent = shard.rank, {}, {}
+    here = shard.rank
+    wanted: dict[int, slice] = {}
+    lent: dict[int, slice] = {}
     for peer in range(len(owned)):
         for table, rows in ((wanted, common(needed[here], owned[peer])), (lent, common(owned[here], needed[peer]))):
             if peer != here and rows.start < rows.stop:
