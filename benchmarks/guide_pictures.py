@@ -14,12 +14,20 @@ from torch import Tensor
 
 from benchmarks.photographs import photograph
 from nlfilter_torch import (
+    abstract,
+    adjust_tone,
     captured_energy,
+    colorize,
+    defocus,
+    denoise,
     detail_layers,
     diffusion_mask,
+    enhance,
     estimate_bandwidth,
     nonlocal_operator,
     polynomial_filter,
+    recolor,
+    sharpen,
 )
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.files import open_beside
@@ -155,6 +163,37 @@ def single_sliders() -> Figure:
     return show_images({title: crop(panel, WHISKERS) for title, panel in panels.items()}, columns=3, side=240)
 
 
+def edits() -> Figure:
+    """The edits, on one photograph of 300x200 pixels with a spot on the saucer and two on the cup."""
+    image = photograph("coffee", 200, 300)
+    saucer, cup = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])
+    saucer[..., 106:122, 52:68], cup[..., 60:74, 92:98], cup[..., 96:106, 120:150] = 1, 1, 1
+    wood = torch.zeros_like(saucer)
+    for top, left in ((20, 60), (5, 100), (50, 250), (130, 270), (185, 20), (54, 140), (75, 145)):
+        wood[..., top : top + 10, left : left + 10] = 1
+    blue = torch.tensor([0.1, 0.2, 0.8]).view(1, 3, 1, 1).expand_as(image)
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0)) * 20 / LEVELS
+    grey = rgb_to_grayscale(image)
+    painted = torch.zeros_like(grey)
+    painted[..., 10::45, 10::45] = 1
+    painted = torch.nn.functional.max_pool2d(painted, 5, 1, 2)
+    panels = {
+        "before": image,
+        "detail --region, on the saucer": enhance(image, torch.tensor([4.0, 4.0, 4.0, 1.0]), saucer),
+        "sharpen": sharpen(image),
+        "tone --contrast 1.3": adjust_tone(image, contrast=1.3),
+        "recolor the saucer, keep wood": recolor(image, blue, saucer, keep=wood),
+        "grey, with dots of colour": torch.lerp(grey.expand_as(image), image, painted),
+        "colorize": colorize(grey, image, painted),
+        "defocus, but for the cup": defocus(image, cup, radius=4.0),
+        "abstract": abstract(image),
+        "abstract --edges 1 --tones 8": abstract(image, edges=1.0, tones=8, photometric_bandwidth=50 / LEVELS),
+        "with noise of 20 levels": image + noise,
+        "denoise": denoise(image + noise),
+    }
+    return show_images(panels, columns=4, side=260)
+
+
 def layers() -> Figure:
     """The layers of a photograph, which sum to it."""
     luminance = rgb_to_grayscale(photograph("chelsea"))
@@ -182,6 +221,7 @@ PICTURES = {
     "spatial-bandwidth": spatial_bandwidth,
     "time-and-width": time_and_width,
     "single-sliders": single_sliders,
+    "edits": edits,
     "layers": layers,
     "eigenvectors": eigenvectors,
     "response": response,
