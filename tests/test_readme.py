@@ -34,7 +34,7 @@ def test_python_blocks_run_in_order(folder: Path) -> None:
 
 def test_commands_run(folder: Path) -> None:
     ours = README.commands("nlfilter-torch")
-    assert len(ours) == 14
+    assert len(ours) == 6
     for arguments in ours:
         assert main(arguments) == 0
     made = {path.name for path in folder.iterdir()}
