@@ -85,6 +85,30 @@ def test_recolour_within_two_levels_outside_a_kept_region() -> None:
     assert (edited[0, 1][painted] > edited[0, 0][painted]).all()
 
 
+def test_one_stroke_does_not_spill() -> None:
+    """Odd pixels under it, here of the backdrop, are painted but do not take their likes along."""
+    image, stroke = colour("astronaut"), box(37, 8, 5, 5)
+    image = torch.where(box(37, 8, 1, 5) > 0, image[..., 6:7, 42:43], image)
+    edited = recolor(image, paint(0.1, 0.3, 0.9, stroke), stroke)
+    assert torch.equal(edited[BACKGROUND], image[BACKGROUND])
+    assert (edited[SUIT][:, 2] > edited[SUIT][:, 0]).float().mean() > 0.9
+    assert (edited != image).any(1).float().mean() < 0.4
+
+
+def test_a_pixel_a_hundred_dots_and_everything_may_be_painted() -> None:
+    image = colour("astronaut")
+    dot = box(40, 10, 1, 1)
+    suit = recolor(image, paint(0.1, 0.3, 0.9, dot), dot)[SUIT]
+    assert (suit[:, 2] > suit[:, 0]).float().mean() > 0.7
+    dots = torch.zeros(1, 1, 64, 64)
+    dots[..., 1::6, 1::6] = 1  # 121 spots of one colour
+    for mask in (dots, torch.ones(1, 1, 64, 64)):
+        edited = recolor(image, paint(0.1, 0.3, 0.9, mask), mask)
+        inside = (mask > 0)[0, 0]
+        assert (edited[0, 2][inside] >= edited[0, 0][inside] - 1e-4).all()
+        assert (luminance(edited) - luminance(image)).abs().max() <= 1 / 255
+
+
 def test_two_colours_reach_their_own_likes() -> None:
     image = torch.full((1, 3, 40, 40), 0.5)
     image[:, 0, :, :20], image[:, 2, :, 20:] = 0.8, 0.8  # reddish, bluish
@@ -212,6 +236,27 @@ def test_the_subject_does_not_bleed() -> None:
     assert blurred[outside > 0].max() < 0.15 * plain[outside > 0].max()
 
 
+def test_a_dot_may_be_in_focus_and_everything_may() -> None:
+    image = colour("astronaut")
+    assert torch.equal(defocus(image, torch.ones(1, 1, 64, 64), radius=3.0), image)
+    dot = box(40, 10, 1, 1)
+    blurred = defocus(image, dot, radius=3.0)
+    assert torch.equal(blurred[..., 40, 10], image[..., 40, 10])
+    near, far = box(36, 8, 8, 6), box(4, 44, 20, 16)
+    assert gradient_energy(blurred, near) / gradient_energy(image, near) > 0.8
+    assert gradient_energy(blurred, far) / gradient_energy(image, far) < 0.5
+
+
+def test_odd_pixels_of_the_subject_do_not_bring_the_background_into_focus() -> None:
+    image = colour("astronaut", 128, 128)
+    region = box(65, 10, 40, 8, size=(128, 128))
+    odd = box(65, 10, 2, 8, size=(128, 128))  # shows the backdrop
+    image = torch.where(odd > 0, image[..., 10:11, 85:86], image)
+    blurred = defocus(image, region, radius=4.0)
+    far = box(0, 95, 60, 33, size=(128, 128))
+    assert gradient_energy(blurred, far) < 0.3 * gradient_energy(image, far)
+
+
 def test_flat_images_stay_flat() -> None:
     flat = torch.full((1, 3, 24, 30), 0.3)
     torch.testing.assert_close(defocus(flat, box(4, 4, size=(24, 30))), flat, atol=1e-5, rtol=0)
@@ -227,6 +272,17 @@ def test_abstraction_fades_with_its_power() -> None:
     assert changes == sorted(changes)
     assert changes[0] < 1e-4
     assert changes[2] > 0.01
+
+
+def test_what_is_like_nothing_else_is_not_blackened() -> None:
+    """A border that few landmarks stand for stays between its two fields, and these stay what they are."""
+    image = torch.full((1, 1, 40, 60), 0.4)
+    image[..., 30:] = 0.9
+    image[..., 29] = 0.65
+    found = abstract(image, num_landmarks=100)
+    torch.testing.assert_close(found[..., 29], image[..., 29], atol=0.01, rtol=0)
+    assert found.min() > 0.34
+    assert found.max() < 0.98
 
 
 def test_tones_and_lines() -> None:
@@ -330,6 +386,11 @@ def test_detail_reaches_the_likes_of_a_region_only() -> None:
         image, torch.stack([sliders, torch.tensor([0.0, 0.0, 1.0, 1.0])]), torch.cat([box(37, 8), box(4, 42)], 1)
     )
     assert (two - part).abs()[BACKGROUND].max() > 0
+    everything = enhance(image, sliders, torch.ones(1, 1, 64, 64))
+    assert torch.isfinite(everything).all()
+    dot = enhance(image, sliders, box(40, 10, 1, 1))
+    share = [((dot - image).abs()[place].mean() / (whole - image).abs()[place].mean()) for place in (SUIT, BACKGROUND)]
+    assert share[0] > 3 * share[1]
     with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
         enhance(image, sliders, negative=box(1, 1))
     with pytest.raises(ValueError, match=r"alpha must have shape \(1, k\+1\)"):

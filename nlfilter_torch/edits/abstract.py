@@ -93,10 +93,13 @@ def abstract(
     )
     spectrum = operator.spectrum()
     exponent = torch.as_tensor(power).to(spectrum.root).reshape(-1, 1)
-    explained = spectral_filter(spectrum, pixels, torch.ones_like)
+    # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
+    mean = pixels.mean((2, 3), keepdim=True)
+    explained = spectral_filter(spectrum, pixels - mean, torch.ones_like)
     alone = (operator.scaling.square() * operator.diagonal).clamp(LEAST, 1.0).unflatten(1, spectrum.size).unsqueeze(1)
     kept = alone ** (TIMES_UNEXPLAINED * exponent.to(alone)[..., None, None])  # (B, 1, H, W)
-    flat = spectral_filter(spectrum, pixels, lambda eigenvalues: eigenvalues**exponent) + kept * (pixels - explained)
+    smoothed = spectral_filter(spectrum, pixels - mean, lambda eigenvalues: eigenvalues**exponent)
+    flat = mean + smoothed + kept * (pixels - mean - explained)
     if edges == 0 and tones is None:
         return flat.to(image.dtype)
     luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))

@@ -15,9 +15,8 @@ from nlfilter_torch.strokes import check_painted, check_share
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
-DOUBT = (
-    0.05  # variance of what a spot tells, in units of a pixel's own: strokes of two colours on one thing are no error
-)
+DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: two colours on one thing are no error
+TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
 
 
@@ -90,21 +89,20 @@ def recolor(
     painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
     wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
     regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
-    marked = regions * counts[..., None, None]
-    if keep is not None:
-        held = keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
-        marked = torch.cat([marked, held], dim=1)
+    own = regions * counts[..., None, None]
+    held = None if keep is None else keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
+    marked = own if held is None else torch.cat([own, held], dim=1)
     likeness = _divide(spectrum, marked, reach)[:, : counts.shape[1]]
     shares = ((likeness - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
     shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
     shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
-    if keep is not None:
-        shares = shares * (1 - held)
+    shares = shares * (1 - marked.sum(1, keepdim=True)) + own  # what someone painted on is theirs, odd or not
 
     # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative saturation.
     old = (regions.flatten(2) @ chroma.flatten(2).mT) / regions.sum((2, 3)).unsqueeze(2)  # (B, K, 3)
-    along = torch.einsum("bkc,bchw->bkhw", old, chroma) + SATURATION**2
-    relative = along / (old.square().sum(2) + SATURATION**2)[..., None, None]
+    usual = old.square().sum(2)[..., None, None]  # squared saturation, (B, K, 1, 1)
+    product = (usual * chroma.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
+    relative = (product + SATURATION**2) / (usual + SATURATION**2)
     painted_chroma = torch.einsum("bkhw,bkc->bchw", shares * relative.clamp(0.0, 1.5), colours)
     chroma = chroma * (1 - shares.sum(1, keepdim=True)) + painted_chroma
     untouched = (shares.sum(1, keepdim=True) == 0).expand_as(pixels)
