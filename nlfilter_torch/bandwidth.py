@@ -1,5 +1,7 @@
 """The photometric bandwidth that suits an image. Paper: Appendix A, eq. (20)."""
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -7,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch.checks import check_choice, check_image
 from nlfilter_torch.features import GuideChannels, reduce_channels
 from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.sharding import Shard, reduce_sum
+from nlfilter_torch.sharding import Shard, meet, reduce_sum, with_halo
 
 # The paper's 0.6 belongs to its own patch weights, whose squares sum to 0.056; under weights of unit sum the same
 # kernel has a bandwidth larger by 1 / sqrt(0.056) = 4.2, hence 2.5.
@@ -16,7 +18,7 @@ SMALLEST = 1.0 / 255.0  # a flat image has no gradient; one grey level keeps the
 
 
 @full_precision
-def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "luminance") -> Tensor:
+def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "luminance", group: Any = None) -> Tensor:
     """Photometric bandwidth h_y from the mean gradient magnitude: 2.5 times it, at least one grey level of 255.
 
     Paper: eq. (20), whose 1/n is read as the mean (outside the root it would make the bandwidth shrink with the image).
@@ -24,6 +26,7 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     Args:
         guide: (B, C, H, W) in [0, 1].
         guide_channels: ``"luminance"`` reduces three channels to one; ``"all"`` takes the mean over channels.
+        group: of :func:`nonlocal_operator`: ``guide`` is then what this rank has of the rows.
 
     Returns:
         (B,), in units of the guide. Constant, as no gradient reaches the guide through it.
@@ -37,7 +40,10 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     """
     check_image(guide, "guide")
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    return bandwidth_of_rows(reduce_channels(guide.to(working_dtype(guide)), guide_channels), (0, 0), None)
+    with torch.no_grad():
+        rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
+        shard = meet(rows, group)
+        return bandwidth_of_rows(*with_halo(rows, 1, shard), shard)
 
 
 def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None) -> Tensor:

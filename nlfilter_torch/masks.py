@@ -237,6 +237,7 @@ def filter_regions(
     """
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_same_size(masks, operator.size, "masks", "operator")
+    alpha = replicate(alpha, operator.shard)
     return blend_regions(
         image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)
     )

@@ -19,6 +19,7 @@ from torch.multiprocessing.spawn import spawn
 
 from benchmarks.distributed import watched
 from nlfilter_torch import (
+    NonlocalFilter,
     captured_energy,
     detail_layers,
     diffusion_map,
@@ -136,6 +137,27 @@ def fitted(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     return {"layers": layers, "rows second": second[0], "second alpha": second[1]}
 
 
+def layer(rows: slice, group: Any, dtype: torch.dtype) -> Results:
+    """The layer, with sliders for each of two regions, all that it has learning; bandwidths from "auto" on."""
+    image = torch.cat([picture(name, HEIGHT, WIDTH, dtype) for name in ("astronaut", "coffee")])[:, :, rows]
+    learned = NonlocalFilter(
+        alpha=((2.0, 1.5, 1.0), (0.5, 3.0, 1.1)),
+        residual=1.0,
+        spatial_bandwidth=9.0,
+        num_landmarks=12,
+        learn=("alpha", "residual", "photometric_bandwidth", "spatial_bandwidth", "patch_weights"),
+        group=group,
+    ).to(dtype)
+    masks = noise(1, 2, HEIGHT, WIDTH, dtype=dtype)[:, :, rows]
+    filtered = learned(image, mask=masks)
+    filtered.pow(3).sum().backward()
+    gradients = {name: value.grad for name, value in learned.named_parameters()}
+    assert len(gradients) == 5
+    return {name: value.detach() for name, value in gradients.items() if value is not None} | {
+        "rows filtered": filtered.detach()
+    }
+
+
 def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     """Strokes, regions and the figures of an operator; some ranks have nothing painted."""
     guide = picture("coffee", HEIGHT, WIDTH, dtype)[:, :, rows].clone().requires_grad_()
@@ -148,14 +170,15 @@ def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     spread = propagate_strokes(spectrum, values, painted[:, :, rows], **leaves)
     spread.pow(2).sum().backward()
     regions = torch.cat([painted, painted.flip(2, 3)], dim=1)
-    figures = [
-        v for value in asdict(operator.diagnostics()).values() for v in (value if isinstance(value, list) else [value])
-    ]
+    figures = asdict(operator.diagnostics())
+    assert figures.pop("pixels") == HEIGHT * WIDTH
+    figures.pop("balancing_steps")  # samples of the ranks are others than those of the whole
+    figures.pop("num_landmarks")
     found = {"rows spread": spread, "rows guide": guide.grad, "rows values": values.grad}
     found |= {name: leaf.grad for name, leaf in leaves.items()}
     found |= {
         "rows segments": segment_mask(spectrum, regions[:, :, rows]),
-        "figures": torch.tensor(figures, dtype=dtype),
+        "figures": torch.tensor(list(figures.values()), dtype=dtype),
     }
     return {name: value.detach() for name, value in found.items() if value is not None}
 
@@ -184,6 +207,7 @@ PROBLEMS: dict[str, tuple[Problem, torch.dtype, float]] = {
     "filtering": (filtering, torch.float64, 1e-9),
     "filtering in float32": (filtering, torch.float32, 1e-5),
     "options": (options, torch.float64, 1e-9),
+    "layer": (layer, torch.float64, 1e-9),
     "painting": (painting, torch.float64, 1e-9),
     "sliders": (sliders, torch.float64, 1e-9),
     "fitted": (fitted, torch.float64, 1e-9),

@@ -1,7 +1,7 @@
 """Guide to operator, as a layer."""
 
 from collections.abc import Collection
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,8 @@ class NonlocalAffinity(nn.Module):
             ``"auto"`` is then the start, image by image, and one factor trains), ``"spatial_bandwidth"`` (which must
             have a number to start from) and ``"patch_weights"``. All stay positive.
         **options: of :func:`nonlocal_operator`. A ``generator`` gives every call other landmarks; do not combine it
-            with gradient checkpointing, which runs the layer twice and expects the same.
+            with gradient checkpointing, which runs the layer twice and expects the same. With a ``group`` a layer can be
+            neither pickled nor copied.
 
     Raises:
         TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive.
@@ -44,6 +45,7 @@ class NonlocalAffinity(nn.Module):
         patch_weights: Tensor | None = None,
         tolerance: float | None = None,
         generator: torch.Generator | None = None,
+        group: Any = None,
         learn: Collection[str] = (),
     ) -> None:
         super().__init__()
@@ -55,6 +57,7 @@ class NonlocalAffinity(nn.Module):
         self.guide_channels: GuideChannels = guide_channels
         self.tolerance = tolerance
         self.generator = generator
+        self.group = group
 
         self.automatic = isinstance(photometric_bandwidth, str)
         if isinstance(photometric_bandwidth, str):
@@ -81,7 +84,7 @@ class NonlocalAffinity(nn.Module):
         """Operator of a guide (B, C, H, W)."""
         photometric: float | Tensor | Literal["auto"] = current(self.photometric_bandwidth)
         if self.automatic and isinstance(photometric, Tensor):
-            photometric = photometric * estimate_bandwidth(guide, guide_channels=self.guide_channels)
+            photometric = photometric * estimate_bandwidth(guide, guide_channels=self.guide_channels, group=self.group)
         elif self.automatic:
             photometric = "auto"
         weights = self.patch_weights
@@ -97,6 +100,7 @@ class NonlocalAffinity(nn.Module):
             patch_weights=weights() if isinstance(weights, UnitWindow) else weights,
             tolerance=self.tolerance,
             generator=self.generator,
+            group=self.group,
         )
 
     def extra_repr(self) -> str:
