@@ -11,6 +11,8 @@ html_theme = "furo"
 html_title = f"nlfilter-torch {release}"
 html_show_sphinx = False
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["tables.css"]
 
 myst_heading_anchors = 3
 myst_links_external_new_tab = False
