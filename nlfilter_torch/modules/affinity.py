@@ -25,7 +25,7 @@ class NonlocalAffinity(nn.Module):
             ``"auto"`` is then the start, image by image, and one factor trains), ``"spatial_bandwidth"`` (which must
             have a number to start from) and ``"patch_weights"``. All stay positive.
         **options: of :func:`nonlocal_operator`. A ``generator`` gives every call other landmarks; do not combine it
-            with gradient checkpointing, which runs the layer twice and expects the same. With a ``group`` a layer can be
+            with gradient checkpointing, which runs the layer twice and expects the same. A layer with a ``group`` is
             neither pickled nor copied.
 
     Raises:
