@@ -241,8 +241,10 @@ def test_too_large_for_memory(
 ) -> None:
     free = psutil.virtual_memory()._replace(available=60 * 90 * 4 * (100 + 2 * 25 + 40) - 1)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
-    sentence = refused(capsys, "detail", photo, tmp_path / "out.png")
+    sentence = refused(capsys, "tone", photo, tmp_path / "out.png")
     assert "has 90x60 pixels and needs about 0.0 GB of memory, but 0.0 GB is free; use fewer landmarks" in sentence
+    sentence = refused(capsys, "detail", photo, tmp_path / "out.png")  # not even in tiles
+    assert "in.png needs 4 MB of memory at least, but 3 MB may be used; allow more" in sentence
 
 
 def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,6 +18,8 @@ from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.landmarks import candidate_pixels
 from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.streaming import sampling, stream_detail
+from nlfilter_torch.streaming.detail import rows_in_memory
+from nlfilter_torch.streaming.rows import Picture
 from nlfilter_torch.streaming.statistics import balance_by_passes
 
 Array = NDArray[Any]
@@ -166,7 +168,7 @@ def test_regions_that_cannot_be_used_are_named(regions: Array, alpha: Tensor, me
 
 @pytest.mark.usefixtures("small_blocks")
 def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> None:
-    picture = sampling.Picture(cat(90, 120))
+    picture = Picture(cat(90, 120))
 
     def image(colours: Tensor) -> Tensor:
         return reduce_channels(colours, "luminance")
@@ -201,16 +203,15 @@ def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_memory_gives_the_size_of_tiles() -> None:
-    picture = cat(60, 80)
-
-    def tiles(memory: int) -> int:
-        stages: list[str] = []
-        streamed(picture, memory=memory, report=lambda stage, *_: stages.append(stage))
-        return stages.count("Filtering") - 1
-
-    assert tiles(100_000) == 60 > tiles(1_000_000) > 1
-    with pytest.raises(MemoryError, match="memory must have room for a row of source"):
-        streamed(picture, memory=1000)
+    picture = Picture(np.zeros((20_000, 200), np.uint8))
+    rows = [rows_in_memory(picture, memory, 4, 1 << 16, False) for memory in (10**8, 10**9, 10**10)]
+    assert 200 * 150 * 4 * rows[0] < 10**8 < 200 * 150 * 4 * 8 * rows[0]
+    assert rows[0] < rows[1] == rows[2]  # longer tiles are no faster
+    assert rows_in_memory(picture, 10**8, 4, 1 << 16, True) < rows[0]
+    with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least, but 10 MB may be used; allow more"):
+        rows_in_memory(picture, 10**7, 4, 1 << 16, False)
+    with pytest.raises(MemoryError, match="source needs 4 MB of memory at least, but 0 MB may be used"):
+        streamed(cat(60, 80), memory=1000)
 
 
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
@@ -268,7 +269,7 @@ def test_more_landmarks_than_pixels_are_reduced() -> None:
 
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.streaming.statistics.MAX_PASSES", 1)
-    picture = sampling.Picture(cat(30, 40))
+    picture = Picture(cat(30, 40))
 
     def image(colours: Tensor) -> Tensor:
         return reduce_channels(colours, "luminance")

@@ -3,6 +3,7 @@
 import math
 from dataclasses import asdict, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -10,11 +11,12 @@ import typer
 from torch import Tensor
 
 from nlfilter_torch.cli import options, painting
+from nlfilter_torch.cli.by_rows import allowed_memory, edit_by_rows, read_if_it_fits
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.edits.enhance import colour_masks
 from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import Depth, check_output, read_photograph, write_photograph
+from nlfilter_torch.files import Depth, check_output, write_photograph
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.presets import PRESETS, find_preset
@@ -79,6 +81,21 @@ Spread = Annotated[
         metavar="TIME", help="How far the edit of a region spreads to what is less like it: 0.5 little, 5 far."
     ),
 ]
+Memory = Annotated[
+    float | None,
+    typer.Option(
+        metavar="GB",
+        help="Gigabytes of memory that may be used. A larger photograph is worked out in tiles of rows, which takes "
+        "longer and shows no seams. Left out: four fifths of what is free.",
+    ),
+]
+Full = Annotated[
+    bool,
+    typer.Option(
+        "--full",
+        help="In tiles: make the filter from every pixel, not from a million of them. Takes several times as long.",
+    ),
+]
 PresetName = Annotated[
     str | None,
     typer.Option(
@@ -108,10 +125,13 @@ def detail(
     region: painting.SliderRegions = None,
     mask: painting.MaskFile = None,
     spread: Spread = 1.0,
+    memory: Memory = None,
+    full: Full = False,
 ) -> None:
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
 
     Colours stay as they are, and so do the file's depth, transparency, colour profile and notes of the camera (EXIF).
+    Photographs that fit no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
 
     Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,4,1.05`
 
@@ -129,43 +149,65 @@ def detail(
     check_residual(residual)
     # A mask is worked out before the filter, from coordinates as large as a factor beside its own factor.
     needed = options.working_bytes(landmarks, patch_size, factors=2 if region or mask else 1)
+    allowed = allowed_memory(memory)
     with steps(4) as begin:
         begin("Reading")
-        photograph = read_photograph(source, bytes_per_pixel=needed)
-        edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
-        check_output(target, edited)
+        photograph = read_if_it_fits(source, target, needed, allowed)
+        if photograph is not None:
+            edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
+            check_output(target, edited)
 
-        begin("Comparing patches")
-        image = photograph.pixels
-        selected = painting.slider_regions(photograph, mask, region, sliders)
-        if selected is not None:
-            regions, own = selected
-            masks = colour_masks(
-                image,
-                regions,
-                time=spread,
-                num_landmarks=landmarks,
+            begin("Comparing patches")
+            image = photograph.pixels
+            selected = painting.slider_regions(photograph, mask, region, sliders)
+            if selected is not None:
+                regions, own = selected
+                masks = colour_masks(
+                    image,
+                    regions,
+                    time=spread,
+                    num_landmarks=landmarks,
+                    spatial_bandwidth=spatial_bandwidth,
+                    generator=torch.Generator().manual_seed(seed),
+                )
+            operator = options.build_operator(
+                reduce_channels(image, "luminance"),
+                bandwidth=bandwidth,
                 spatial_bandwidth=spatial_bandwidth,
-                generator=torch.Generator().manual_seed(seed),
+                patch_size=patch_size,
+                landmarks=landmarks,
+                sampling=sampling,
+                seed=seed,
             )
-        operator = options.build_operator(
-            reduce_channels(image, "luminance"),
-            bandwidth=bandwidth,
-            spatial_bandwidth=spatial_bandwidth,
-            patch_size=patch_size,
-            landmarks=landmarks,
-            sampling=sampling,
-            seed=seed,
-        )
 
-        begin("Filtering")
+            begin("Filtering")
 
-        def edit(planes: Tensor) -> Tensor:
-            if selected is None:
-                return polynomial_filter(operator, planes, sliders, residual=residual)
-            return filter_regions(operator, planes, masks, own, residual=residual)
+            def edit(planes: Tensor) -> Tensor:
+                if selected is None:
+                    return polynomial_filter(operator, planes, sliders, residual=residual)
+                return filter_regions(operator, planes, masks, own, residual=residual)
 
-        pixels = edit_luminance(image, edit) if channels is options.Channels.luminance else edit(image)
+            pixels = edit_luminance(image, edit) if channels is options.Channels.luminance else edit(image)
 
-        begin("Writing")
-        write_photograph(edited.with_pixels(pixels), target)
+            begin("Writing")
+            write_photograph(edited.with_pixels(pixels), target)
+            return
+    edit_by_rows(
+        Path(source),
+        Path(target),
+        sliders,
+        depth=None if depth is None else DEPTHS[depth],
+        mask=mask,
+        region=region,
+        memory=allowed,
+        residual=residual,
+        time=spread,
+        channels=channels.value,
+        statistics="full" if full else "sample",
+        photometric_bandwidth=options.parse_bandwidth(bandwidth),
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=landmarks,
+        landmarks=sampling.value,
+        generator=torch.Generator().manual_seed(seed),
+    )

@@ -4,13 +4,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import torch
 import typer
+from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.files import Photograph, read_photograph
+from nlfilter_torch.streaming.rows import Picture, RowSource
 
 StrokesFile = Annotated[
     Path | None,
@@ -150,17 +153,68 @@ def slider_regions(
     size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
     masks, sliders = ([], []) if path is None else ([_read_mask(path, size)], [alpha])
     for text in regions or []:
-        rectangle = Rectangle.parse(text, "--region", size)
-        own = alpha if rectangle.note is None else parse_sliders(rectangle.note, "--region")
-        if len(own) != len(alpha):
-            raise ValueError(
-                f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
-                "repeat or drop some"
-            )
+        rectangle, own = _with_sliders(text, size, alpha)
         masks.append(torch.zeros(1, 1, *size))
         masks[-1][..., rectangle.rows, rectangle.columns] = 1
         sliders.append(own)
     return (torch.cat(masks, dim=1), torch.stack(sliders)) if masks else None
+
+
+def _with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Rectangle, Tensor]:
+    """A rectangle of ``--region`` and its sliders (k+1,)."""
+    rectangle = Rectangle.parse(text, "--region", size)
+    own = alpha if rectangle.note is None else parse_sliders(rectangle.note, "--region")
+    if len(own) != len(alpha):
+        raise ValueError(
+            f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
+            "repeat or drop some"
+        )
+    return rectangle, own
+
+
+@dataclass(frozen=True)
+class RegionRows:
+    """Regions of a picture that fits no memory: rows (h, W, K) of their weights.
+
+    Attributes:
+        shape: (H, W, K).
+        mask: the picture of the first region, or None.
+        rectangles: the other regions.
+    """
+
+    shape: tuple[int, int, int]
+    mask: Picture | None
+    rectangles: list[Rectangle]
+    dtype = np.dtype(np.float32)
+
+    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        regions = np.moveaxis(weights, 2, 0)
+        if self.mask is not None:
+            regions[0] = self.mask.tile(rows.start, rows.stop, 0).pixels.mean(1)[0].clamp(0, 1)
+        first = len(regions) - len(self.rectangles)
+        for region, rectangle in zip(regions[first:], self.rectangles, strict=True):
+            top, bottom = (max(row - rows.start, 0) for row in (rectangle.rows.start, rectangle.rows.stop))
+            region[top:bottom, rectangle.columns] = 1
+        return weights
+
+
+def region_rows(
+    size: tuple[int, int], path: Path | None, mask: RowSource | None, regions: list[str] | None, alpha: Tensor
+) -> tuple[RegionRows, Tensor] | None:
+    """What :func:`slider_regions` gives, for a picture of ``size`` that is read by rows, as its mask is."""
+    if mask is not None and tuple(mask.shape[:2]) != size:
+        raise ValueError(
+            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {mask.shape[1]}x{mask.shape[0]}; "
+            "resize one"
+        )
+    parsed = [_with_sliders(text, size, alpha) for text in regions or []]
+    sliders = ([alpha] if mask is not None else []) + [own for _, own in parsed]
+    if not sliders:
+        return None
+    picture = None if mask is None else Picture(mask, str(path))
+    return RegionRows((*size, len(sliders)), picture, [rectangle for rectangle, _ in parsed]), torch.stack(sliders)
 
 
 def _read_strokes(path: Path, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -14,8 +14,17 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.masks import blend_regions
-from nlfilter_torch.streaming.fitting import FittedMasks, Statistics, fit_masks, fit_picture
-from nlfilter_torch.streaming.rows import KINDS, Picture, RowSource, RowTarget, Tile, stored_as, transparency
+from nlfilter_torch.streaming import sampling
+from nlfilter_torch.streaming.fitting import MASK_SHARE, FittedMasks, Statistics, fit_masks, fit_picture
+from nlfilter_torch.streaming.rows import (
+    KINDS,
+    Picture,
+    RowSource,
+    RowTarget,
+    Tile,
+    stored_as,
+    transparency,
+)
 from nlfilter_torch.streaming.sampling import Report
 
 SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
@@ -71,7 +80,7 @@ def stream_detail(
 
     Raises:
         TypeError, ValueError: if an argument does not fit, or the source changes its size meanwhile.
-        MemoryError: if a single row takes more than ``memory``.
+        MemoryError: if the samples or a single row take more than ``memory``.
 
     Example:
         >>> picture = np.random.default_rng(0).integers(0, 256, (60, 40, 3), np.uint8)
@@ -140,7 +149,7 @@ def detail_rows(
     if tile_rows is not None:
         check_count(tile_rows, "tile_rows")
     report = report or (lambda stage, done, rows: None)
-    rows = tile_rows or rows_in_memory(picture, memory, alpha.shape[-1], regions is not None, **options)
+    rows = tile_rows or rows_in_memory(picture, memory, alpha.shape[-1], sample, regions is not None, **options)
     generator, masks = options.get("generator"), None
     if regions is not None:
         if alpha.ndim == 2 and len(alpha) != regions.shape[-1]:
@@ -212,6 +221,7 @@ def rows_in_memory(
     picture: Picture,
     memory: int,
     sliders: int,
+    sample: int,
     masked: bool,
     *,
     num_landmarks: int = 100,
@@ -222,18 +232,24 @@ def rows_in_memory(
     """Rows of a tile that can be worked out in ``memory`` bytes.
 
     Raises:
-        MemoryError: if there is not one.
+        MemoryError: if there is not one, or no room for the samples.
     """
     check_count(num_landmarks, "num_landmarks")
     check_count(patch_size, "patch_size")
-    planes = patch_size**2 * (picture.colours if guide_channels == "all" else 1)
-    floats = num_landmarks + planes + (3 * sliders + 8) * picture.colours
-    if masked:  # coordinates, their differences from a centre, and features in colour
-        floats = max(floats, 3 * num_landmarks + patch_size**2 * picture.colours)
-    row = picture.size[1] * floats * (8 if picture.dtype == torch.float64 else 4)
-    if row > memory:
+    in_colour = masked or guide_channels == "all"
+    planes = patch_size**2 * (picture.colours if in_colour else 1)
+    size = 8 if picture.dtype == torch.float64 else 4
+    # A tile: features and factor, or coordinates and their differences from a centre, and some images.
+    floats = num_landmarks * (3 if masked else 1) + planes + (3 * sliders + 8) * picture.colours
+    row = picture.size[1] * floats * size
+    # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
+    pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
+    chosen = min(picture.pixels, sample // MASK_SHARE if masked else sample)
+    later = (pilot + chosen) * planes + block * (num_landmarks + planes + 8)
+    least = size * max(pilot * (num_landmarks + 3 * planes), later)
+    if max(row, least) > memory:
         raise MemoryError(
-            f"memory must have room for a row of {picture.name} at least, {row / 1e6:.0f} MB, got {memory / 1e6:.0f} "
-            "MB; allow more, or use fewer landmarks"
+            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {memory / 1e6:.0f} MB may be "
+            "used; allow more, or use fewer landmarks"
         )
     return max(1, min(memory // (2 * row), TILE_PIXELS // picture.size[1]))

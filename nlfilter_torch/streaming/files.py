@@ -1,0 +1,258 @@
+"""Files that are read and written by rows: TIFF and BigTIFF, folders of zarr, and other pictures by their bytes alone.
+
+Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complete or not at all.
+"""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from nlfilter_torch import exif as exif_tags
+from nlfilter_torch import tiff
+from nlfilter_torch.files import (
+    check_file,
+    check_type,
+    encode,
+    first_bytes,
+    name_beside,
+    open_beside,
+    read_channels,
+)
+from nlfilter_torch.streaming.rows import RowSource
+from nlfilter_torch.streaming.tiff_rows import TiffRows
+
+ZARR = ".zarr"
+CHUNK = 256  # side of the chunks of a zarr array that is made here
+CODED = 8  # times its bytes that a picture other than TIFF and zarr takes while it is decoded or encoded
+
+Rows = Iterator[tuple[slice, NDArray[Any]]]
+
+
+@dataclass(frozen=True)
+class StoredPicture:
+    """A picture in a file, of which only what is asked for is read.
+
+    Attributes:
+        rows: upright, (H, W, S) or (H, W).
+        alpha: that the last channel is one.
+        held: bytes of it that are in memory meanwhile.
+        icc: the colour profile, or None.
+        exif: the EXIF block, or None.
+        attributes: of a zarr array.
+    """
+
+    rows: RowSource
+    alpha: bool
+    held: int
+    icc: bytes | None = None
+    exif: bytes | None = None
+    attributes: dict[str, Any] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(H, W, S)."""
+        height, width, *samples = self.rows.shape
+        return height, width, samples[0] if samples else 1
+
+
+def is_zarr(path: Path) -> bool:
+    """Is this the folder of a zarr array, or does it have the name of one?"""
+    return path.suffix.lower() == ZARR or _holds_zarr(path)
+
+
+def _holds_zarr(path: Path) -> bool:
+    return any((path / name).is_file() for name in ("zarr.json", ".zarray"))
+
+
+@contextmanager
+def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
+    """A picture that is read by rows as long as the block lasts.
+
+    Raises:
+        FileNotFoundError, ValueError: if no file is there, or it is none that can be read.
+        MemoryError: if it can only be read in pieces that take more than ``memory`` bytes.
+    """
+    with ExitStack() as stack:
+        if is_zarr(path):
+            stored = _open_zarr(path)
+        elif tiff.is_tiff(first_bytes(path)):
+            stored = _open_tiff(path, stack)
+        else:
+            channels, icc, exif = read_channels(path, bytes_per_pixel=CODED, memory=memory)
+            stored = StoredPicture(channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif)
+        if stored.held > memory:
+            raise MemoryError(
+                f"{path} can only be read in pieces of {stored.held / 1e6:.0f} MB, but {memory / 1e6:.0f} MB may be "
+                "used; save it in tiles, or allow more"
+            )
+        yield stored
+
+
+def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> None:
+    """Raise unless the picture can be written to ``path`` at that depth.
+
+    Raises:
+        ValueError: as :func:`check_output`.
+        MemoryError: if a file of that type has to be put together in more than ``memory`` bytes.
+    """
+    if path.suffix.lower() == ZARR:
+        _zarr()
+        if not path.is_dir():
+            check_file(path)
+        elif not _holds_zarr(path):
+            raise ValueError(f"{path} is a folder, but no array of zarr that could be replaced; choose another name")
+        return
+    kind = check_type(path, depth, picture.alpha)
+    needed = 0 if kind == "TIFF" else _bytes(picture, depth) * CODED
+    if needed > memory:
+        raise MemoryError(
+            f"{path} takes {needed / 1e6:.0f} MB to be put together, but {memory / 1e6:.0f} MB may be used; write a "
+            "TIFF file, or allow more"
+        )
+
+
+def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> None:
+    """Write rows as they come, with the profile and the notes of another picture of that shape.
+
+    Raises:
+        OSError: if the system does not let the file be written.
+    """
+    shape, dtype = like.shape, np.dtype(depth)
+    if path.suffix.lower() == ZARR:
+        _write_zarr(path, rows, dtype, like)
+        return
+    kind = check_type(path, depth, like.alpha)
+    with open_beside(path) as stream:
+        if kind == "TIFF":
+            values = (part for _, part in rows)
+            tiff.write_rows(stream, values, shape, dtype, like.alpha, like.icc, like.exif)
+        else:
+            whole = np.empty(shape, dtype)
+            for part, values_of_part in rows:
+                whole[part] = values_of_part
+            encode(stream, kind, whole, like.alpha, like.icc, like.exif)
+
+
+def _bytes(picture: StoredPicture, depth: str) -> int:
+    height, width, samples = picture.shape
+    return height * width * samples * np.dtype(depth).itemsize
+
+
+def free_memory() -> int:
+    """Bytes that may be used where no one says how many: four fifths of what is free."""
+    return int(psutil.virtual_memory().available * 4 // 5)
+
+
+def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
+    try:
+        rows = stack.enter_context(TiffRows(path))
+    except tiff.UnhandledTiff as error:
+        raise ValueError(f"{path} {error}") from error
+    except OSError:
+        raise
+    except Exception as error:  # tifffile has no class of its own for every damage
+        raise ValueError(
+            f"{path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
+        ) from error
+    source: RowSource = rows
+    if rows.turned:
+        source = _turn(rows, stack)
+    return StoredPicture(source, rows.alpha, rows.held, rows.icc, rows.exif)
+
+
+def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
+    """The rows of a picture that lies on its side, from a copy on disk that has no name and so vanishes by itself."""
+    height, width, samples = rows.shape
+    copy = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
+    upright = np.memmap(copy, dtype=rows.dtype, mode="w+", shape=(width, height, samples))
+    step = max(rows.segment[0], 64)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        block = exif_tags.upright(rows[slice(start, stop)], rows.orientation)
+        # Orientations 6 and 7 begin with the last row.
+        place = slice(height - stop, height - start) if rows.orientation in (6, 7) else slice(start, stop)
+        upright[:, place] = block
+    return upright
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError as error:
+        raise ValueError(
+            "arrays of zarr need the package zarr, which is missing; install nlfilter-torch[zarr]"
+        ) from error
+    return zarr
+
+
+class _ZarrRows:
+    """An array of zarr that notices when it gets another shape meanwhile."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.array = self._open()
+        self.shape: tuple[int, ...] = tuple(self.array.shape)
+        self.dtype = self.array.dtype
+
+    def _open(self) -> Any:
+        try:
+            return _zarr().open_array(self.path, mode="r")
+        except (FileNotFoundError, KeyError, TypeError) as error:
+            raise ValueError(f"{self.path} is no array of zarr ({error}); name the folder of one") from error
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        now = tuple(self._open().shape)
+        if now != self.shape:
+            raise ValueError(
+                f"{self.path} changed while it was read, from the shape {self.shape} to {now}; let nothing write to it "
+                "meanwhile, and start again"
+            )
+        return np.asarray(self.array[rows])
+
+
+def _open_zarr(path: Path) -> StoredPicture:
+    rows = _ZarrRows(path)
+    if len(rows.shape) not in (2, 3):
+        raise ValueError(
+            f"{path} must have the shape (H, W) or (H, W, S), got {rows.shape}; name the array of a picture"
+        )
+    alpha = len(rows.shape) == 3 and rows.shape[2] in (2, 4)
+    chunk = (*rows.array.chunks[:1], *rows.shape[1:])
+    held = 2 * int(np.prod(chunk)) * rows.dtype.itemsize
+    return StoredPicture(rows, alpha, held, attributes=dict(rows.array.attrs))
+
+
+def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:
+    """An array that takes its name when it is whole; one that had the name before goes then, and not earlier."""
+    shape = tuple(like.rows.shape)
+    beside, former = name_beside(path), name_beside(path)
+    try:
+        chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
+        array = _zarr().create_array(
+            store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
+        )
+        start = 0
+        for band in tiff.bands((part for _, part in rows), CHUNK):
+            array[start : start + len(band)] = band.reshape(len(band), *shape[1:])
+            start += len(band)
+        if path.exists():
+            path.replace(former)
+        try:
+            os.replace(beside, path)
+        except OSError:
+            former.replace(path)
+            raise
+    except OSError as error:
+        raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
+    finally:
+        for folder in (beside, former):
+            shutil.rmtree(folder, ignore_errors=True)
