@@ -225,7 +225,8 @@ def nonlocal_operator(
             never used.
         group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
             this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
-            process would, for their own rows; see :mod:`nlfilter_torch.sharding`. None is the whole image here.
+            process would, for their own rows; see :mod:`nlfilter_torch.sharding`. None, which
+            ``torch.distributed.group.WORLD`` is as well before there is one, is the whole image here.
 
     Returns:
         The operator, with row sums of 1 to ``tolerance`` or to rounding.

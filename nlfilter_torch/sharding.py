@@ -66,10 +66,16 @@ def meet(guide: Tensor, group: Any) -> Shard | None:
     """Tell the other ranks of the rows (B, C, H, W) that are here.
 
     Raises:
+        TypeError: if ``group`` is no process group that this process belongs to.
         ValueError: if the guides differ in more than their number of rows.
     """
     if group is None:
         return None
+    if not dist.is_available() or not isinstance(group, dist.ProcessGroup):
+        raise TypeError(
+            f"group must be a process group of torch.distributed with this process in it, got {type(group).__name__}; "
+            "pass torch.distributed.group.WORLD after torch.distributed.init_process_group"
+        )
     batch, channels, height, width = guide.shape
     own = [height, batch, channels, width, torch.finfo(guide.dtype).bits]
     shapes = [part.tolist() for part in _gather(torch.tensor(own, device=guide.device), group)]
