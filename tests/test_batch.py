@@ -273,15 +273,16 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A preset and options reach the edit and the record; cores are shared among workers and local ranks."""
-    fill(tmp_path / "in", 2)
+    fill(tmp_path / "in", 9)
     seen = {}
     monkeypatch.setattr("nlfilter_torch.cli.batch.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args))
     monkeypatch.setattr("nlfilter_torch.cli.batch._cores", lambda: 12)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     arguments = ["batch", str(tmp_path / "in"), str(tmp_path / "out"), "--preset", "smooth", "--seed", "5"]
-    assert main([*arguments, "--workers", "2"]) == 0
+    assert main([*arguments, "--workers", "2", "--memory", "8"]) == 0
     assert (seen["workers"], seen["threads"]) == (2, 3)
     settings = seen["args"][2].keywords
+    assert settings.pop("memory") == 2.0  # of two ranks with two workers each
     smooth = PRESETS["smooth"]
     assert settings["alpha"] == ",".join(map(str, smooth.alpha))
     assert (settings["bandwidth"], settings["seed"]) == (str(smooth.bandwidth), 5)
@@ -307,7 +308,14 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "must be another folder than that of the photographs" in refused(capsys, source, source)
     assert "is a file, not a folder" in refused(capsys, source, tmp_path / "file")
     assert "does not exist; make it first" in refused(capsys, source, tmp_path / "no" / "where")
-    for options in (("--alpha", 3), ("--bandwidth", 0), ("--residual", "nan"), ("--patch-size", 4), ("--workers", 0)):
+    for options in (
+        ("--alpha", 3),
+        ("--bandwidth", 0),
+        ("--residual", "nan"),
+        ("--patch-size", 4),
+        ("--workers", 0),
+        ("--memory", 0),
+    ):
         assert options[0].strip("-").replace("-", "_") in refused(capsys, source, target, *options).replace("-", "_")
     assert "--spatial-bandwidth must be positive" in refused(capsys, source, target, "--spatial-bandwidth", 0)
     assert not target.exists()

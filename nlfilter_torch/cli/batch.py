@@ -9,7 +9,8 @@ import typer
 
 from nlfilter_torch.checks import check_patch_size, check_positive
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.detail import Edited, PresetName, Residual, check_residual, detail
+from nlfilter_torch.cli.by_rows import allowed_memory
+from nlfilter_torch.cli.detail import Edited, Memory, PresetName, Residual, check_residual, detail
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.folders import Tally, edit_folder, pictures, prepare
 from nlfilter_torch.ranks import connected_ranks
@@ -47,11 +48,12 @@ def batch(
     seed: options.Seed = 0,
     preset: PresetName = None,
     workers: Workers = None,
+    memory: Memory = None,
 ) -> None:
     """Edit the details of all photographs of a folder, as `nlfilter-torch detail` edits one.
 
     A file that cannot be edited is reported and the others are done; the exit status is 1 then. After an interruption
-    the same command does what is left.
+    the same command does what is left. The workers share --memory.
 
     All like one: `nlfilter-torch batch shots edited --preset look.json`
 
@@ -60,6 +62,7 @@ def batch(
     options.parse_alpha(alpha)
     options.parse_bandwidth(bandwidth)
     check_residual(residual)
+    allowed_memory(memory)
     check_patch_size(patch_size)
     if spatial_bandwidth is not None:
         check_positive(spatial_bandwidth, "--spatial-bandwidth")
@@ -79,13 +82,14 @@ def batch(
         prepare(paths, target, settings)
         share, tally, total = ranks.share(paths), Tally(), Tally()
         cores = max(1, _cores() // ranks.local)
-        count = workers or cores
+        count = min(workers or cores, len(share)) or 1
+        room = allowed_memory(memory) / (count * ranks.local) / 1e9
         try:
             with steps(len(share)) as begin:
                 edit_folder(
                     share,
                     target,
-                    partial(detail, **settings),
+                    partial(detail, **settings, memory=room),
                     workers=count,
                     threads=max(1, cores // count),
                     tell=_tell,
