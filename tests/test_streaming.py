@@ -276,7 +276,7 @@ def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -
 
     pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
-        balance_by_passes(lambda: pilot.sample.blocks(pilot.kernel), 9 * pilot.balancing)
+        balance_by_passes(lambda: pilot.sample.blocks(pilot.kernel), 9 * pilot.balancing, completed=True)
 
 
 class Shrinking(Rows):

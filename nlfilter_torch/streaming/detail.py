@@ -70,8 +70,8 @@ def stream_detail(
         width: squared diffusion distance at which a mask has fallen to 1/e.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
         statistics: ``"sample"`` balances the filter and finds its coefficients on a sample of the pixels, in which
-            rare patches come before common ones, after two readings of the source; ``"full"`` on all pixels, in four
-            or five passes that each cost as much as the result.
+            rare patches come before common ones, after two readings of the source; ``"full"`` goes on
+            from there to all pixels, in three or four passes that each cost more than the result.
         sample: number of pixels of that sample, about; with as many as the picture has, statistics are full.
         tile_rows: rows that are worked out at once; None is as many as ``memory`` has room for.
         memory: bytes that may be used, beside those of source and target.

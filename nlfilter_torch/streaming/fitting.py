@@ -1,6 +1,6 @@
 """A picture that is read by rows to the filter and the masks of the whole, a few M-vectors each."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -149,18 +149,21 @@ def _gather(
 ) -> tuple[Kernel, Tensor, Sums]:
     """Kernel, moment t of balancing, and the sums for the first ``order`` powers of W."""
     pilot = take_pilot(picture, image, report, **options)
-    kernel = pilot.kernel
-    blocks: Callable[[str], Iterator[Block]]
-    if statistics == "full" or sample >= picture.pixels:
+    kernel, balancing = pilot.kernel, pilot.balancing
+    completed = kernel.completion == "diagonal"
 
-        def blocks(stage: str) -> Iterator[Block]:
-            return all_blocks(picture, kernel, image, report, stage)
-    else:
+    def every(stage: str) -> Iterator[Block]:
+        return all_blocks(picture, kernel, image, report, stage)
+
+    def some(stage: str) -> Iterator[Block]:
+        report(stage, 0, 1)
+        return (block for part in chosen for block in part.blocks(kernel))
+
+    drawn = sample < picture.pixels
+    if drawn:
         chosen = sample_by_influence(picture, pilot, image, sample, report, spectral=spectral)
-
-        def blocks(stage: str) -> Iterator[Block]:
-            report(stage, 0, 1)
-            return (block for part in chosen for block in part.blocks(kernel))
-
-    balancing = balance_by_passes(lambda: blocks("Balancing"), pilot.balancing)
-    return kernel, balancing, sum_up(lambda: blocks("Summing up"), balancing, order)
+        balancing = balance_by_passes(lambda: some("Balancing"), balancing, completed=completed)
+    if drawn and statistics == "sample":
+        return kernel, balancing, sum_up(lambda: some("Summing up"), balancing, order)
+    balancing = balance_by_passes(lambda: every("Balancing"), balancing, completed=completed)
+    return kernel, balancing, sum_up(lambda: every("Summing up"), balancing, order)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nlfilter_torch.blocks import moment, pixel_blocks
 from nlfilter_torch.checks import warn
-from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.newton import LARGEST, scaling_from_moment
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import whiten_gram
 
@@ -45,8 +45,13 @@ def start_balancing(factor: Tensor, diagonal: Tensor, weight: float) -> Tensor:
     return weight**0.5 * moment(factor, scaling.unsqueeze(1))
 
 
-def balance_by_passes(blocks: Pass, total: Tensor) -> Tensor:
-    """The moment t (1, M, 1) of the pixels in ``blocks``, from a first guess ``total``."""
+def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor:
+    """The moment t (1, M, 1) of the pixels in ``blocks``, from a first guess ``total``.
+
+    ``completed``: the kernel has a unit diagonal and no negative entry, so that no scaling can be large. A guess that
+    knows nothing of some pixels would give them one, and Newton's method would only halve it with every pass.
+    """
+    largest = LARGEST if completed else float("inf")
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
     change = float("inf")
     for _ in range(MAX_PASSES):
@@ -54,7 +59,7 @@ def balance_by_passes(blocks: Pass, total: Tensor) -> Tensor:
         tolerance = 0.0
         for block in blocks():
             tolerance = CONVERGED[block.factor.dtype]
-            scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor))
+            scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor)).clamp(max=largest)
             remainder = scaling * (scaling * block.diagonal)
             sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
             weights = scaling * (block.weights / (1 + remainder)).sqrt()

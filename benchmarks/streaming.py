@@ -1,0 +1,197 @@
+"""Time, memory and exactness of pictures that are worked out by rows: ``python -m benchmarks.streaming``.
+
+A mosaic of photographs, each piece turned, darkened or lightened and roughened in its own way, goes into a BigTIFF
+file; a fresh process filters it into another. Time is that of the processor, summed over its cores, so that other work
+on the machine does little to it. Peaks are the kernel's own (VmHWM; Linux only), over what is resident when the program
+and its libraries have been read. ``--quick`` runs everything on a fraction of a megapixel.
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import skimage.data
+import tifffile
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.memory import MIB, forget_peak, resident
+from nlfilter_torch import nonlocal_operator, polynomial_filter
+from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.streaming import stream_detail
+from nlfilter_torch.streaming.detail import SAMPLE, detail_rows
+from nlfilter_torch.streaming.files import open_picture, write_picture
+
+ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
+PIECE = 256  # side of a piece of the mosaic
+NAMES = ("astronaut", "chelsea", "coffee", "rocket", "camera", "moon", "coins", "page", "brick", "grass", "gravel")
+Array = NDArray[np.uint8]
+
+
+def photographs() -> list[Array]:
+    """Photographs (H, W, 3) that come with scikit-image, none smaller than a piece."""
+    found = [getattr(skimage.data, name)() for name in (*NAMES, "retina", "hubble_deep_field")]
+    found.append(skimage.data.stereo_motorcycle()[0])
+    colour = [picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2) for picture in found]
+    short = [np.maximum(PIECE - np.array(picture.shape[:2]), 0) for picture in colour]
+    return [np.pad(p, ((0, s[0]), (0, s[1]), (0, 0)), mode="symmetric") for p, s in zip(colour, short, strict=True)]
+
+
+def mosaic(height: int, width: int) -> Iterator[Array]:
+    """Bands (PIECE or fewer, width, 3) of a picture of any size; the same every time."""
+    generator, sources = np.random.default_rng(0), photographs()
+    for top in range(0, height, PIECE):
+        band = np.empty((PIECE, -(-width // PIECE) * PIECE, 3), np.uint8)
+        for left in range(0, width, PIECE):
+            source = sources[generator.integers(len(sources))]
+            y, x = (generator.integers(length - PIECE + 1) for length in source.shape[:2])
+            piece = np.rot90(source[y : y + PIECE, x : x + PIECE], generator.integers(4)) / 255
+            piece = piece ** generator.uniform(0.6, 1.6)
+            piece = piece + generator.normal(0, generator.uniform(0, 4 / 255), piece.shape)
+            band[:, left : left + PIECE] = np.rint(piece.clip(0, 1) * 255)
+        yield band[: height - top, :width]
+
+
+def write_mosaic(path: Path, side: int) -> None:
+    """A tiled BigTIFF of side x side pixels."""
+
+    def tiles() -> Iterator[Array]:
+        for band in mosaic(side, side):
+            for left in range(0, side, PIECE):
+                tile = band[:, left : left + PIECE]
+                yield np.pad(tile, ((0, PIECE - tile.shape[0]), (0, PIECE - tile.shape[1]), (0, 0)))
+
+    shape = (side, side, 3)
+    options = {"tile": (PIECE, PIECE), "compression": "zlib", "predictor": True, "maxworkers": 1}
+    tifffile.imwrite(path, tiles(), shape=shape, dtype=np.uint8, bigtiff=True, photometric="rgb", **options)
+
+
+def work(source: Path, target: Path, statistics: str, landmarks: int, memory: int) -> dict[str, object]:
+    """Filter a file in this process, and say what it took."""
+    edit_luminance(torch.zeros(1, 3, 1, 1), lambda y: y)  # kornia is read when it is first needed
+    forget_peak()
+    before, started, wall = resident("VmRSS"), time.process_time(), time.perf_counter()
+    stages: dict[str, float] = {}
+    stage, since = "", started
+
+    def report(name: str, done: int, total: int) -> None:
+        nonlocal stage, since
+        now = time.process_time()
+        stages[stage] = stages.get(stage, 0.0) + now - since
+        stage, since = name, now
+
+    with open_picture(source, memory) as picture:
+        rows = detail_rows(
+            picture.rows,
+            ALPHA,
+            kind="uint8",
+            statistics=statistics,  # type: ignore[arg-type]
+            memory=memory,
+            report=report,
+            num_landmarks=landmarks,
+        )
+        write_picture(target, rows, "uint8", picture)
+        pixels = picture.shape[0] * picture.shape[1]
+    report("", 0, 0)
+    stages.pop("")
+    return {
+        "megapixels": pixels / 1e6,
+        "landmarks": landmarks,
+        "statistics": statistics,
+        "cpu_s": time.process_time() - started,
+        "wall_s": time.perf_counter() - wall,
+        "peak_mib": resident("VmHWM") - before,
+        "start_mib": before,
+        "stages_s": stages,
+    }
+
+
+def in_fresh_process(folder: Path, source: Path, statistics: str, landmarks: int) -> dict[str, object]:
+    """:func:`work` in a process of its own, which has held nothing before."""
+    arguments = [str(source), str(folder / "out.tif"), statistics, str(landmarks)]
+    command = [sys.executable, "-m", "benchmarks.streaming", "--work", *arguments]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    result: dict[str, object] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def exactness(side: int, tiles: list[int]) -> dict[str, float]:
+    """Largest differences between rows and memory, and between tiles, as fractions of white."""
+    picture = np.concatenate(list(mosaic(side, side))).astype(np.float32) / np.float32(255)
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    luminance = 0.299 * image[:, :1] + 0.587 * image[:, 1:2] + 0.114 * image[:, 2:]
+    change = polynomial_filter(nonlocal_operator(luminance), luminance, ALPHA) - luminance
+    whole = (image + change)[0].permute(1, 2, 0).numpy()
+
+    def by_rows(**options: object) -> NDArray[np.float32]:
+        edited = np.empty_like(picture)
+        stream_detail(picture, edited, ALPHA, sample=min(SAMPLE, side * side // 4), **options)  # type: ignore[arg-type]
+        return edited
+
+    sampled = by_rows(tile_rows=tiles[0])
+    others = [np.abs(by_rows(tile_rows=rows) - sampled).max() for rows in tiles[1:]]
+    result = {"megapixels": side * side / 1e6, "sample_pixels": min(SAMPLE, side * side // 4)}
+    result["sample_max"] = float(np.abs(sampled - whole).max())
+    result["sample_rms"] = float(np.sqrt(np.square(sampled - whole, dtype=np.float64).mean()))
+    result["full_max"] = float(np.abs(by_rows(statistics="full") - whole).max())
+    return result | {"tiles_max": float(max(others)), "smallest_tile": tiles[0], "largest_tile": tiles[-1]}
+
+
+def main() -> None:
+    """Measure, print and, if asked for, write JSON."""
+    parser = argparse.ArgumentParser(description="Time, memory and exactness of pictures worked out by rows.")
+    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    parser.add_argument("--work", nargs=4, metavar=("IN", "OUT", "STATISTICS", "LANDMARKS"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.work:
+        source, target, statistics, landmarks = options.work
+        print(json.dumps(work(Path(source), Path(target), statistics, int(landmarks), 800 * MIB)))
+        return
+
+    sides = [300, 450] if options.quick else [2048, 5000, 10_000]
+    runs = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for number, side in enumerate(sides):
+            source = folder / "in.tif"
+            write_mosaic(source, side)
+            kinds = [("sample", 100)]
+            if number == 0:
+                kinds += [("full", 100), ("sample", 50), ("sample", 200)]
+            for statistics, landmarks in kinds:
+                runs.append(in_fresh_process(folder, source, statistics, landmarks))
+                show(runs[-1])
+    exact = exactness(400, [16, 64, 400]) if options.quick else exactness(2050, [64, 256, 1000, 4096])
+    print(
+        f"{exact['megapixels']:.2f} MP against memory: {exact['sample_max'] * 255:.2f} levels of 255 at most from a "
+        f"sample of {exact['sample_pixels']:.0f} pixels (RMS {exact['sample_rms'] * 255:.3f}), {exact['full_max']:.1e} "
+        f"of white from all; tiles of {exact['smallest_tile']:.0f} to {exact['largest_tile']:.0f} rows differ by "
+        f"{exact['tiles_max']:.1e}"
+    )
+    if options.out:
+        machine = {"machine": platform.machine(), "threads": torch.get_num_threads(), "torch": torch.__version__}
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps({"machine": machine, "runs": runs, "exactness": exact}, indent=1) + "\n")
+
+
+def show(run: dict[str, object]) -> None:
+    """One line for a run."""
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
+    cpu, pixels = float(run["cpu_s"]), float(run["megapixels"])  # type: ignore[arg-type]
+    print(
+        f"{pixels:7.2f} MP, m = {run['landmarks']}, {run['statistics']}: {cpu:.1f} s of processor, {cpu / pixels:.2f} "
+        f"s per MP, {run['peak_mib']:.0f} MiB over {run['start_mib']:.0f} at the start ({stages})",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()
