@@ -30,7 +30,7 @@ def detail() -> dict[str, Tensor]:
     panels = {
         "A spot (yellow)": marked(image, spot),
         "What is like it": colour_masks(image, spot, time=2.0),
-        "Detail there, nowhere else": enhance(image, torch.tensor(ALPHA), spot, time=2.0),
+        "Detail where it is alike": enhance(image, torch.tensor(ALPHA), spot, time=2.0),
     }
     return {title: panel[wide] for title, panel in panels.items()}
 
@@ -66,7 +66,7 @@ def focusing() -> dict[str, Tensor]:
     region = spots(image, scale, *PORTRAIT)
     return {
         "Spots to stay sharp": marked(image, region),
-        "What does": default_map(image, region),
+        "What stays sharp": default_map(image, region),
         "defocus": defocus(image, region),
     }
 

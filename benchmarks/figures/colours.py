@@ -7,7 +7,7 @@ from torch import Tensor
 
 from benchmarks.colorize import levin, psnr
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, painted_over, rounded, scene, spots, strokes
-from nlfilter_torch import colorize, recolor
+from nlfilter_torch import colorize, diffusion_mask, nonlocal_operator, recolor
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.pictures import show_images
 
@@ -28,11 +28,13 @@ TOLERANCE = 20.0  # of the replacement by colour range, in units of Lab
 def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
     """One stroke on a motorcycle's tank recolours all of its red, beside replacing a range of colours.
 
-    (c) is where the colour goes. (e) takes the stroke's hue for all colours within 20 units of Lab, fading out.
+    (c) is where the colour goes. (e) takes the stroke's hue for all colours within 20 units of Lab, fading out; (f) is
+    the paper's mask, for comparison.
     """
     image, scale = scene("motorcycle", size)
     colours, mask = strokes(image, scale, ((350, 205, 40, 20), BLUE))
     edited = recolor(image, colours, mask)
+    by_colour = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all")
     replaced = colour_range(image, colours, mask)
     panels = {
         "(a) photograph": image,
@@ -40,6 +42,7 @@ def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
         "(c) where it goes": reached(image, edited),
         "(d) recolor": edited,
         "(e) a range of colours replaced": replaced,
+        "(f) the mask of eq. (17), t = 3": diffusion_mask(by_colour.spectrum(), mask, time=3.0),
     }
     numbers = {"recolor": _told(image, edited), "range replaced": _told(image, replaced)}
     return show_images(panels, columns=3, side=SIDE), numbers

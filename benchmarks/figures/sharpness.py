@@ -25,7 +25,7 @@ def figure_12(size: int = SIZE) -> tuple[Figure, Numbers]:
 
     Propagated, the edit leaves skin and backdrop as they are, and with them their noise.
     """
-    return _compare("astronaut", size, ((60, 300, 20, 20),), time=2.0, window=(10, 40, 330))
+    return _compare("astronaut", size, ((60, 300, 20, 20),), time=2.0, width=4.0, window=(10, 40, 330))
 
 
 def figure_13(size: int = SIZE) -> tuple[Figure, Numbers]:
@@ -33,14 +33,16 @@ def figure_13(size: int = SIZE) -> tuple[Figure, Numbers]:
 
     Propagated, the edit leaves the sky as it is, and with it the sky's noise.
     """
-    return _compare("camera", size, ((300, 380, 40, 60),), time=0.5, window=(60, 130, 330))
+    return _compare("camera", size, ((300, 380, 40, 60),), time=1.0, width=2.0, window=(60, 130, 330))
 
 
-def _compare(name: str, size: int, boxes: tuple[Box, ...], *, time: float, window: Window) -> tuple[Figure, Numbers]:
+def _compare(
+    name: str, size: int, boxes: tuple[Box, ...], *, time: float, width: float, window: Window
+) -> tuple[Figure, Numbers]:
     image, scale = scene(name, size)
     before, region = luminance(image), spots(image, scale, *boxes)
     by_colour = nonlocal_operator(image, photometric_bandwidth=BANDWIDTH, guide_channels="all")
-    mask = diffusion_mask(by_colour.spectrum(), region, time=time)
+    mask = diffusion_mask(by_colour.spectrum(), region, time=time, width=width)
     selected = mask > 0.5
     whole = polynomial_filter(nonlocal_operator(before), before, ALPHA) - before
     gain = _gain(before, before + mask * whole, selected)

@@ -15,7 +15,7 @@ from nlfilter_torch.filtering import spectral_filter
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 
-LOCALITY = 0.1  # default spatial bandwidth as a share of the short side
+LOCALITY = 0.15  # default spatial bandwidth as a share of the short side
 # What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel
 # has likes, there where it is like no other, such as on a border, and back everywhere as the power goes to 0.
 TIMES_UNEXPLAINED = 10
@@ -52,7 +52,7 @@ def abstract(
         edge_width: of the lines, in pixels.
         tones: number of tones of luminance, at least 2; None leaves it continuous.
         photometric_bandwidth: h_y; larger makes larger flat areas.
-        spatial_bandwidth: h_x in pixels; None is 0.1 of the short side.
+        spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
         patch_size: of the patches that are compared.
         num_landmarks: M; fewer make coarser pictures.
         **options: further ones of :func:`nonlocal_operator`.
