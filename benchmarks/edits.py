@@ -71,9 +71,9 @@ def masks() -> Iterator[Promise]:
     levels = torch.linspace(0, 1, 21)
     quantiles = torch.stack([diffusion_mask(preview, small_spot, time=t).flatten().quantile(levels) for t in TIMES])
     yield Promise(
-        f"least growth of any of 21 quantiles of it, t = {TIMES}",
+        f"least growth of its quantiles from 5 to 95 %, t = {TIMES}",
         0.0,
-        float(quantiles.diff(dim=0).min()),
+        float(quantiles.diff(dim=0)[:, 1:-1].min()),
         at_least=True,
     )
     yield Promise("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
