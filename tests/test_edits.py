@@ -24,6 +24,7 @@ from nlfilter_torch import (
     sharpen,
 )
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.edits.spots import MAX_SPOTS, find_spots
 from tests.problems import noise
 
 LUMINANCE = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
@@ -255,6 +256,20 @@ def test_odd_pixels_of_the_subject_do_not_bring_the_background_into_focus() -> N
     blurred = defocus(image, region, radius=4.0)
     far = box(0, 95, 60, 33, size=(128, 128))
     assert gradient_energy(blurred, far) < 0.3 * gradient_energy(image, far)
+
+
+def test_spots_beyond_the_last_that_is_kept_apart_are_taken_together() -> None:
+    image = colour("astronaut")
+    spectrum = nonlocal_operator(image, num_landmarks=40, photometric_bandwidth=0.2, guide_channels="all").spectrum()
+    dots = torch.zeros(1, 2, 64, 64)
+    dots[:, 0, 1::4, 1::4], dots[:, 1, 3::16, 3::16] = 0.5, 1.0  # 256 and 16
+    (spots,) = find_spots(spectrum, dots, 0.5)
+    assert spots.owners.sum(0).tolist() == [MAX_SPOTS, 16]
+    torch.testing.assert_close(spots.between.diagonal(), torch.ones(MAX_SPOTS + 16), atol=1e-4, rtol=0)
+    each = spots.mix(torch.eye(MAX_SPOTS + 16))
+    assert each.abs().max() <= 1 + 1e-3
+    single = dots[0, 1].flatten() > 0  # a dot correlates with itself fully
+    torch.testing.assert_close(each[MAX_SPOTS:, single].diagonal(), torch.ones(16), atol=1e-3, rtol=0)
 
 
 def test_flat_images_stay_flat() -> None:

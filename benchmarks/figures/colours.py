@@ -49,7 +49,7 @@ def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def figure_15(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Two strokes on things of one red: the spatial term sends each to its own side."""
+    """Strokes of two colours on things of one red: the spatial term sends each colour to its own side."""
     image, scale = scene("motorcycle", size)
     colours, mask = strokes(
         image, scale, ((350, 205, 40, 20), BLUE), ((565, 272, 30, 14), BLUE), ((565, 190, 40, 40), GREEN)

@@ -27,7 +27,7 @@ def figure_1(size: int = SIZE) -> tuple[Figure, Numbers]:
 def figure_3(size: int = SIZE) -> tuple[Figure, Numbers]:
     """The same with a narrow spatial term, h_x = 20 pixels and h_y = 5 grey levels: piecewise smooth, local patterns.
 
-    The paper's h_y is in units of patch weights whose sum is 4.2 times smaller.
+    400 landmarks here, as local patterns are many. The paper's h_y is for patch weights of a sum 4.2 times smaller.
     """
     image = scene("camera", size)[0]
     operator = nonlocal_operator(

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_image, check_positive, check_same_size
-from nlfilter_torch.edits.spots import spot_correlations
+from nlfilter_torch.edits.spots import Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
@@ -44,7 +44,7 @@ def defocus(
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp; several spots may differ
-            in colour.
+            in colour, and each stands for what most of it covers.
         radius: of the strongest blur, in pixels; None is 2.5 % of the short side.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
             variance.
@@ -103,7 +103,7 @@ def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor
     from kornia.filters import guided_blur  # kornia takes half a second to import: only who needs it waits
 
     painted = focus_region.to(spectrum.factor).expand(image.shape[0], -1, -1, -1)
-    best = [correlation.amax(0) for correlation, _, _ in spot_correlations(spectrum, painted, REACH)]  # B times (N,)
+    best = [_best(spots) for spots in find_spots(spectrum, painted, REACH)]  # B times (N,)
     likeness = torch.stack(best).unflatten(1, spectrum.size).unsqueeze(1).to(focus_region)
     share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
     focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
@@ -116,6 +116,12 @@ def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor
     if window // 2 < short:  # reflection needs as many pixels
         closed = guided_blur(image, closed, window, eps=1e-4)
     return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
+
+
+def _best(spots: Spots) -> Tensor:
+    """Largest correlation (N,) of every pixel with a spot, few spots at a time."""
+    few = torch.eye(len(spots.between)).to(spots.between).split(8)
+    return torch.stack([spots.mix(weights).amax(0) for weights in few]).amax(0)
 
 
 def blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:

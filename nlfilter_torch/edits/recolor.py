@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nlfilter_torch.checks import check_image, check_same_size
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
-from nlfilter_torch.edits.spots import spot_correlations
+from nlfilter_torch.edits.spots import find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
@@ -36,7 +36,7 @@ def recolor(
 
     Paper: Sec. V-A, with a regression on correlations in place of k-means: it is soft, and any number of spots with any
     number of colours divide the image among them. A spot, which is paint of one colour without a gap, stands for what
-    most of it covers. Hue and saturation count before lightness, in CIE Lab.
+    most of it covers, and takes its colour all over. Hue and saturation count before lightness, in CIE Lab.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
@@ -116,9 +116,9 @@ def _divide(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Tenso
     painted on what resembles another one takes from it what is its own.
     """
     found = []
-    for correlation, between, owners in spot_correlations(spectrum, regions, reach):
-        doubtful = between + DOUBT * torch.eye(len(between)).to(between)
-        found.append(torch.linalg.solve(doubtful, owners).mT @ correlation)
+    for spots in find_spots(spectrum, regions, reach):
+        doubtful = spots.between + DOUBT * torch.eye(len(spots.between)).to(spots.between)
+        found.append(spots.mix(torch.linalg.solve(doubtful, spots.owners).mT))
     return torch.stack(found).unflatten(2, spectrum.size)
 
 
