@@ -114,7 +114,7 @@ def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor
     closed = -F.max_pool2d(-grown, gap - 2, stride=1, padding=gap // 2 - 1)
     window = 2 * math.ceil(SMOOTHING * short) + 1
     if window // 2 < short:  # reflection needs as many pixels
-        closed = guided_blur(image, closed, window, eps=1e-4)
+        closed = guided_blur(image, closed, window, eps=1e-4, separable=True)
     return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
 
 
