@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import skimage.data
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.memory import MIB, forget_peak, resident
 from nlfilter_torch import nonlocal_operator, polynomial_filter
+from nlfilter_torch.cli.options import working_bytes
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.streaming import stream_detail
 from nlfilter_torch.streaming.detail import SAMPLE, detail_rows
@@ -127,8 +129,12 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
     picture = np.concatenate(list(mosaic(side, side))).astype(np.float32) / np.float32(255)
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
     luminance = 0.299 * image[:, :1] + 0.587 * image[:, 1:2] + 0.114 * image[:, 2:]
-    change = polynomial_filter(nonlocal_operator(luminance), luminance, ALPHA) - luminance
-    whole = (image + change)[0].permute(1, 2, 0).numpy()
+    started = time.process_time()
+    operator = nonlocal_operator(luminance)
+    filtered = polynomial_filter(operator, luminance, ALPHA)
+    in_memory = time.process_time() - started
+    whole = (image + filtered - luminance)[0].permute(1, 2, 0).numpy()
+    del operator
 
     def by_rows(**options: object) -> NDArray[np.float32]:
         edited = np.empty_like(picture)
@@ -137,7 +143,11 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
 
     sampled = by_rows(tile_rows=tiles[0])
     others = [np.abs(by_rows(tile_rows=rows) - sampled).max() for rows in tiles[1:]]
-    result = {"megapixels": side * side / 1e6, "sample_pixels": min(SAMPLE, side * side // 4)}
+    result = {
+        "megapixels": side * side / 1e6,
+        "memory_cpu_s": in_memory,
+        "sample_pixels": min(SAMPLE, side * side // 4),
+    }
     result["sample_max"] = float(np.abs(sampled - whole).max())
     result["sample_rms"] = float(np.sqrt(np.square(sampled - whole, dtype=np.float64).mean()))
     result["full_max"] = float(np.abs(by_rows(statistics="full") - whole).max())
@@ -149,8 +159,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Time, memory and exactness of pictures worked out by rows.")
     parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    parser.add_argument("--table", type=Path, metavar="JSON", help="print the tables of docs/scale.md from such a file")
     parser.add_argument("--work", nargs=4, metavar=("IN", "OUT", "STATISTICS", "LANDMARKS"), help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.table:
+        table(json.loads(options.table.read_text()))
+        return
     if options.work:
         source, target, statistics, landmarks = options.work
         print(json.dumps(work(Path(source), Path(target), statistics, int(landmarks), 800 * MIB)))
@@ -171,15 +185,36 @@ def main() -> None:
                 show(runs[-1])
     exact = exactness(400, [16, 64, 400]) if options.quick else exactness(2050, [64, 256, 1000, 4096])
     print(
-        f"{exact['megapixels']:.2f} MP against memory: {exact['sample_max'] * 255:.2f} levels of 255 at most from a "
-        f"sample of {exact['sample_pixels']:.0f} pixels (RMS {exact['sample_rms'] * 255:.3f}), {exact['full_max']:.1e} "
-        f"of white from all; tiles of {exact['smallest_tile']:.0f} to {exact['largest_tile']:.0f} rows differ by "
-        f"{exact['tiles_max']:.1e}"
+        f"{exact['megapixels']:.2f} MP against memory, from a sample of {exact['sample_pixels']:.0f} pixels: "
+        f"{exact['sample_max'] * 255:.2f} levels of 255 at most (RMS {exact['sample_rms'] * 255:.3f}); "
+        f"from all pixels: {exact['full_max']:.1e} of white; tiles of {exact['smallest_tile']:.0f} to "
+        f"{exact['largest_tile']:.0f} rows differ by {exact['tiles_max']:.1e}"
     )
     if options.out:
         machine = {"machine": platform.machine(), "threads": torch.get_num_threads(), "torch": torch.__version__}
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps({"machine": machine, "runs": runs, "exactness": exact}, indent=1) + "\n")
+
+
+def table(figures: dict[str, Any]) -> None:
+    """The tables of docs/scale.md from the JSON of a run."""
+    print("| megapixels | m | statistics | processor, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|---|")
+    for run in figures["runs"]:
+        cpu, pixels = run["cpu_s"], run["megapixels"]
+        kinds = f"{pixels:.1f} | {run['landmarks']} | {run['statistics']}"
+        print(f"| {kinds} | {cpu:.1f} | {cpu / pixels:.2f} | {run['peak_mib']:.0f} |")
+    large = max(figures["runs"], key=lambda run: run["megapixels"])
+    once = sum(large["stages_s"][name] for name in ("Balancing", "Summing up"))
+    rate = (large["cpu_s"] - once) / large["megapixels"]
+    exact = figures["exactness"]
+    whole = exact["memory_cpu_s"] / exact["megapixels"]
+    print("\n| workers | way | time | memory of each |\n|---|---|---|---|")
+    print(f"| 1 | rows | {(1000 * rate + once) / 60:.0f} min | {large['peak_mib'] / 1024:.1f} GiB |")
+    for workers in (8, 64):
+        pixels = 1e9 / workers
+        memory = pixels * working_bytes(large["landmarks"], 5) / 2**30
+        print(f"| {workers} | shards | {1000 * whole / workers / 60:.1f} min | {memory:.0f} GiB |")
+    print(f"\n{rate:.2f} s per MP by rows and {once:.1f} s once; {whole:.2f} s per MP in memory")
 
 
 def show(run: dict[str, object]) -> None:

@@ -182,6 +182,15 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> 
         assert abs(float(weights.sum()) / picture.pixels - 1) < 0.1
 
 
+def test_a_residual_takes_every_pixel() -> None:
+    picture = cat(60, 80)
+    edited, full = (
+        streamed(picture, residual=1.0, statistics=statistics, sample=1500, num_landmarks=30)
+        for statistics in ("sample", "full")
+    )
+    np.testing.assert_array_equal(edited, full)
+
+
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("statistics", ["sample", "full"])
 def test_tiles_of_any_size_give_the_same(statistics: str) -> None:

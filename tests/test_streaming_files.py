@@ -104,6 +104,17 @@ def test_grey_floats_white_at_zero_and_multiplied_alpha(tmp_path: Path) -> None:
     np.testing.assert_array_equal(rows_of(tmp_path / "alpha.tif"), np.rint(wanted * 255))
 
 
+def test_tiles_that_a_sparse_file_leaves_out_are_black(tmp_path: Path) -> None:
+    tile = cat(64, 64)
+    tiles = iter([tile, None, None, tile])
+    tifffile.imwrite(tmp_path / "in.tif", tiles, shape=(128, 128, 3), dtype=np.uint8, tile=(64, 64), photometric="rgb")
+    rows = rows_of(tmp_path / "in.tif")
+    np.testing.assert_array_equal(rows[:64, :64], tile)
+    np.testing.assert_array_equal(rows[64:, 64:], tile)
+    assert not rows[:64, 64:].any()
+    assert not rows[64:, :64].any()
+
+
 def test_a_part_of_a_tiff_is_read_without_the_rest(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", cat(), photometric="rgb", tile=(32, 32), compression="zlib")
     with TiffRows(tmp_path / "in.tif") as rows:

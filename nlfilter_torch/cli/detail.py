@@ -93,7 +93,8 @@ Full = Annotated[
     bool,
     typer.Option(
         "--full",
-        help="In tiles: make the filter from every pixel, not from a million of them. Takes several times as long.",
+        help="In tiles: make the filter from every pixel, not from a million of them, as with --residual. Takes two or "
+        "three times as long.",
     ),
 ]
 PresetName = Annotated[

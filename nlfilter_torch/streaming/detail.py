@@ -65,7 +65,8 @@ def stream_detail(
             all.
         regions: rows (H, W, K), non-negative weights of the pixels of K regions: all that looks like them is edited,
             as by :func:`enhance`. None edits the whole picture.
-        residual: as of :func:`polynomial_filter`.
+        residual: as of :func:`polynomial_filter`; with it statistics are full, since what the eigenvectors explain
+            depends on pixels that no sample holds enough of.
         time: diffusion time of the masks that grow from the regions; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
@@ -172,9 +173,8 @@ def detail_rows(
         picture,
         alpha.shape[-1] - 1,
         channels=channels,
-        statistics=statistics,
+        statistics=statistics if residual is None else "full",
         sample=sample,
-        spectral=residual is not None,
         report=report,
         **options,
     )

@@ -34,19 +34,15 @@ def fit_picture(
     channels: Literal["luminance", "all"],
     statistics: Statistics,
     sample: int,
-    spectral: bool,
     report: Report,
     **options: Any,
 ) -> FittedFilter:
-    """The filter of a picture, as :func:`fit_filter` makes it of an image in memory.
-
-    ``spectral``: a residual is going to be given.
-    """
+    """The filter of a picture, as :func:`fit_filter` makes it of an image in memory."""
 
     def image(colours: Tensor) -> Tensor:
         return reduce_channels(colours, "luminance") if channels == "luminance" else colours
 
-    kernel, balancing, sums = _gather(picture, image, order, statistics, sample, spectral, report, **options)
+    kernel, balancing, sums = _gather(picture, image, order, statistics, sample, False, report, **options)
     return FittedFilter(kernel, balancing, sums.coefficients(), sums.explained())
 
 
