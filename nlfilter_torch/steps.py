@@ -175,7 +175,7 @@ class Recolor:
 
     strokes: tuple[Stroke, ...] = ()
     reach: float = 0.8
-    tolerance: float = 15.0
+    tolerance: float = 12.0
 
     PAINTS: ClassVar[tuple[str, ...]] = ("colour", "keep")
     VALID: ClassVar[dict[str, Valid]] = {"reach": _within(0, 0.999), "tolerance": _within(1, 100)}

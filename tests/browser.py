@@ -31,11 +31,11 @@ def chromium() -> Iterator[Browser]:
 class Editor:
     """``nlfilter-torch app`` as a process of its own."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, threads: int = 1) -> None:
         command = [sys.executable, "-m", "nlfilter_torch", "app", "--no-open", *arguments]
         # NiceGUI would take the process for a test of its own if pytest's variables reached it.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-        environment = inherited | {"OMP_NUM_THREADS": "1"}
+        environment = inherited | {"OMP_NUM_THREADS": str(threads)}
         self.log = folder / "log.txt"
         with self.log.open("w") as stream:
             self.process = subprocess.Popen(

@@ -18,11 +18,11 @@ body { background: #17181b; }
   opacity: min(1, var(--wipe)); pointer-events: none; z-index: 4; }
 .photo .tag { position: absolute; top: 8px; left: 10px; padding: 1px 8px; border-radius: 9px; background: #000a;
   color: #fff; font-size: 12px; pointer-events: none; z-index: 4; opacity: min(1, var(--wipe)); }
-.stroke { fill: none; stroke-linecap: round; stroke-linejoin: round; opacity: .75; }
+.stroke { fill: none; stroke-linecap: round; stroke-linejoin: round; opacity: .6; }
 .welcome { text-align: center; color: #b9bcc4; border: 2px dashed #44474f; border-radius: 12px; padding: 60px 80px; }
-.panel { width: 372px; overflow-y: auto; background: #212328; padding: 4px 18px 18px; color: #dfe1e6; gap: 2px; }
+.panel { width: 376px; overflow-y: auto; background: #212328; padding: 4px 12px 18px; color: #dfe1e6; gap: 2px; }
 .panel .q-tab { min-height: 40px; padding: 0 9px; }
-.panel .q-tab-panel { padding: 10px 0 0; }
+.panel .q-tab-panel { padding: 10px 8px 14px; }
 .hint { font-size: 12px; color: #9aa0aa; line-height: 1.35; }
 .group { font-size: 12px; text-transform: uppercase; letter-spacing: .06em; color: #9aa0aa; margin-top: 10px; }
 .control { width: 100%; margin-bottom: -6px; }

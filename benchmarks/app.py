@@ -1,0 +1,120 @@
+"""How long the editor takes from a hand's move to a picture: python -m benchmarks.app [--side 1000] [--browser].
+
+Prints medians and quartiles of 20, in milliseconds, on a square preview; with ``--browser`` from the pointer's move to
+the picture in a headless Chromium as well, over the server and its pictures as JPEG.
+"""
+
+import argparse
+import platform
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import skimage.data
+import torch
+import torch.nn.functional as F
+
+from nlfilter_torch.app import drawing
+from nlfilter_torch.app.session import Session
+from nlfilter_torch.files import Photograph, write_photograph
+
+REPEATS = 20
+
+
+def photograph(side: int) -> torch.Tensor:
+    """(1, 3, side, side) in [0, 1]."""
+    pixels = torch.from_numpy(skimage.data.astronaut().copy()).permute(2, 0, 1)[None].float() / 255
+    return F.interpolate(pixels, size=(side, side), mode="bicubic", antialias=True).clamp(0, 1)
+
+
+def milliseconds(work: Callable[[], object]) -> float:
+    """Time of one call."""
+    start = time.perf_counter()
+    work()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def report(name: str, times: list[float]) -> None:
+    """Print a line of the table."""
+    low, middle, high = statistics.quantiles(times, n=4) if len(times) > 1 else times * 3
+    print(f"{name:<44} {middle:>8.0f}   {low:.0f} to {high:.0f}")
+
+
+def in_the_library(path: Path) -> None:
+    """Sliders and strokes without a page."""
+    session = Session(path.parent)
+    report("open", [milliseconds(lambda: session.open(path))])
+    size = session.preview.size
+
+    def slide(value: float) -> None:
+        session.set("detail", alpha=(value, 1.0, 1.0, 1.0))
+        session.render("detail")
+
+    report("first slider: the operator and its layers", [milliseconds(lambda: slide(2.0))])
+    report("slider to pixels", [milliseconds(lambda i=i: slide(1 + i / 10)) for i in range(REPEATS)])
+    report("pixels to JPEG", [milliseconds(lambda: drawing.picture(session.render())) for _ in range(REPEATS)])
+
+    def stroke(shift: float) -> None:
+        session.add_stroke("detail", [(shift * size[1], 0.8 * size[0]), (0.6 * size[1], 0.85 * size[0])], 0.01, "in")
+        session.preview.mask(session.recipe.detail)
+
+    report("first stroke to mask", [milliseconds(lambda: stroke(0.3))])
+    report("stroke to mask", [milliseconds(lambda i=i: stroke(0.3 + i / 100)) for i in range(REPEATS)])
+    for step, paint in (("recolor", "#2040e0"), ("colorize", "#2040e0"), ("defocus", "in"), ("abstract", "")):
+        session.load(type(session.recipe)())
+        if paint:
+            session.add_stroke(step, [(0.4 * size[1], 0.4 * size[0]), (0.5 * size[1], 0.4 * size[0])], 0.02, paint)
+        else:
+            session.set(step, power=0.1)
+        report(f"{step}", [milliseconds(session.render)])
+
+
+def in_the_browser(path: Path) -> None:
+    """From the pointer's move to the picture in the page."""
+    from tests.browser import Editor, Tab, chromium
+
+    editor = Editor(path.parent, path.name, threads=torch.get_num_threads())
+    try:
+        with chromium() as browser:
+            tab = Tab(browser.new_page(viewport={"width": 1400, "height": 1000}))
+            tab.page.goto(editor.url)
+            tab.wait_for_picture()
+            tab.page.locator(".response circle").first.wait_for()
+            slider = tab.slider("Texture")
+            tab.drag(slider, 0.2, 0.25, release=False)
+            tab.page.wait_for_timeout(3000)
+            box = slider.bounding_box()
+            assert box is not None
+            times = []
+            for i in range(REPEATS):
+                before, x = tab.source(), box["x"] + (0.3 + 0.03 * i) * box["width"]
+                start = time.perf_counter()
+                tab.page.mouse.move(x, box["y"] + box["height"] / 2)
+                tab.wait_for_picture(before)
+                times.append(1e3 * (time.perf_counter() - start))
+                tab.page.wait_for_timeout(300)
+            report("pointer to picture in the browser", times)
+    finally:
+        editor.stop()
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--side", type=int, default=1000, help="pixels of a square preview")
+    parser.add_argument("--browser", action="store_true", help="with headless Chromium too")
+    arguments = parser.parse_args()
+    print(f"{arguments.side}x{arguments.side} pixels, {torch.get_num_threads()} threads, {platform.machine()}")
+    print(f"{'milliseconds, median and quartiles':<44}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "photograph.png"
+        write_photograph(Photograph(photograph(arguments.side)), path)
+        in_the_library(path)
+        if arguments.browser:
+            in_the_browser(path)
+
+
+if __name__ == "__main__":
+    main()
