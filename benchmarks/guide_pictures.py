@@ -164,10 +164,11 @@ def single_sliders() -> Figure:
 
 
 def edits() -> Figure:
-    """The edits, on one photograph of 300x200 pixels with a spot on the saucer and two on the cup."""
+    """The edits, on one photograph of 300x200 pixels with a spot on the saucer and five on the cup."""
     image = photograph("coffee", 200, 300)
     saucer, cup = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])
-    saucer[..., 106:122, 52:68], cup[..., 60:74, 92:98], cup[..., 96:106, 120:150] = 1, 1, 1
+    saucer[..., 106:122, 52:68], cup[..., 60:74, 92:98] = 1, 1
+    cup[..., 96:103, 120:150] = cup[..., 76:88, 120:150] = cup[..., 35:60, 110:116] = cup[..., 112:120, 112:150] = 1
     wood = torch.zeros_like(saucer)
     for top, left in ((20, 60), (5, 100), (50, 250), (130, 270), (185, 20), (54, 140), (75, 145)):
         wood[..., top : top + 10, left : left + 10] = 1

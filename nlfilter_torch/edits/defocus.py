@@ -18,7 +18,7 @@ Aperture = Literal["disc", "gaussian"]
 
 RADIUS = 0.025  # default radius of the blur as a share of the short side
 LOCALITY = 0.2  # default spatial bandwidth, likewise
-REACH = 0.5  # of the correlations with the spots of the focus region
+REACH = 0.7  # of the correlations with the spots of the focus region
 CLOSING, SMOOTHING = 0.015, 0.04  # sizes, as shares of the short side, of the gaps in a focus map that are filled
 BLURRED, SHARP = 0.15, 0.45  # likeness below BLURRED gets the whole blur, above SHARP none
 STEPS = (0.1, 0.25, 0.5, 1.0)  # blurs that others are mixed from, as shares of the radius
