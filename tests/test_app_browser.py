@@ -300,6 +300,13 @@ def test_foreign_names_of_this_machine_are_refused(editor: Editor) -> None:
         connection.close()
 
 
+def test_pictures_are_for_those_who_know_their_address(opened: Tab, editor: Editor) -> None:
+    request = opened.page.request
+    assert request.get(editor.url.rstrip("/") + opened.source()).status == 200
+    for address in ("picture/another/after", opened.source().removeprefix("/").replace("after", "mask")):
+        assert request.get(editor.url + address).status == 404
+
+
 def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> None:
     """Killed outright: the old file stays as it was, and the page says that the editor is gone."""
     large = torch.nn.functional.interpolate(cat(), size=(600, 900), mode="bicubic").clamp(0, 1)

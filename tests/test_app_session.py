@@ -1,6 +1,8 @@
 """The editor without its page: what a session does, and what it shows."""
 
 import io
+import socket
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +123,17 @@ def test_sampled_operator_is_a_sample_of_the_whole() -> None:
         wanted = whole[..., first::stride, first::stride][..., :height, :width]
         assert (found - wanted).square().mean().sqrt() * 255 < 1.0
         assert (wanted - points).square().mean().sqrt() * 255 > 15
+
+
+def test_sampled_operator_in_colour_and_nearby() -> None:
+    """As close as the whole operator is with other landmarks; half or twice the spatial bandwidth is 2.4 levels off."""
+    image = cat(1)
+    options = {"patch_size": 3, "photometric_bandwidth": 0.1, "spatial_bandwidth": 60.0, "num_landmarks": 200}
+    whole = nonlocal_operator(image, guide_channels="all", **options) @ image  # type: ignore[arg-type]
+    detail = Detail(landmarks=200, spatial_bandwidth=60.0, patch_size=3)
+    operator = sampled_operator(image, 2, detail, bandwidth=0.1, channels="all", patch_size=3)
+    found, wanted = operator @ image[..., ::2, ::2], whole[..., ::2, ::2]
+    assert (found - wanted).square().mean().sqrt() * 255 < 0.8
 
 
 def test_preview_of_a_large_photograph_shows_what_saving_gives() -> None:
@@ -363,6 +376,24 @@ def test_presets_come_back(session: Session) -> None:
     with pytest.raises(ValueError, match=r"photo\.jpg is no preset: it is not JSON"):
         session.load_preset(b"\xff\xd8\xff", "photo.jpg")
     assert session.recipe == Recipe()
+
+
+# The verb
+
+
+def test_app_says_what_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["app", "--out", str(tmp_path / "gone"), "--no-open"]) == 2
+    assert "does not exist; make the folder first" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2
+    assert f"cannot listen on --host 127.0.0.1 --port {port}" in capsys.readouterr().err
+    monkeypatch.delitem(sys.modules, "nlfilter_torch.app.server")
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    assert main(["app", "--out", str(tmp_path), "--no-open"]) == 2
+    assert "the editor needs nicegui, which is not installed" in capsys.readouterr().err
 
 
 # What is drawn

@@ -43,7 +43,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     def _picture(token: str, kind: str) -> Response:
         editor = EDITORS.get(token)
         content = None if editor is None else editor.pictures.get(kind)
-        if content is None:
+        if not content:
             return Response(status_code=404)
         media_type = "image/png" if kind == "mask" else "image/jpeg"
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
