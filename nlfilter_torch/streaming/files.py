@@ -6,6 +6,7 @@ Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complet
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -242,7 +243,10 @@ def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPictur
         )
         start = 0
         for band in tiff.bands((part for _, part in rows), CHUNK):
-            array[start : start + len(band)] = band.reshape(len(band), *shape[1:])
+            values = band.reshape(len(band), *shape[1:])
+            # One chunk a call: zarr writes several at once, and goes on with the others after one has failed.
+            for left in range(0, shape[1], CHUNK):
+                array[start : start + len(band), left : left + CHUNK] = values[:, left : left + CHUNK]
             start += len(band)
         if path.exists():
             path.replace(former)
@@ -254,5 +258,13 @@ def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPictur
     except OSError as error:
         raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
-        for folder in (beside, former):
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(former, ignore_errors=True)
+        if beside.exists():
+            _remove(beside)
+
+
+def _remove(folder: Path) -> None:
+    """Remove an array that was given up; after an interrupt a thread of zarr may still be writing its last chunk."""
+    for pause in (0.0, 0.1, 0.4):
+        time.sleep(pause)
+        shutil.rmtree(folder, ignore_errors=True)
