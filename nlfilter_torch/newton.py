@@ -19,8 +19,9 @@ from torch import Tensor
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 
-PER_LANDMARK = 160  # pixels of the sample; its Jacobian is then within sqrt(1 / 160) = 8 % of the true one
-EXPLORED = 8192  # pixels that the first guess comes from
+PER_LANDMARK = (32, 160)  # pixels of the sample, least and most: its Jacobian is then within 18 or 8 % of the true one
+EXPLORED = 8192  # pixels that the first guess comes from, at most
+SHARE = 8  # the part of the pixels that either is, between these bounds
 GUESSES = 3  # steps that it takes towards their fixed point; more gain nothing for the pixels that are not among them
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly and on no period of the image
 LARGEST = 2.0  # K has a unit diagonal and its entries are not negative but for errors, so that no d exceeds 1
@@ -103,8 +104,9 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     """A first t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
     pixels = factor.shape[2]
     few, rest = factor, diagonal
-    if pixels > 2 * EXPLORED:
-        steps = torch.arange(EXPLORED, dtype=torch.float64, device=factor.device) * GOLDEN
+    count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
+    if 2 * count < pixels:
+        steps = torch.arange(count, dtype=torch.float64, device=factor.device) * GOLDEN
         chosen = (steps.frac() * pixels).long().sort().values
         few, rest = factor.index_select(2, chosen), diagonal[:, chosen]
     sample = Sample(few, rest, torch.full_like(rest, pixels / few.shape[2]), shard)
@@ -131,7 +133,8 @@ def solve(
 ) -> tuple[Tensor, Tensor, Tensor, int, Tensor]:
     """Scaling (B, N), its moment (B, M, 1) and residual (B,), the sweeps, and an estimate of J^-1, (B, M, M)."""
     watched = factor.device.type == "cpu"
-    count = -(-PER_LANDMARK * factor.shape[1] // (1 if shard is None else len(shard.rows)))  # of the sample, here
+    least, most = (bound * factor.shape[1] // (1 if shard is None else len(shard.rows)) for bound in PER_LANDMARK)
+    count = max(min(factor.shape[2] // SHARE, most), least)  # of the sample, here
     scaling, found = _sweep(factor, diagonal, _guess(factor, diagonal, shard), shard)
     total = found
     worst, slow, gain = 1.0, 0, 1.0

@@ -112,7 +112,10 @@ class Spectrum:
             mirror = target / target.norm(dim=1, keepdim=True).clamp(min=1e-12)
             mirror[:, :1] -= 1.0
             length = mirror.square().sum(1, keepdim=True).unsqueeze(2)
-            reflection = 2 * mirror.unsqueeze(2) * mirror.unsqueeze(1) / length.clamp(min=1e-12)
+            # However short the mirror is, the reflection in it keeps lengths; none at all is divided by something tiny.
+            reflection = (
+                2 * mirror.unsqueeze(2) * mirror.unsqueeze(1) / length.clamp(min=torch.finfo(length.dtype).tiny)
+            )
         return vectors - vectors @ reflection
 
 

@@ -377,5 +377,5 @@ def test_without_a_group() -> None:
     assert nonlocal_operator(image, num_landmarks=5, group=None).shard is None
     assert with_halo(image, 2, None) == (image, (0, 0))
     assert meet(image, None) is None
-    with pytest.raises(TypeError, match="group must be a process group of torch.distributed"):
+    with pytest.raises(TypeError, match=r"group must be a process group of torch.distributed"):
         nonlocal_operator(image, group="world")
