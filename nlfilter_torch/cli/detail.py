@@ -136,7 +136,7 @@ def detail(
 
     Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,4,1.05`
 
-    Sharpen a little, spare the grain: `nlfilter-torch detail in.jpg out.jpg --alpha 1.5,1.5,1.5,1 --residual 1`
+    A look with a name: `nlfilter-torch detail in.jpg out.jpg --preset crisp`
 
     Smooth skin or noise away: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
 
