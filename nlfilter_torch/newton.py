@@ -145,7 +145,8 @@ def solve(
             error = found - sample.moment(part)
             for _ in range(2):
                 part = sample.scaling(total)
-                inverse = torch.linalg.inv(sample.jacobian(part))
+                # J is positive definite; its Cholesky factor, unlike batched LU in MKL, withstands several threads.
+                inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(sample.jacobian(part)).L)
                 total = total - inverse @ (total - sample.moment(part) - error)
         else:
             total = total - inverse @ (total - found)
