@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+from nlfilter_torch.newton import SMALLEST_AFFINITY, STALL
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
-STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it have met rounding
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
-SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
 LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
 
 

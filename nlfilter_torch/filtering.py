@@ -45,7 +45,11 @@ def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
     check_count(order, "order")
     powers = operator.powers(image, order)  # (B, k, C, H, W)
     first = image.to(powers).unsqueeze(1).expand(powers.shape[0], -1, -1, -1, -1)
-    smoothed = torch.cat([first, powers], dim=1)
+    return layers_between(torch.cat([first, powers], dim=1))
+
+
+def layers_between(smoothed: Tensor) -> Tensor:
+    """What lies between neighbours in ``y, W y, ..., W^k y`` (B, k+1, ...), and the last of them."""
     return torch.cat([smoothed[:, :-1] - smoothed[:, 1:], smoothed[:, -1:]], dim=1)
 
 
@@ -110,12 +114,17 @@ def polynomial_filter(
     alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None:
-        weights = torch.as_tensor(replicate(residual, operator.shard)).to(filtered).reshape(-1, 1, 1, 1)
-        finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
-        finest = finest.to(filtered) if alpha.ndim == 4 else finest.to(filtered).reshape(-1, 1, 1, 1)
         explained = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
-        filtered = filtered + (weights - finest) * (image.to(filtered) - explained)
+        weight = replicate(residual, operator.shard)
+        filtered = filtered + residual_change(alpha, weight, image.to(filtered) - explained)
     return filtered.to(image.dtype)
+
+
+def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor) -> Tensor:
+    """What ``missed`` (B, C, H, W), the image but for its explained part, adds if its weight is not alpha_1."""
+    finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
+    finest = finest.to(missed) if alpha.ndim == 4 else finest.to(missed).reshape(-1, 1, 1, 1)
+    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - finest) * missed
 
 
 @full_precision

@@ -16,7 +16,7 @@ from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import check_count, check_image, check_same_size
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.filtering import weigh_layers
+from nlfilter_torch.filtering import layers_between, residual_change, weigh_layers
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
@@ -79,10 +79,8 @@ class FittedFilter:
         layers, explained = self._smoothed(image, guide, origin, halo)
         filtered = weigh_layers(layers, alpha)
         if residual is not None:
-            finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
-            finest = finest.to(filtered) if alpha.ndim == 4 else finest.to(filtered).reshape(-1, 1, 1, 1)
-            weight = torch.as_tensor(residual).to(filtered).reshape(-1, 1, 1, 1)
-            filtered = filtered + (weight - finest) * (_without(image.to(filtered), halo) - explained)
+            missed = _without(image.to(filtered), halo) - explained
+            filtered = filtered + residual_change(alpha, residual, missed)
         return filtered.to(image.dtype)
 
     def _smoothed(
@@ -108,8 +106,7 @@ class FittedFilter:
         smoothed = [image.to(factor).flatten(2)]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(scaling * (coefficients.mT @ factor) + remainder * smoothed[-1])
-        powers = torch.stack(smoothed, dim=1)  # (B, k+1, C, N)
-        layers = torch.cat([powers[:, :-1] - powers[:, 1:], powers[:, -1:]], dim=1).unflatten(-1, size)
+        layers = layers_between(torch.stack(smoothed, dim=1)).unflatten(-1, size)  # (B, k+1, C, h, W)
         explained = (scaling * (self.explained.to(factor).mT @ factor)).unflatten(-1, size)
         return layers, explained
 

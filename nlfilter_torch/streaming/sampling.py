@@ -14,7 +14,7 @@ from nlfilter_torch.checks import check_choice, check_count, check_positive, war
 from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, unit_window
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.newton import SMALLEST_AFFINITY
+from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.nystrom import Affinity, Completion, nystrom_factor, whitener
 from nlfilter_torch.spectrum import CUT
 from nlfilter_torch.streaming.rows import Picture, Tile
@@ -275,9 +275,7 @@ class Influence:
         for part in features.split(CACHED, dim=2):
             near, _ = affinity(part, features.new_empty(1, self.direction.shape[1], part.shape[2]))
             lengths = (self.sketches @ near[0]).square().unflatten(0, (-1, SKETCHED)).sum(1)  # (J, n)
-            total = (self.direction.mT @ near)[0].clamp(min=SMALLEST_AFFINITY)
-            missed = (1 - lengths[:1]).clamp(min=0.0)
-            scaling = 2 / (total + torch.sqrt(total.square() + 4 * missed))
+            scaling = scaling_from_moment(near, (1 - lengths[:1]).clamp(min=0.0), self.direction)
             found.append(scaling.square() * lengths)
         return torch.cat(found, dim=1)
 
