@@ -28,7 +28,45 @@ Response = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class Spectrum:
+class RitzPairs:
+    """All that functions of W need beside the factor itself: sums over pixels, and no pixel.
+
+    Attributes:
+        ritz: T, (B, M, M), float64.
+        root: G^(-1/2), (B, M, M), float64.
+        support: (B, M) bool, which of the eigenvalues of T count.
+    """
+
+    ritz: SymmetricMatrix
+    root: Tensor
+    support: Tensor
+
+    @staticmethod
+    def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
+        """From the sums that :func:`whiten_gram` takes."""
+        root, inner, ranks = whiten_gram(grams, dtype)
+        ritz = SymmetricMatrix.of(inner)
+        ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
+        return RitzPairs(ritz, root, torch.arange(inner.shape[1], device=inner.device) < ranks.unsqueeze(1))
+
+    def basis(self, response: Response) -> Tensor:
+        """``f(T) G^(-1/2)``, (B, M, M) in float64: ``B^T B`` is the core of ``f(W)^2``."""
+        return self.ritz.apply(response, self.support) @ self.root
+
+    def gain(self, response: Response) -> Tensor:
+        """The m x m core X (B, M, M) of ``f(W) = F^T X F``, in float64: ``G^(-1/2) f(T) G^(-1/2)``.
+
+        Args:
+            response: f, an elementwise differentiable function of the eigenvalues, (B, R) to (B, R).
+
+        Returns:
+            Independent of the choice of eigenvectors; differentiable in the operator and in what ``response`` holds.
+        """
+        return self.root @ self.basis(response)
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum(RitzPairs):
     """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
 
     Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first asked for; filters and masks never
@@ -37,9 +75,6 @@ class Spectrum:
     Attributes:
         eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
             gradient is exact, also where they meet.
-        ritz: T, (B, M, M), float64.
-        root: G^(-1/2), (B, M, M), float64.
-        support: (B, M) bool, which of the eigenvalues of T count.
         factor: (B, M, N), before scaling.
         scaling: d, (B, N).
         size: (H, W).
@@ -48,9 +83,6 @@ class Spectrum:
     """
 
     eigenvalues: Tensor
-    ritz: SymmetricMatrix
-    root: Tensor
-    support: Tensor
     factor: Tensor
     scaling: Tensor
     size: tuple[int, int]
@@ -80,20 +112,9 @@ class Spectrum:
         basis = (self.root @ vectors).mT.to(self.factor) @ self.factor  # (B, R, N)
         return (basis * self.scaling.unsqueeze(1)).unflatten(2, self.size)
 
-    def gain(self, response: Response) -> Tensor:
-        """The m x m core X (B, M, M) of ``f(W) = F^T X F``, in float64: ``G^(-1/2) f(T) G^(-1/2)``.
-
-        Args:
-            response: f, an elementwise differentiable function of the eigenvalues, (B, R) to (B, R).
-
-        Returns:
-            Independent of the choice of eigenvectors; differentiable in the operator and in what ``response`` holds.
-        """
-        return self.root @ self.ritz.apply(response, self.support) @ self.root
-
     def diffusion_basis(self, response: Response) -> Tensor:
         """Rows (B, M, N) of ``f(T) G^(-1/2) F``: ``f(S) V^T`` up to a rotation that leaves distances alone."""
-        core = (self.ritz.apply(response, self.support) @ self.root).to(self.factor)
+        core = self.basis(response).to(self.factor)
         return (core @ self.factor) * self.scaling.unsqueeze(1)
 
     def apply(self, response: Response, image: Tensor) -> Tensor:
@@ -131,17 +152,15 @@ def compute_spectrum(
     remainder = None if diagonal is None else scaling.square() * diagonal
     # F F^T and F diag(r) F^T, (B, J, M, M)
     grams = reduce_sum(_Grams.apply(factor, scaling, remainder), shard)  # type: ignore[no-untyped-call]
-    root, inner, ranks = whiten_gram(grams, factor.dtype)
-    ritz = SymmetricMatrix.of(inner)
-    top = ritz.eigenvalues[:, 0]
-    ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
-
-    full = int(ranks.max())
-    shown = full if rank is None else min(rank, full)
-    support = torch.arange(factor.shape[1], device=factor.device) < ranks.clamp(max=shown).unsqueeze(1)
+    pairs = RitzPairs.of_sums(grams, factor.dtype)
+    shown = int(pairs.support.sum(1).max())
+    shown = shown if rank is None else min(rank, shown)
+    support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
     # First-order perturbation: the derivative of an eigenvalue is v^T dT v, repeated or not.
-    eigenvalues = (ritz.vectors * (ritz.matrix @ ritz.vectors)).sum(1).clamp(0.0, 1.0) * support
-    return Spectrum(eigenvalues[:, :shown].to(factor), ritz, root, support, factor, scaling, size, top, shard)
+    vectors = pairs.ritz.vectors
+    values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
+    eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
+    return Spectrum(pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), shard)
 
 
 def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,6 +8,9 @@ on the span of the factor, the covariance of two pixels is ``u_i^T X u_j`` with 
 the best estimate is one m x m solve, with no choice of eigenvectors in it.
 """
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -15,10 +18,13 @@ from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import check_image, check_positive, check_same_size, check_unit_range
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
-from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.spectrum import RitzPairs, Spectrum
 
 SPOT = 25 / 38400  # share of the image that a dab of a brush covers: 5x5 pixels of 160x240
 NOISE = 0.08  # variance of the values of one dab, as a share of the variance of the image
+FLOOR = 1e-12  # of eigenvalues, which keeps the derivative of a root finite
+
+Painted = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
 
 
 @full_precision
@@ -78,28 +84,125 @@ def propagate_strokes(
     if not weights.requires_grad:  # the weight of an unpainted pixel has a derivative, but no effect
         painted = (weights > 0).any(0).squeeze(0).nonzero().squeeze(1)
         factor, weights, values = factor[:, :, painted], weights[:, :, painted], values[:, :, painted]
-    walk = _per_image(reach, spectrum.root).squeeze(2)  # (B or 1, 1)
-    core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues))  # (B, M, M), float64
+    fitted = fit_strokes(
+        lambda: [(factor, weights, values)],
+        spectrum,
+        spectrum.pixels,
+        strength=strength,
+        reach=reach,
+        smoothness=smoothness,
+        shard=shard,
+    )
+    return fitted(spectrum.factor).unflatten(2, spectrum.size).to(strokes.dtype)
 
-    spot = SPOT * spectrum.pixels
-    weights = _raise_dots(factor, weights, core, spot, shard)
-    gram = moment(factor * weights, factor, shard) @ core
-    painted_weight = reduce_sum(weights.double().sum((1, 2)), shard)
-    variance = gram.diagonal(dim1=1, dim2=2).sum(1) / painted_weight  # of a painted pixel, on average
-    noise = _per_image(smoothness, gram) * (NOISE * spot * variance).reshape(-1, 1, 1)
-    known = torch.cat([values, torch.ones_like(values[:, :1])], dim=1).expand(images, -1, -1)
-    target = moment(factor.expand(images, -1, -1), weights * known, shard)  # (B, M, C+1)
-    solution = core @ torch.linalg.solve(gram + noise * torch.eye(gram.shape[1]).to(gram), target)
+
+@dataclass(frozen=True, eq=False)
+class FittedStrokes:
+    """What strokes say about any pixel, from its column of the factor alone.
+
+    Attributes:
+        coefficients: (B, C, M), float64.
+        share: (B, C, 1), the part of the strokes' mean that goes to pixels that resemble none of them.
+    """
+
+    coefficients: Tensor
+    share: Tensor
+
+    def __call__(self, factor: Tensor) -> Tensor:
+        """Values (B, C, n) of pixels with the columns (B, M, n), before scaling."""
+        return self.coefficients.to(factor) @ factor + self.share.to(factor)
+
+
+def fit_strokes(
+    painted: Painted,
+    pairs: RitzPairs,
+    pixels: int,
+    *,
+    strength: float | Tensor,
+    reach: float | Tensor,
+    smoothness: float | Tensor,
+    shard: Shard | None = None,
+) -> FittedStrokes:
+    """The regression of :func:`propagate_strokes`, from sums over the painted pixels.
+
+    Args:
+        painted: gives, as often as it is called, all painted pixels in blocks of columns of the factor (B, M, n),
+            weights (B, 1, n) and values (B, C, n).
+        pairs: of the operator.
+        pixels: N, of the whole image.
+        strength: as of :func:`propagate_strokes`, and so are ``reach`` and ``smoothness``.
+        reach: s of the walks.
+        smoothness: scales the noise.
+        shard: of the image, where other ranks have the rest of it.
+    """
+    walk = _per_image(reach, pairs.root).squeeze(2)  # (B or 1, 1)
+    # X = R R^T
+    half = pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt()).mT
+    spot = SPOT * pixels
+    dots = Dots.of(painted, half, spot, shard) if spot > 1 else None
+
+    gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
+    for factor, weights, values in painted():
+        heeded = weights if dots is None else dots.raised(factor, weights)
+        images = max(len(factor), len(heeded), len(values))
+        known = torch.cat([values, torch.ones_like(values[:, :1])], dim=1).expand(images, -1, -1)
+        gram = gram + moment(factor * heeded, factor)  # (B, M, M)
+        target = target + moment(factor.expand(images, -1, -1), heeded * known)  # (B, M, C+1)
+        sums = sums + (heeded * known).double().sum(2)  # (B, C+1)
+    gram, target, sums = (reduce_sum(total, shard) for total in (gram, target, sums))
+
+    # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
+    inner = half.mT @ gram @ half
+    trace = inner.diagonal(dim1=1, dim2=2).sum(1)
+    noise = NOISE * spot * trace / sums[:, -1]  # the trace over the weights is the variance of a painted pixel
+    noise = _per_image(smoothness, gram) * noise.reshape(-1, 1, 1)
+    noise = noise.clamp(min=torch.finfo(torch.float64).tiny)
+    identity = torch.eye(inner.shape[1]).to(inner)
+    lower = torch.linalg.cholesky_ex(inner + noise * identity).L
+    solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
 
     # The last column extends a stroke of ones: how far each pixel is reached at all. Generalised least squares tells
     # the mean from what both leave unexplained on the strokes, and unreached pixels get their part of it.
-    sums = reduce_sum((weights * known).double().sum(2), shard)
     unexplained = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
     mean = unexplained[:, :-1] / unexplained[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
-    weights_of_pixels = (solution[:, :, :-1] - solution[:, :, -1:] * share).mT.to(factor)  # (B, C, M)
-    spread = weights_of_pixels @ spectrum.factor + share.mT.to(factor)
-    return spread.unflatten(2, spectrum.size).to(strokes.dtype)
+    return FittedStrokes((solution[:, :, :-1] - solution[:, :, -1:] * share).mT, share.mT)
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """How few others a painted pixel resembles, so that small dots may count like a whole spot.
+
+    A dot that someone sets with care must not drown among broad strokes, nor in a large photograph.
+
+    Attributes:
+        core: X, (B, M, M).
+        gram: ``X G X / v`` with G the sum over the painted pixels and v their mean variance, (B, M, M).
+        spot: pixels that a dab of a brush covers.
+    """
+
+    core: Tensor
+    gram: Tensor
+    spot: float
+
+    @staticmethod
+    def of(painted: Painted, half: Tensor, spot: float, shard: Shard | None) -> "Dots":
+        """From a pass over the painted pixels."""
+        gram, total = torch.zeros(()), torch.zeros(())
+        for factor, weights, _ in painted():
+            gram = gram + moment(factor * weights, factor)
+            total = total + weights.double().sum((1, 2))
+        gram, total = reduce_sum(gram, shard), reduce_sum(total, shard)
+        core = half @ half.mT
+        typical = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
+        return Dots(core, core @ gram @ core / typical.reshape(-1, 1, 1), spot)
+
+    def raised(self, factor: Tensor, weights: Tensor) -> Tensor:
+        """The weights (B, 1, n), larger where columns (B, M, n) are like few others."""
+        variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
+        # The sum of squared correlations with what is painted.
+        likes = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
+        return weights * (self.spot / likes.clamp(min=1.0)).clamp(min=1.0)
 
 
 def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shard | None = None) -> None:
@@ -121,24 +224,6 @@ def check_share(value: float | Tensor, name: str, *, below: bool = False) -> Non
     inside = (values >= 0) & ((values < 1) if below else (values <= 1))
     if not bool(inside.all()):
         raise ValueError(f"{name} must be in [0, 1{')' if below else ']'}, got {values.tolist()}; clamp it")
-
-
-def _raise_dots(factor: Tensor, weights: Tensor, core: Tensor, spot: float, shard: Shard | None) -> Tensor:
-    """Weights (B, 1, n) under which painted pixels that few others resemble count like a whole spot.
-
-    A dot that someone sets with care must not drown among broad strokes, nor in a large photograph.
-    """
-    if spot <= 1:
-        return weights
-    gram = core @ moment(factor * weights, factor, shard) @ core
-    variance = (factor * (core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
-    typical = reduce_sum((weights * variance).sum(2, keepdim=True), shard) / reduce_sum(
-        weights.sum(2, keepdim=True), shard
-    )
-    likes = (factor * (gram.to(factor) @ factor)).sum(1, keepdim=True) / (
-        variance * typical
-    )  # sum of squared correlations
-    return weights * (spot / likes.clamp(min=1.0)).clamp(min=1.0)
 
 
 def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
