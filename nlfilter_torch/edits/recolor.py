@@ -1,5 +1,6 @@
 """Strokes of colour that reach everything of the same colour. Paper: Sec. V-A, Figs. 14, 15."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -7,10 +8,9 @@ from torch import Tensor
 
 from nlfilter_torch.checks import check_image, check_same_size
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
-from nlfilter_torch.edits.spots import find_spots
+from nlfilter_torch.edits.spots import Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.strokes import check_painted, check_share
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
@@ -85,41 +85,66 @@ def recolor(
         guide_channels="all",
         **options,
     ).spectrum()
-    luminance, chroma = split_luminance(pixels)
     painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
     wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
     regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
     own = regions * counts[..., None, None]
     held = None if keep is None else keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
     marked = own if held is None else torch.cat([own, held], dim=1)
-    likeness = _divide(spectrum, marked, reach)[:, : counts.shape[1]]
-    shares = ((likeness - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
-    shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
-    shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
-    shares = shares * (1 - marked.sum(1, keepdim=True)) + own  # what someone painted on is theirs, odd or not
-
-    # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative saturation.
-    old = (regions.flatten(2) @ chroma.flatten(2).mT) / regions.sum((2, 3)).unsqueeze(2)  # (B, K, 3)
-    usual = old.square().sum(2)[..., None, None]  # squared saturation, (B, K, 1, 1)
-    product = (usual * chroma.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
-    relative = (product + SATURATION**2) / (usual + SATURATION**2)
-    painted_chroma = torch.einsum("bkhw,bkc->bchw", shares * relative.clamp(0.0, 1.5), colours)
-    chroma = chroma * (1 - shares.sum(1, keepdim=True)) + painted_chroma
-    untouched = (shares.sum(1, keepdim=True) == 0).expand_as(pixels)
-    return torch.where(untouched, pixels, merge_luminance(luminance, chroma)).to(image.dtype)
+    found = [spots.mix(divide(spots)) for spots in find_spots(spectrum, marked, reach)]
+    likeness = torch.stack(found).unflatten(2, spectrum.size)
+    old = regions.flatten(2) @ split_luminance(pixels)[1].flatten(2).mT / regions.sum((2, 3)).unsqueeze(2)
+    return Dye(colours, old)(pixels, likeness, marked).to(image.dtype)
 
 
-def _divide(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Tensor:
-    """How much every pixel resembles one region rather than the others, (B, K, H, W), about 0 to 1.
+@dataclass(frozen=True, eq=False)
+class Dye:
+    """What K strokes make of any pixel, given how much it resembles the spots they are painted on.
 
-    The spots share a pixel by the best linear estimate of its region from its correlations with them, so that a region
-    painted on what resembles another one takes from it what is its own.
+    Attributes:
+        colours: chroma of the strokes, (B, K, 3).
+        old: mean chroma of what they are painted on, (B, K, 3).
     """
-    found = []
-    for spots in find_spots(spectrum, regions, reach):
-        doubtful = spots.between + DOUBT * torch.eye(len(spots.between)).to(spots.between)
-        found.append(spots.mix(torch.linalg.solve(doubtful, spots.owners).mT))
-    return torch.stack(found).unflatten(2, spectrum.size)
+
+    colours: Tensor
+    old: Tensor
+
+    def __call__(self, pixels: Tensor, likeness: Tensor, marked: Tensor) -> Tensor:
+        """Pixels (B, 3, H, W) in their new colours.
+
+        Args:
+            pixels: RGB.
+            likeness: to each region, (B, K, H, W), and maybe to one more that stays as it is.
+            marked: weights (B, K or K+1, H, W) of what is painted, and kept.
+        """
+        count = self.colours.shape[1]
+        shares = ((likeness[:, :count] - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
+        shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
+        shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
+        # What someone painted on is theirs, odd or not.
+        shares = shares * (1 - marked.sum(1, keepdim=True)) + marked[:, :count]
+
+        # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
+        # saturation.
+        luminance, chroma = split_luminance(pixels)
+        usual = self.old.square().sum(2)[..., None, None]  # squared saturation, (B, K, 1, 1)
+        product = (usual * chroma.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
+        relative = (product + SATURATION**2) / (usual + SATURATION**2)
+        new = torch.einsum("bkhw,bkc->bchw", shares * relative.clamp(0.0, 1.5), self.colours)
+        chroma = chroma * (1 - shares.sum(1, keepdim=True)) + new
+        untouched = (shares.sum(1, keepdim=True) == 0).expand_as(pixels)
+        return torch.where(untouched, pixels, merge_luminance(luminance, chroma))
+
+
+def divide(spots: Spots) -> Tensor:
+    """Weights (K, J) of a pixel's correlations that say how much it resembles one region rather than the others.
+
+    The spots share a pixel, about 0 to 1, by the best linear estimate of its region from its correlations with them, so
+    that a region painted on what resembles another one takes from it what is its own.
+    """
+    doubtful = spots.between.double() + DOUBT * torch.eye(len(spots.between)).to(spots.between)
+    solved = torch.cholesky_solve(spots.owners.double(), torch.linalg.cholesky_ex(doubtful).L)
+    return solved.mT.to(spots.between)
 
 
 def colour_guide(image: Tensor) -> Tensor:

@@ -5,13 +5,13 @@ is paint without a gap, is compared by the mean of what it covers, so that few o
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.spectrum import RitzPairs, Spectrum
 
 MAX_SPOTS = 64  # of one region; further ones are taken together
 TINY = 1e-6  # variance below which a pixel correlates with nothing
@@ -19,23 +19,37 @@ TINY = 1e-6  # variance below which a pixel correlates with nothing
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """The J spots of one image, and what it takes to compare all its pixels with them.
+    """The J spots of one image, and what it takes to compare pixels with them.
 
     Attributes:
         between: correlations of the spots with each other, (J, J), within [-1, 1].
         owners: the region that each spot belongs to, (J, K) of zeros and ones.
         means: of the spots' factor columns, scaled to unit variance, (J, M).
-        columns: of all pixels, likewise, multiplied by the core, (M, N).
+        core: X, (M, M), with which the columns u and v of two pixels have the covariance u^T X v.
+        columns: of the pixels that are compared, scaled likewise, multiplied by the core, (M, N).
     """
 
     between: Tensor
     owners: Tensor
     means: Tensor
+    core: Tensor
     columns: Tensor
+
+    @staticmethod
+    def of_means(means: Tensor, owners: Tensor, core: Tensor, columns: Tensor) -> "Spots":
+        """From the mean columns (J, M) of the spots, those of single pixels being of unit variance."""
+        gram = (means.double() @ core.double() @ means.mT.double()).to(means)
+        scale = gram.diagonal().clamp(min=TINY).rsqrt().unsqueeze(1)
+        return Spots(scale * gram * scale.mT, owners, scale * means, core, columns)
 
     def mix(self, weights: Tensor) -> Tensor:
         """Weighted sums (L, N), with weights (L, J), of the correlations of every pixel with the spots."""
         return (weights @ self.means) @ self.columns
+
+    def at(self, factor: Tensor) -> "Spots":
+        """The same spots, to be compared with other pixels, whose columns of the factor are (M, n)."""
+        columns, unit = _scaled(self.core, factor)
+        return replace(self, columns=columns * unit)
 
 
 def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Iterator[Spots]:
@@ -49,32 +63,80 @@ def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> It
     Yields:
         The spots of an image after the other. Differentiable in operator, weights and reach.
     """
-    factor = spectrum.factor  # (B, M, N)
-    walk = torch.as_tensor(reach).to(spectrum.root).reshape(-1, 1)
-    core = spectrum.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues)).to(factor)
+    core = walk_core(spectrum, reach).to(spectrum.factor)
+    for b, region in enumerate(regions.flatten(2)):
+        numbers, places = (region.detach() > 0).nonzero().unbind(1)
+        spots, owners = label_spots(places, numbers, spectrum.size)
+        factor = spectrum.factor[b]
+        columns, unit = _scaled(core[b], factor)
+        sums, weight = spot_sums((factor * unit)[:, places], region[numbers, places], spots, len(owners))
+        yield Spots.of_means(sums / weight, F.one_hot(owners, len(region)).to(region), core[b], columns * unit)
+
+
+def walk_core(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
+    """X (B, M, M), float64, under which columns of the factor covary as walks from one pixel to the other go."""
+    walk = torch.as_tensor(reach).to(pairs.root).reshape(-1, 1)
+    return pairs.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues))
+
+
+def unit_columns(core: Tensor, factor: Tensor) -> Tensor:
+    """Columns of the factor (M, n), scaled to unit variance under the core (M, M)."""
+    return factor * _scaled(core, factor)[1]
+
+
+def _scaled(core: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
+    """The core times columns (M, n), and what scales each of them to unit variance, (1, n)."""
     columns = core @ factor
-    unit = (factor * columns).sum(1, keepdim=True).clamp(min=TINY).rsqrt()  # (B, 1, N)
-    for b, region in enumerate(regions):
-        means, owners = _means(region, factor[b] * unit[b])  # (J, M), (J, K)
-        gram = means @ core[b] @ means.mT
-        scale = gram.diagonal().clamp(min=TINY).rsqrt().unsqueeze(1)
-        yield Spots(scale * gram * scale.mT, owners, scale * means, columns[b] * unit[b])
+    return columns, (factor * columns).sum(0, keepdim=True).clamp(min=TINY).rsqrt()
 
 
-def _means(region: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted means (J, M) of vectors (M, N) over the connected spots of regions (K, H, W); their regions (J, K)."""
-    from skimage.measure import label  # slow to import
+def spot_sums(columns: Tensor, weights: Tensor, spots: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Sums (J, M) of weighted columns (M, n) over J = ``count`` spots, and the weights (J, 1) of these."""
+    sums = columns.new_zeros(count, columns.shape[0]).index_add(0, spots, (columns * weights).mT)
+    return sums, weights.new_zeros(count, 1).index_add(0, spots, weights.unsqueeze(1))
 
-    means, owners = [], []
-    for number, plane in enumerate(region):
-        spots = torch.from_numpy(label((plane.detach() > 0).cpu().numpy(), connectivity=2)).to(plane.device).flatten()
-        inside = spots.nonzero().squeeze(1)
-        if len(inside) == 0:
-            continue
-        spot = spots[inside].clamp(max=MAX_SPOTS) - 1
-        weights, count = plane.flatten()[inside], int(spot.max()) + 1
-        total = weights.new_zeros(count).index_add(0, spot, weights)
-        sums = weights.new_zeros(count, vectors.shape[0]).index_add(0, spot, (vectors[:, inside] * weights).mT)
-        means.append(sums / total.unsqueeze(1))
-        owners += [number] * count
-    return torch.cat(means), F.one_hot(torch.tensor(owners, device=region.device), len(region)).to(region)
+
+def label_spots(places: Tensor, regions: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Tell the spots of painted pixels apart: paint of one region without a gap, corners included.
+
+    Args:
+        places: numbers (n,) of the painted pixels, counted along the rows.
+        regions: the region (n,) of each; by them the pixels are sorted first, and then by their places.
+        size: (H, W) of the image.
+
+    Returns:
+        The number (n,) of the spot of each pixel, and the region (J,) of each spot.
+
+    Example:
+        >>> label_spots(torch.tensor([0, 1, 6, 3, 8]), torch.tensor([0, 0, 0, 1, 1]), (2, 5))
+        (tensor([0, 0, 0, 1, 1]), tensor([0, 1]))
+    """
+    pixels, width = size[0] * size[1], size[1]
+    keys, columns = regions * pixels + places, places % width
+    begins = torch.cat([torch.ones_like(keys[:1]), ((keys.diff() != 1) | (columns[1:] == 0)).long()])
+    runs = begins.cumsum(0) - 1  # paint without a gap within a row
+    count, links = int(runs[-1]) + 1, []
+    for step, allowed in ((width - 1, columns > 0), (width, columns >= 0), (width + 1, columns < width - 1)):
+        above = (allowed & (places + step < pixels)).nonzero().squeeze(1)
+        below = torch.searchsorted(keys, keys[above] + step).clamp(max=len(keys) - 1)
+        meet = keys[below] == keys[above] + step
+        links.append((runs[above[meet]] * count + runs[below[meet]]).unique_consecutive())
+    both = torch.cat(links)
+    first = _connect(count, torch.stack([both // count, both % count]))
+    firsts, spots = first.unique(return_inverse=True)  # sorted, region after region
+    owners = regions[begins.nonzero().squeeze(1)[firsts]]
+    within = torch.arange(len(owners)).to(owners) - torch.searchsorted(owners, owners)  # number of a spot in its region
+    kept = (within < MAX_SPOTS).cumsum(0) - 1
+    return kept[spots[runs]], owners[within < MAX_SPOTS]
+
+
+def _connect(count: int, links: Tensor) -> Tensor:
+    """The smallest number (n,) that each of n = ``count`` things is connected to by links (2, L) between pairs."""
+    first = torch.arange(count, device=links.device)
+    while True:
+        lower = first[links].amin(0).expand(2, -1).flatten()
+        closer = first.scatter_reduce(0, first[links].flatten(), lower, "amin")
+        closer = closer[closer]
+        if torch.equal(closer, first):
+            return first
+        first = closer

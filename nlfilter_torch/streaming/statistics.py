@@ -64,7 +64,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
             sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
             weights = scaling * (block.weights / (1 + remainder)).sqrt()
             jacobian += _grams(block.factor, weights, remainder, 1)[:, 0]
-        step = torch.linalg.solve(jacobian, sums - total)
+        step = torch.cholesky_solve(sums - total, torch.linalg.cholesky_ex(jacobian).L)
         total = total + step
         change = float(step.norm() / total.norm())
         if change <= tolerance:
