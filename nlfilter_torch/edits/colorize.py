@@ -1,5 +1,7 @@
 """A grey photograph and a few strokes of colour to a colour photograph. Paper: Sec. V-B, Fig. 16."""
 
+import math
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -13,10 +15,30 @@ from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.strokes import check_painted, check_share, propagate_strokes
 
+
+@dataclass(frozen=True)
+class Stage:
+    """One regression of several, each on what the ones before leave of the strokes' chroma.
+
+    Attributes:
+        spatial: bandwidth, as a multiple of that of the call.
+        photometric: likewise.
+        patch_size: of the patches, at most.
+        reach: of :func:`propagate_strokes`.
+        smoothness: likewise.
+    """
+
+    spatial: float
+    photometric: float
+    patch_size: float
+    reach: float
+    smoothness: float
+
+
 # Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
 # than 0.3 dB.
 LOCALITY = 0.5625  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
-NARROW, TOLERANT = 2 / 9, 3.0  # spatial and photometric bandwidths of the second operator, as multiples of the first's
+FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 2.0), Stage(2 / 9, 3.0, 3, 0.5, 4.0)
 
 
 @full_precision
@@ -83,25 +105,26 @@ def colorize(
     luminance = grey.to(working_dtype(grey))
     bandwidth = LOCALITY * min(size) if spatial_bandwidth is None else spatial_bandwidth
 
-    def spectrum(reach: float, tolerance: float, patch: int) -> Spectrum:
+    def spectrum(stage: Stage) -> Spectrum:
         return nonlocal_operator(
             luminance,
-            patch_size=patch,
-            photometric_bandwidth=tolerance * photometric_bandwidth,
-            spatial_bandwidth=reach * bandwidth,
+            patch_size=int(min(patch_size, stage.patch_size)),
+            photometric_bandwidth=stage.photometric * photometric_bandwidth,
+            spatial_bandwidth=stage.spatial * bandwidth,
             num_landmarks=min(num_landmarks, luminance[0].numel()),
             generator=generator,
         ).spectrum()
 
     painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)
     wanted = split_luminance(strokes.to(luminance).expand(batch, -1, -1, -1))[1]
-    far = spectrum(1.0, 1.0, patch_size)
     if method == "kmeans":
         regions, colours, _ = group_colours(wanted, painted)
-        pieces = segment_mask(far, regions, time=time)
+        pieces = segment_mask(spectrum(FAR), regions, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
     else:
-        chroma = propagate_strokes(far, wanted, painted, strength=strength, reach=0.95, smoothness=2.0)
-        near = spectrum(NARROW, TOLERANT, min(patch_size, 3))
-        chroma = chroma + propagate_strokes(near, wanted - chroma, painted, strength=0.0, reach=0.5, smoothness=4.0)
+        chroma = torch.zeros_like(wanted)
+        for stage in (FAR, NEAR):
+            part = strength if stage is FAR else 0.0
+            given = {"strength": part, "reach": stage.reach, "smoothness": stage.smoothness}
+            chroma = chroma + propagate_strokes(spectrum(stage), wanted - chroma, painted, **given)
     return merge_luminance(luminance, chroma).to(grey.dtype)
