@@ -353,14 +353,14 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
 ) -> None:
     program = (
         "import sys, time\n"
-        "from nlfilter_torch.streaming import detail, rows\n"
+        "from nlfilter_torch.streaming import detail, rows, tiles\n"
         "def slow(original):\n"
         "    def edit(*arguments):\n"
         "        time.sleep(0.05)\n"
         "        return original(*arguments)\n"
         "    return edit\n"
-        "detail._edit, detail.TILE_PIXELS = slow(detail._edit), 300\n"
-        "detail.sampling.PILOT = rows.STATISTICS_PIXELS = 8000\n"
+        "detail._edit, tiles.TILE_PIXELS = slow(detail._edit), 300\n"
+        "tiles.sampling.PILOT = rows.STATISTICS_PIXELS = 8000\n"
         "from nlfilter_torch.cli import main\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )

@@ -1,12 +1,9 @@
 """Detail sliders for pictures whose factor fits no memory: statistics from passes or a sample, then tile after tile."""
 
 import math
-from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.checks import check_alpha, check_choice, check_count, check_positive
@@ -14,22 +11,19 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.masks import blend_regions
-from nlfilter_torch.streaming import sampling
-from nlfilter_torch.streaming.fitting import MASK_SHARE, FittedMasks, Statistics, fit_masks, fit_picture
-from nlfilter_torch.streaming.rows import (
-    KINDS,
-    Picture,
-    RowSource,
-    RowTarget,
-    Tile,
-    stored_as,
-    transparency,
-)
+from nlfilter_torch.streaming.fitting import MASK_SHARE, FittedMasks, fit_masks, fit_picture
+from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
 from nlfilter_torch.streaming.sampling import Report
-
-SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
-TILE_PIXELS = 1 << 17  # longer tiles are no faster
-Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
+from nlfilter_torch.streaming.tiles import (
+    SAMPLE,
+    Rows,
+    Statistics,
+    check_settings,
+    check_target,
+    fill,
+    rows_that_fit,
+    work_out,
+)
 
 
 def stream_detail(
@@ -84,17 +78,14 @@ def stream_detail(
         MemoryError: if the samples or a single row take more than ``memory``.
 
     Example:
+        >>> import torch
         >>> picture = np.random.default_rng(0).integers(0, 256, (60, 40, 3), np.uint8)
         >>> edited = np.empty_like(picture)
         >>> stream_detail(picture, edited, torch.ones(4), num_landmarks=20, tile_rows=16)
         >>> np.array_equal(edited, picture)
         True
     """
-    if tuple(target.shape) != tuple(source.shape):
-        raise ValueError(
-            f"target must have the shape of the source, {tuple(source.shape)}, got {tuple(target.shape)}; "
-            "make one of that shape"
-        )
+    check_target(target, tuple(source.shape))
     rows = detail_rows(
         source,
         alpha,
@@ -111,8 +102,7 @@ def stream_detail(
         report=report,
         **options,
     )
-    for part, values in rows:
-        target[part] = values.reshape(values.shape[0], *source.shape[1:])
+    fill(target, rows)
 
 
 def detail_rows(
@@ -132,7 +122,7 @@ def detail_rows(
     report: Report | None = None,
     name: str = "source",
     **options: Any,
-) -> Iterator[tuple[slice, NDArray[Any]]]:
+) -> Rows:
     """The rows (h, W, S) of :func:`stream_detail` as dtype ``kind``, from the first to the last, as they are asked for.
 
     Errors call the source ``name``.
@@ -142,13 +132,9 @@ def detail_rows(
     check_positive(time, "time")
     check_positive(width, "width")
     check_choice(channels, "channels", ("luminance", "all"))
-    check_choice(statistics, "statistics", ("sample", "full"))
-    check_choice(kind, "dtype of the target", KINDS)
-    check_count(sample, "sample")
+    check_settings(kind, statistics, sample, tile_rows)
     if residual is not None and not math.isfinite(residual):
         raise ValueError(f"residual must be finite, got {residual}; pass a number or None")
-    if tile_rows is not None:
-        check_count(tile_rows, "tile_rows")
     report = report or (lambda stage, done, rows: None)
     rows = tile_rows or rows_in_memory(picture, memory, alpha.shape[-1], sample, regions is not None, **options)
     generator, masks = options.get("generator"), None
@@ -205,18 +191,6 @@ def _edit(
     return edit(tile.inner) if channels == "all" else edit_luminance(tile.inner, edit)
 
 
-def work_out(
-    picture: Picture, edit: Edit, kind: str, margin: int, rows: int, report: Report
-) -> Iterator[tuple[slice, NDArray[Any]]]:
-    """The edited rows, a tile at a time, with the transparency that they had."""
-    for tile in picture.tiles(margin, rows):
-        report("Filtering", tile.start, picture.size[0])
-        with torch.no_grad():
-            values = stored_as(edit(tile), kind)
-        yield slice(tile.start, tile.start + len(values)), np.concatenate([values, transparency(tile, kind)], axis=2)
-    report("Filtering", picture.size[0], picture.size[0])
-
-
 def rows_in_memory(
     picture: Picture,
     memory: int,
@@ -238,18 +212,7 @@ def rows_in_memory(
     check_count(patch_size, "patch_size")
     in_colour = masked or guide_channels == "all"
     planes = patch_size**2 * (picture.colours if in_colour else 1)
-    size = 8 if picture.dtype == torch.float64 else 4
     # A tile: features and factor, or coordinates and their differences from a centre, and some images.
     floats = num_landmarks * (3 if masked else 1) + planes + (3 * sliders + 8) * picture.colours
-    row = picture.size[1] * floats * size
-    # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
-    pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
-    chosen = min(picture.pixels, sample // MASK_SHARE if masked else sample)
-    later = (pilot + chosen) * planes + block * (num_landmarks + planes + 8)
-    least = size * max(pilot * (num_landmarks + 3 * planes), later)
-    if max(row, least) > memory:
-        raise MemoryError(
-            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {memory / 1e6:.0f} MB may be "
-            "used; allow more, or use fewer landmarks"
-        )
-    return max(1, min(memory // (2 * row), TILE_PIXELS // picture.size[1]))
+    sample = sample // MASK_SHARE if masked else sample
+    return rows_that_fit(picture, memory, floats=floats, planes=planes, num_landmarks=num_landmarks, sample=sample)

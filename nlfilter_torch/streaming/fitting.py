@@ -13,15 +13,14 @@ from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.masks import FARTHEST, squared_distances
-from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.spectrum import whiten_gram
+from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
 from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
 from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, sum_up
+from nlfilter_torch.streaming.tiles import Statistics
 
-Statistics = Literal["sample", "full"]
 MASK_SHARE = 2  # patches in colour are three times as large
 
 
@@ -44,6 +43,16 @@ def fit_picture(
 
     kernel, balancing, sums = _gather(picture, image, order, statistics, sample, False, report, **options)
     return FittedFilter(kernel, balancing, sums.coefficients(), sums.explained())
+
+
+@torch.no_grad()
+@full_precision
+def fit_spectrum(
+    picture: Picture, *, statistics: Statistics, sample: int, report: Report, **options: Any
+) -> tuple[Kernel, RitzPairs]:
+    """Kernel and eigenvalues of a picture, with the options of :func:`nonlocal_operator`."""
+    kernel, _, sums = _gather(picture, lambda c: c[:, :1], 1, statistics, sample, True, report, **options)
+    return kernel, RitzPairs.of_sums(sums.grams, sums.dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +107,7 @@ def fit_masks(
     shared |= {"photometric_bandwidth": MASK_BANDWIDTH, "guide_channels": "all"}
     count = max(1, sample // MASK_SHARE)
     kernel, balancing, sums = _gather(picture, lambda c: c, 1, statistics, count, True, report, **shared)
-    root, inner, ranks = whiten_gram(sums.grams, sums.dtype)
-    ritz = SymmetricMatrix.of(inner)
-    support = torch.arange(inner.shape[1]) < ranks.unsqueeze(1)
-    core = ritz.apply(lambda eigenvalues: eigenvalues.clamp(max=1.0).pow(time), support) @ root
+    core = RitzPairs.of_sums(sums.grams, sums.dtype).basis(lambda eigenvalues: eigenvalues.pow(time))
     centres = core @ _region_means(picture, regions, kernel, balancing, report)
     return FittedMasks(kernel, balancing, core, centres.mT, picture.pixels / width)
 
