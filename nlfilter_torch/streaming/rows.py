@@ -89,7 +89,7 @@ class Picture:
                 f"{name} must have the shape (H, W) or (H, W, S) with one to four channels, got {shape}; "
                 "move the channels to the end"
             )
-        if kind not in KINDS:
+        if kind not in (*KINDS, "bool"):
             raise TypeError(f"{name} must hold one of {', '.join(KINDS)}, got {kind}; convert it")
         self.size = (int(shape[0]), int(shape[1]))
         self.samples = int(shape[2]) if len(shape) == 3 else 1

@@ -132,7 +132,7 @@ def take_pilot(
     slope = 0.0
     for tile, chosen in _visit(picture, max(patch_size // 2, 1), wanted.sort().values, report, "Looking"):
         guide = reduce_channels(tile.pixels, guide_channels)
-        patches.append(_patches(guide, tile, chosen, patch_size))
+        patches.append(patches_at(guide, tile, chosen, patch_size))
         values.append(image(tile.inner).flatten(2)[:, :, chosen])
         if photometric_bandwidth == "auto":
             slope += float(gradients(guide, tile.halo).double().mean((0, 1)).sum())
@@ -141,7 +141,7 @@ def take_pilot(
     order = torch.empty_like(wanted)
     order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
     recipe = (window, photometric_bandwidth, spatial_bandwidth)
-    features = _scaled(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
+    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
     points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
     kernel = Kernel(*recipe, guide_channels, points, whitener(points), completion)
     weight = picture.pixels / len(even)
@@ -179,10 +179,10 @@ def sample_by_influence(
         likely = (even + rate * influence(features)).clamp(max=1.0)
         drawn = torch.from_numpy(generator.random(likely.numel())) < likely
         chosen = drawn.nonzero().squeeze(1)
-        patches, places = _patches(guide, tile, chosen, size), chosen + tile.start * picture.size[1]
+        patches, places = patches_at(guide, tile, chosen, size), chosen + tile.start * picture.size[1]
         values = image(tile.inner).flatten(2)[:, :, chosen]
         weights = likely[chosen].reciprocal().to(picture.dtype)[None]
-        waiting.append(Sample(_scaled(patches, places, picture, *recipe), values, weights))
+        waiting.append(Sample(scaled_patches(patches, places, picture, *recipe), values, weights))
         if sum(part.weights.numel() for part in waiting) >= CHUNK:
             done.append(Sample.together(waiting))
             waiting = []
@@ -199,7 +199,7 @@ def _visit(picture: Picture, margin: int, pixels: Tensor, report: Report, stage:
         yield tile, pixels[first:last] - tile.start * width
 
 
-def _patches(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
+def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
     """The patches (1, C p^2, n), without weights, around some pixels of a tile with the guide (1, C, H, W)."""
     padded = pad_border(guide, size // 2)[..., tile.halo[0] :, :]
     columns, stride = guide.shape[-1], padded.shape[-1]
@@ -209,7 +209,7 @@ def _patches(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
     return padded[0].flatten(1)[:, places].flatten(0, 1)[None]
 
 
-def _scaled(
+def scaled_patches(
     patches: Tensor,
     pixels: Tensor,
     picture: Picture,

@@ -1,0 +1,237 @@
+"""Colours from strokes for a grey picture that fits no memory."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlfilter_torch.checks import check_choice, check_count, check_patch_size, check_positive
+from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from nlfilter_torch.edits.colorize import FAR, LOCALITY, NEAR, Stage
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.precision import full_precision
+from nlfilter_torch.spectrum import RitzPairs
+from nlfilter_torch.streaming.fitting import fit_spectrum
+from nlfilter_torch.streaming.painted import Guide, Painted, check_room, floats_of_painted, gather, read_strokes
+from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
+from nlfilter_torch.streaming.sampling import Report, Sample
+from nlfilter_torch.streaming.tiles import (
+    SAMPLE,
+    Rows,
+    Statistics,
+    check_settings,
+    check_target,
+    fill,
+    rows_that_fit,
+    work_out,
+)
+from nlfilter_torch.strokes import FittedStrokes, check_share, fit_strokes
+
+
+def stream_colorize(
+    source: RowSource,
+    target: RowTarget,
+    strokes: RowSource,
+    stroke_mask: RowSource | None = None,
+    *,
+    method: Literal["regression"] = "regression",
+    strength: float = 1.0,
+    photometric_bandwidth: float = 40 / 255,
+    spatial_bandwidth: float | None = None,
+    patch_size: int = 5,
+    num_landmarks: int = 100,
+    generator: torch.Generator | None = None,
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+) -> None:
+    """Colour a picture of any size, as :func:`colorize` does one in memory.
+
+    What the strokes make of a pixel depends on the pixel's own patch and place only, once the sums over all pixels and
+    over the painted ones are known: tiles have no seams, and their size makes no difference.
+
+    Args:
+        source: rows (H, W) or (H, W, S), as of :func:`stream_detail`; of colours the luminance is taken.
+        target: what takes the rows; (H, W, 3), or (H, W, 4) where the source has transparency.
+        strokes: rows (H, W, 3), RGB, read where painted only; or (H, W, 4), painted where not transparent. Integers
+            count from 0 to 1, whatever their range.
+        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 where painted; None where the strokes have
+            four channels.
+        method: ``"regression"``; k-means takes all pixels at once.
+        strength: as of :func:`colorize`, and so are bandwidths, ``patch_size``, ``num_landmarks`` and ``generator``.
+        photometric_bandwidth: in units of the image.
+        spatial_bandwidth: in pixels; None is 0.5625 of the short side.
+        patch_size: of the patches that are compared.
+        num_landmarks: M of the operators.
+        generator: source of randomness for the landmarks.
+        statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
+        sample: number of pixels.
+        tile_rows: rows that are worked out at once.
+        memory: in bytes, beside those of the sources and the target.
+        report: called with a stage and how much of it is done.
+
+    Raises:
+        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size meanwhile.
+        MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
+
+    Example:
+        >>> grey = np.full((60, 40), 60, np.uint8)
+        >>> grey[:, 20:] = 200
+        >>> strokes, coloured = np.zeros((60, 40, 4), np.uint8), np.empty((60, 40, 3), np.uint8)
+        >>> strokes[4:8, 4:8], strokes[4:8, -8:-4] = (0, 0, 200, 255), (200, 0, 0, 255)  # dark is blue, bright is red
+        >>> stream_colorize(grey, coloured, strokes, num_landmarks=20, tile_rows=16)
+        >>> red, blue = coloured[..., 0].astype(int), coloured[..., 2].astype(int)
+        >>> bool((blue > red)[:, :17].all()), bool((red > blue)[:, 23:].all())
+        (True, True)
+    """
+    height, width, *samples = source.shape
+    check_target(
+        target,
+        (height, width, 3 if samples in ([], [1], [3]) else 4),
+        "the height and width of the source, three colours, and transparency where that has it",
+    )
+    rows = colorize_rows(
+        source,
+        strokes,
+        stroke_mask,
+        kind=np.dtype(target.dtype).name,
+        method=method,
+        strength=strength,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        generator=generator,
+        statistics=statistics,
+        sample=sample,
+        tile_rows=tile_rows,
+        memory=memory,
+        report=report,
+    )
+    fill(target, rows)
+
+
+def colorize_rows(
+    source: RowSource,
+    strokes: RowSource,
+    stroke_mask: RowSource | None = None,
+    *,
+    kind: str,
+    method: str = "regression",
+    strength: float = 1.0,
+    photometric_bandwidth: float = 40 / 255,
+    spatial_bandwidth: float | None = None,
+    patch_size: int = 5,
+    num_landmarks: int = 100,
+    generator: torch.Generator | None = None,
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+    names: tuple[str, str] = ("source", "strokes"),
+) -> Rows:
+    """The rows (h, W, S) of :func:`stream_colorize` as dtype ``kind``, as they are asked for.
+
+    Errors call source and strokes by ``names``.
+    """
+    check_choice(method, "method", ("regression", "kmeans"))
+    if method == "kmeans":
+        raise ValueError(
+            "method must be regression where a picture is worked out by rows, got kmeans, which takes all pixels at "
+            "once; choose regression, or allow more memory"
+        )
+    check_settings(kind, statistics, sample, tile_rows)
+    check_share(strength, "strength")
+    check_positive(photometric_bandwidth, "photometric_bandwidth")
+    check_patch_size(patch_size)
+    check_count(num_landmarks, "num_landmarks")
+    picture = Picture(source, names[0])
+    guide = Guide(source, names[0], lambda colours: reduce_channels(colours, "luminance"))
+    bandwidth = LOCALITY * min(guide.size) if spatial_bandwidth is None else spatial_bandwidth
+    check_positive(bandwidth, "spatial_bandwidth")
+    report = report or (lambda stage, done, rows: None)
+    painted = read_strokes(guide, strokes, stroke_mask, memory=memory, report=report, name=names[1])
+
+    planes = patch_size**2 + 2
+    check_room(guide, len(painted.places), planes, memory)
+    rows = rows_that_fit(
+        guide,
+        memory,
+        floats=planes + num_landmarks + 40,
+        planes=planes,
+        num_landmarks=num_landmarks,
+        sample=sample,
+        held=len(painted.places) * floats_of_painted(planes),
+    )
+    values = split_luminance(painted.colours[None, :, None])[1][:, :, 0]  # (1, 3, n)
+    fitted: list[FittedChroma] = []
+    for stage in (FAR, NEAR):
+        kernel, pairs = fit_spectrum(
+            guide,
+            statistics=statistics,
+            sample=sample,
+            report=report,
+            patch_size=int(min(patch_size, stage.patch_size)),
+            photometric_bandwidth=stage.photometric * photometric_bandwidth,
+            spatial_bandwidth=stage.spatial * bandwidth,
+            num_landmarks=min(num_landmarks, guide.pixels),
+            generator=generator,
+        )
+        part = strength if stage is FAR else 0.0
+        chroma, values = fit_chroma(picture, guide, kernel, pairs, painted, values, stage, part, report)
+        fitted.append(chroma)
+
+    def edit(tile: Tile) -> Tensor:
+        return merge_luminance(tile.inner, fitted[0](tile) + fitted[1](tile))
+
+    yield from work_out(guide, edit, kind, patch_size // 2, tile_rows or rows, report)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedChroma:
+    """The chroma that strokes give to a picture's tiles.
+
+    Attributes:
+        kernel: of the operator.
+        strokes: fitted to it.
+    """
+
+    kernel: Kernel
+    strokes: FittedStrokes
+
+    @full_precision
+    def __call__(self, tile: Tile) -> Tensor:
+        """(1, 3, h, W), for the rows of a tile of the guide."""
+        factor, _ = self.kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
+        return self.strokes(factor).unflatten(2, (tile.inner.shape[-2], tile.inner.shape[-1]))
+
+
+@torch.no_grad()
+@full_precision
+def fit_chroma(
+    picture: Picture,
+    guide: Guide,
+    kernel: Kernel,
+    pairs: RitzPairs,
+    painted: Painted,
+    values: Tensor,
+    stage: Stage,
+    strength: float,
+    report: Report,
+) -> tuple[FittedChroma, Tensor]:
+    """A stage of :func:`colorize` for values (1, 3, n) of the painted pixels, and what it leaves of them."""
+    found = gather(picture, guide, kernel, painted.places, painted.weights, lambda colours: colours, report)
+    found = Sample(found.features, values, found.weights)
+
+    def blocks() -> Any:
+        return ((block.factor, block.weights.unsqueeze(1), block.image) for block in found.blocks(kernel))
+
+    fitted = fit_strokes(blocks, pairs, guide.pixels, strength=strength, reach=stage.reach, smoothness=stage.smoothness)
+    said = torch.cat([fitted(factor) for factor, _, _ in blocks()], dim=2)
+    return FittedChroma(kernel, fitted), values - said
