@@ -9,8 +9,8 @@ import typer
 
 from nlfilter_torch.checks import check_patch_size, check_positive
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.by_rows import allowed_memory
-from nlfilter_torch.cli.detail import Edited, Memory, PresetName, Residual, check_residual, detail
+from nlfilter_torch.cli.by_rows import Memory, allowed_memory
+from nlfilter_torch.cli.detail import Edited, PresetName, Residual, check_residual, detail
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.folders import Tally, edit_folder, pictures, prepare
 from nlfilter_torch.ranks import connected_ranks

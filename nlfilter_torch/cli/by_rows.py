@@ -1,17 +1,42 @@
-"""``nlfilter-torch detail`` for photographs that fit no memory: tile after tile, from file to file."""
+"""Verbs on photographs that fit no memory: tile after tile, from file to file."""
 
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from torch import Tensor
+import typer
 
-from nlfilter_torch.cli import painting
 from nlfilter_torch.cli.progress import stages
 from nlfilter_torch.files import Photograph, TooLarge, read_photograph
-from nlfilter_torch.streaming.detail import detail_rows
-from nlfilter_torch.streaming.files import check_place, free_memory, is_zarr, open_picture, write_picture
+from nlfilter_torch.streaming.files import (
+    Rows,
+    StoredPicture,
+    check_place,
+    free_memory,
+    is_zarr,
+    open_picture,
+    write_picture,
+)
+from nlfilter_torch.streaming.sampling import Report
+
+Memory = Annotated[
+    float | None,
+    typer.Option(
+        metavar="GB",
+        help="Gigabytes of memory that may be used. A larger photograph is worked out in tiles of rows, which takes "
+        "longer and shows no seams. Left out: four fifths of what is free.",
+    ),
+]
+Full = Annotated[
+    bool,
+    typer.Option(
+        "--full",
+        help="In tiles: work from every pixel, not from a million of them. Takes two or three times as long.",
+    ),
+]
 
 
 def allowed_memory(gigabytes: float | None) -> int:
@@ -33,35 +58,64 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int)
         return None
 
 
+@dataclass
+class Job:
+    """A photograph that is edited by rows.
+
+    Attributes:
+        picture: that is read.
+        kind: dtype of what is written.
+        memory: bytes that are left.
+        report: told of the progress.
+        files: closes what was opened.
+    """
+
+    picture: StoredPicture
+    kind: str
+    memory: int
+    report: Report
+    files: ExitStack
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.picture.shape[0], self.picture.shape[1]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What every edit by rows is told."""
+        return {"kind": self.kind, "memory": max(self.memory, 1), "report": self.report}
+
+    def open(self, path: Path) -> StoredPicture:
+        """Another picture, read by rows as long as the job takes."""
+        found = self.files.enter_context(open_picture(path, self.memory))
+        self.memory -= found.held
+        return found
+
+
 def edit_by_rows(
     source: Path,
     target: Path,
-    alpha: Tensor,
-    *,
     depth: str | None,
-    mask: Path | None,
-    region: list[str] | None,
     memory: int,
-    **options: Any,
+    edit: Callable[[Job], Rows],
+    *,
+    coloured: bool = False,
 ) -> None:
-    """What `detail` does, with the options of :func:`stream_detail`."""
+    """Write the rows that ``edit`` makes of the photograph in one file to another.
+
+    Args:
+        source: the file to read.
+        target: the file to write; may be the same.
+        depth: dtype of the output, None for that of the input.
+        memory: bytes that may be used.
+        edit: from what is open to the edited rows.
+        coloured: that a grey photograph becomes one in colour.
+    """
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(source, memory))
         kind = depth or str(picture.rows.dtype)
-        check_place(target, kind, picture, memory)
-        size = (picture.shape[0], picture.shape[1])
-        stored = None if mask is None else stack.enter_context(open_picture(mask, memory)).rows
-        selected = painting.region_rows(size, mask, stored, region, alpha)
-        regions, sliders = (None, alpha) if selected is None else selected
-        report = stack.enter_context(stages())
-        rows = detail_rows(
-            picture.rows,
-            sliders,
-            regions,
-            kind=kind,
-            memory=max(memory - picture.held, 1),
-            report=report,
-            name=str(source),
-            **options,
-        )
-        write_picture(target, rows, kind, picture)
+        written = picture.in_colour() if coloured else picture
+        check_place(target, kind, written, memory)
+        job = Job(picture, kind, memory - picture.held, stack.enter_context(stages()), stack)
+        write_picture(target, edit(job), kind, written)

@@ -6,11 +6,14 @@ from typing import Annotated
 import typer
 from torch import Tensor
 
-from nlfilter_torch.cli import editing, options, painting
+from nlfilter_torch.cli import editing, options, painted_rows, painting
+from nlfilter_torch.cli.by_rows import Full, Job, Memory
 from nlfilter_torch.cli.detail import OutputDepth, Target
 from nlfilter_torch.edits.colorize import colorize as edit
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.files import Photograph
+from nlfilter_torch.streaming.colorize import colorize_rows
+from nlfilter_torch.streaming.files import Rows
 
 
 class Method(StrEnum):
@@ -49,10 +52,13 @@ def colorize(
     depth: OutputDepth = None,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
+    memory: Memory = None,
+    full: Full = False,
 ) -> None:
     """Colour a grey photograph: paint some strokes, and the colours spread over what looks alike nearby.
 
-    Brightness stays as it is. A photograph in colour is taken for a grey one: its own colours are replaced.
+    Brightness stays as it is. A photograph in colour is taken for a grey one: its own colours are replaced. Photographs
+    that fit no memory are worked out in tiles, by regression; best as TIFF files or arrays of zarr, read in parts.
 
     Example: `nlfilter-torch colorize grey.jpg out.jpg --strokes paint.png`
 
@@ -65,4 +71,18 @@ def colorize(
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
         return edit(grey, painted, mask, method=method.value, strength=strength, **shared)
 
-    editing.edit_file(source, target, depth, work, landmarks=landmarks)
+    def by_rows(job: Job) -> Rows:
+        painted = painted_rows.stroke_rows(job, strokes, region)
+        shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
+        return colorize_rows(
+            job.picture.rows,
+            painted,
+            method=method.value,
+            strength=strength,
+            statistics="full" if full else "sample",
+            names=(source, str(strokes or "--region")),
+            **shared,
+            **job.settings,
+        )
+
+    editing.edit_file(source, target, depth, work, landmarks=landmarks, memory=memory, by_rows=by_rows, coloured=True)

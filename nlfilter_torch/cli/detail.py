@@ -10,8 +10,8 @@ import torch
 import typer
 from torch import Tensor
 
-from nlfilter_torch.cli import options, painting
-from nlfilter_torch.cli.by_rows import allowed_memory, edit_by_rows, read_if_it_fits
+from nlfilter_torch.cli import options, painted_rows, painting
+from nlfilter_torch.cli.by_rows import Full, Job, Memory, allowed_memory, edit_by_rows, read_if_it_fits
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.edits.enhance import colour_masks
@@ -20,6 +20,8 @@ from nlfilter_torch.files import Depth, check_output, write_photograph
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.presets import PRESETS, find_preset
+from nlfilter_torch.streaming.detail import detail_rows
+from nlfilter_torch.streaming.files import Rows
 
 
 class FileDepth(StrEnum):
@@ -79,22 +81,6 @@ Spread = Annotated[
     float,
     typer.Option(
         metavar="TIME", help="How far the edit of a region spreads to what is less like it: 0.5 little, 5 far."
-    ),
-]
-Memory = Annotated[
-    float | None,
-    typer.Option(
-        metavar="GB",
-        help="Gigabytes of memory that may be used. A larger photograph is worked out in tiles of rows, which takes "
-        "longer and shows no seams. Left out: four fifths of what is free.",
-    ),
-]
-Full = Annotated[
-    bool,
-    typer.Option(
-        "--full",
-        help="In tiles: make the filter from every pixel, not from a million of them, as with --residual. Takes two or "
-        "three times as long.",
     ),
 ]
 PresetName = Annotated[
@@ -193,22 +179,25 @@ def detail(
             begin("Writing")
             write_photograph(edited.with_pixels(pixels), target)
             return
-    edit_by_rows(
-        Path(source),
-        Path(target),
-        sliders,
-        depth=None if depth is None else DEPTHS[depth],
-        mask=mask,
-        region=region,
-        memory=allowed,
-        residual=residual,
-        time=spread,
-        channels=channels.value,
-        statistics="full" if full else "sample",
-        photometric_bandwidth=options.parse_bandwidth(bandwidth),
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=landmarks,
-        landmarks=sampling.value,
-        generator=torch.Generator().manual_seed(seed),
-    )
+
+    def by_rows(job: Job) -> Rows:
+        regions, own = painted_rows.region_rows(job, mask, region, sliders)
+        return detail_rows(
+            job.picture.rows,
+            own,
+            regions,
+            name=source,
+            residual=residual,
+            time=spread,
+            channels=channels.value,
+            statistics="full" if full else "sample",
+            photometric_bandwidth=options.parse_bandwidth(bandwidth),
+            spatial_bandwidth=spatial_bandwidth,
+            patch_size=patch_size,
+            num_landmarks=landmarks,
+            landmarks=sampling.value,
+            generator=torch.Generator().manual_seed(seed),
+            **job.settings,
+        )
+
+    edit_by_rows(Path(source), Path(target), None if depth is None else DEPTHS[depth], allowed, by_rows)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -9,9 +10,11 @@ import typer
 from torch import Tensor
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.cli.by_rows import Job, allowed_memory, edit_by_rows, read_if_it_fits
 from nlfilter_torch.cli.detail import DEPTHS, FileDepth
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.files import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.streaming.files import Rows
 
 Bandwidth = Annotated[
     float | None,
@@ -40,6 +43,9 @@ def edit_file(
     landmarks: int,
     patch_size: int = 5,
     factors: int = 1,
+    memory: float | None = None,
+    by_rows: Callable[[Job], Rows] | None = None,
+    coloured: bool = False,
 ) -> None:
     """Write ``edit`` of the photograph in one file to another, at its depth and with all that the file carries.
 
@@ -51,19 +57,31 @@ def edit_file(
         landmarks: M.
         patch_size: p.
         factors: arrays of the factor's size that the edit holds at once.
+        memory: gigabytes that may be used, None for most of what is free; for edits that can do by rows.
+        by_rows: the edit of a photograph that is larger, or None where there is no such edit.
+        coloured: that the edit by rows gives colours to a grey photograph.
     """
+    needed = options.working_bytes(landmarks, patch_size, factors=factors)
+    allowed = None if by_rows is None else allowed_memory(memory)
     with steps(3) as begin:
         begin("Reading")
-        needed = options.working_bytes(landmarks, patch_size, factors=factors)
-        photograph = read_photograph(source, bytes_per_pixel=needed)
-        edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
-        check_output(target, edited)
-        begin("Editing")
-        pixels = edit(photograph)
-        begin("Writing")
-        if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
-            edited = replace(edited, icc=None)
-        write_photograph(edited.with_pixels(pixels), target)
+        if allowed is None:
+            photograph: Photograph | None = read_photograph(source, bytes_per_pixel=needed)
+        else:
+            photograph = read_if_it_fits(source, target, needed, allowed)
+        if photograph is not None:
+            edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
+            check_output(target, edited)
+            begin("Editing")
+            pixels = edit(photograph)
+            begin("Writing")
+            if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
+                edited = replace(edited, icc=None)
+            write_photograph(edited.with_pixels(pixels), target)
+            return
+    if allowed is not None and by_rows is not None:
+        kind = None if depth is None else DEPTHS[depth]
+        edit_by_rows(Path(source), Path(target), kind, allowed, by_rows, coloured=coloured)
 
 
 def common(bandwidth: float | None, spatial_bandwidth: float | None, landmarks: int, seed: int) -> dict[str, Any]:
@@ -76,7 +94,7 @@ def common(bandwidth: float | None, spatial_bandwidth: float | None, landmarks: 
     return given
 
 
-def check_colour(photograph: Photograph, verb: str, remedy: str) -> None:
-    """Raise unless the photograph has colours."""
-    if photograph.pixels.shape[1] != 3:
+def check_colour(channels: int, verb: str, remedy: str) -> None:
+    """Raise unless a photograph of so many channels has colours."""
+    if channels < 3:
         raise ValueError(f"{verb} needs a colour photograph, got a grey one; {remedy}")

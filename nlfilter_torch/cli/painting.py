@@ -4,16 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import torch
 import typer
-from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.files import Photograph, read_photograph
-from nlfilter_torch.streaming.rows import Picture, RowSource
 
 StrokesFile = Annotated[
     Path | None,
@@ -105,17 +102,30 @@ def colour_strokes(photograph: Photograph, path: Path | None, regions: list[str]
     """Strokes (1, 3, H, W) and their mask (1, 1, H, W) from ``--strokes`` and ``--region``."""
     size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
     strokes, painted = torch.zeros(1, 3, *size), torch.zeros(1, 1, *size)
-    if path is None and not regions:
-        raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
+    check_strokes(path, regions)
     if path is not None:
         strokes, painted = _read_strokes(path, size)
+    for rectangle, colour in coloured_rectangles(size, regions):
+        strokes[0, :, rectangle.rows, rectangle.columns] = colour[:, None, None]
+        painted[..., rectangle.rows, rectangle.columns] = 1
+    return strokes, painted
+
+
+def check_strokes(path: Path | None, regions: list[str] | None) -> None:
+    """Raise unless there is ``--strokes`` or ``--region``."""
+    if path is None and not regions:
+        raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
+
+
+def coloured_rectangles(size: tuple[int, int], regions: list[str] | None) -> list[tuple[Rectangle, Tensor]]:
+    """Rectangles of ``--region`` and their RGB colours (3,)."""
+    found = []
     for text in regions or []:
         rectangle = Rectangle.parse(text, "--region", size)
         if rectangle.note is None:
             raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
-        strokes[0, :, rectangle.rows, rectangle.columns] = _colour(rectangle.note, text)[:, None, None]
-        painted[..., rectangle.rows, rectangle.columns] = 1
-    return strokes, painted
+        found.append((rectangle, colour_named(rectangle.note, text)))
+    return found
 
 
 def selection(photograph: Photograph, path: Path | None, regions: list[str] | None, *, option: str) -> Tensor | None:
@@ -131,12 +141,19 @@ def selection(photograph: Photograph, path: Path | None, regions: list[str] | No
     if path is None and not regions:
         return None
     mask = torch.zeros(1, 1, *size) if path is None else _read_mask(path, size)
-    for text in regions or []:
-        rectangle = Rectangle.parse(text, option, size)
-        if rectangle.note is not None:
-            raise ValueError(f"{option} must be X,Y,W,H alone here, got {text!r}; leave out what follows the colon")
+    for rectangle in plain_rectangles(size, regions, option):
         mask[..., rectangle.rows, rectangle.columns] = 1
     return mask
+
+
+def plain_rectangles(size: tuple[int, int], regions: list[str] | None, option: str) -> list[Rectangle]:
+    """Rectangles of an option that takes no more than them."""
+    found = []
+    for text in regions or []:
+        found.append(Rectangle.parse(text, option, size))
+        if found[-1].note is not None:
+            raise ValueError(f"{option} must be X,Y,W,H alone here, got {text!r}; leave out what follows the colon")
+    return found
 
 
 def slider_regions(
@@ -153,14 +170,14 @@ def slider_regions(
     size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
     masks, sliders = ([], []) if path is None else ([_read_mask(path, size)], [alpha])
     for text in regions or []:
-        rectangle, own = _with_sliders(text, size, alpha)
+        rectangle, own = with_sliders(text, size, alpha)
         masks.append(torch.zeros(1, 1, *size))
         masks[-1][..., rectangle.rows, rectangle.columns] = 1
         sliders.append(own)
     return (torch.cat(masks, dim=1), torch.stack(sliders)) if masks else None
 
 
-def _with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Rectangle, Tensor]:
+def with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Rectangle, Tensor]:
     """A rectangle of ``--region`` and its sliders (k+1,)."""
     rectangle = Rectangle.parse(text, "--region", size)
     own = alpha if rectangle.note is None else parse_sliders(rectangle.note, "--region")
@@ -172,59 +189,11 @@ def _with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Rect
     return rectangle, own
 
 
-@dataclass(frozen=True)
-class RegionRows:
-    """Regions of a picture that fits no memory: rows (h, W, K) of their weights.
-
-    Attributes:
-        shape: (H, W, K).
-        mask: the picture of the first region, or None.
-        rectangles: the other regions.
-    """
-
-    shape: tuple[int, int, int]
-    mask: Picture | None
-    rectangles: list[Rectangle]
-    dtype = np.dtype(np.float32)
-
-    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
-        """The rows from ``rows.start`` to ``rows.stop``."""
-        weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
-        regions = np.moveaxis(weights, 2, 0)
-        if self.mask is not None:
-            regions[0] = self.mask.tile(rows.start, rows.stop, 0).pixels.mean(1)[0].clamp(0, 1)
-        first = len(regions) - len(self.rectangles)
-        for region, rectangle in zip(regions[first:], self.rectangles, strict=True):
-            top, bottom = (max(row - rows.start, 0) for row in (rectangle.rows.start, rectangle.rows.stop))
-            region[top:bottom, rectangle.columns] = 1
-        return weights
-
-
-def region_rows(
-    size: tuple[int, int], path: Path | None, mask: RowSource | None, regions: list[str] | None, alpha: Tensor
-) -> tuple[RegionRows, Tensor] | None:
-    """What :func:`slider_regions` gives, for a picture of ``size`` that is read by rows, as its mask is."""
-    if mask is not None and tuple(mask.shape[:2]) != size:
-        raise ValueError(
-            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {mask.shape[1]}x{mask.shape[0]}; "
-            "resize one"
-        )
-    parsed = [_with_sliders(text, size, alpha) for text in regions or []]
-    sliders = ([alpha] if mask is not None else []) + [own for _, own in parsed]
-    if not sliders:
-        return None
-    picture = None if mask is None else Picture(mask, str(path))
-    return RegionRows((*size, len(sliders)), picture, [rectangle for rectangle, _ in parsed]), torch.stack(sliders)
-
-
 def _read_strokes(path: Path, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     painting = read_photograph(path)
-    _check_size(path, painting, size)
+    check_size(path, (painting.pixels.shape[-2], painting.pixels.shape[-1]), size)
     if painting.alpha is None:
-        raise ValueError(
-            f"{path} has no transparency, so that every pixel of it would be a stroke; "
-            "paint on a transparent layer and save that"
-        )
+        raise opaque(path)
     painted = painting.alpha.float()
     if not bool((painted > 0).any()):
         raise ValueError(f"{path} is transparent everywhere; paint at least one stroke")
@@ -233,22 +202,31 @@ def _read_strokes(path: Path, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 def _read_mask(path: Path, size: tuple[int, int]) -> Tensor:
     picture = read_photograph(path)
-    _check_size(path, picture, size)
+    check_size(path, (picture.pixels.shape[-2], picture.pixels.shape[-1]), size)
     mask = picture.pixels.float().mean(1, keepdim=True).clamp(0, 1)
     if not bool((mask > 0).any()):
         raise ValueError(f"{path} is black everywhere; paint white what is to be selected")
     return mask
 
 
-def _check_size(path: Path, picture: Photograph, size: tuple[int, int]) -> None:
-    height, width = picture.pixels.shape[-2:]
-    if (height, width) != size:
+def check_size(path: Path, found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise unless a picture over a photograph of ``size`` has its height and width."""
+    if found != size:
         raise ValueError(
-            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {width}x{height}; resize one"
+            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize one"
         )
 
 
-def _colour(name: str, text: str) -> Tensor:
+def opaque(path: Path) -> ValueError:
+    """What to raise where a picture of strokes has no transparency."""
+    return ValueError(
+        f"{path} has no transparency, so that every pixel of it would be a stroke; "
+        "paint on a transparent layer and save that"
+    )
+
+
+def colour_named(name: str, text: str) -> Tensor:
+    """RGB (3,) of the colour with which a rectangle ends."""
     try:
         red, green, blue = ImageColor.getrgb(name)[:3]
     except ValueError:

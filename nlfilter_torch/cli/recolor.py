@@ -5,10 +5,13 @@ from typing import Annotated
 import typer
 from torch import Tensor
 
-from nlfilter_torch.cli import editing, options, painting
+from nlfilter_torch.cli import editing, options, painted_rows, painting
+from nlfilter_torch.cli.by_rows import Full, Job, Memory
 from nlfilter_torch.cli.detail import OutputDepth, Target
 from nlfilter_torch.edits.recolor import recolor as edit
 from nlfilter_torch.files import Photograph
+from nlfilter_torch.streaming.files import Rows
+from nlfilter_torch.streaming.recolor import recolor_rows
 
 Reach = Annotated[
     float,
@@ -33,21 +36,42 @@ def recolor(
     depth: OutputDepth = None,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
+    memory: Memory = None,
+    full: Full = False,
 ) -> None:
     """Give things another colour: paint a little of it on one, and all that look alike take it.
 
-    Brightness stays as it is to the last bit, and so does whatever looks like none of the strokes.
+    Brightness stays as it is to the last bit, and so does whatever looks like none of the strokes. Photographs that fit
+    no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
 
     A red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
 
     Spare the wood: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
     """
 
+    def check(channels: int) -> None:
+        editing.check_colour(channels, "recolor", "use nlfilter-torch colorize, which colours grey ones")
+
     def work(photograph: Photograph) -> Tensor:
-        editing.check_colour(photograph, "recolor", "use nlfilter-torch colorize, which colours grey ones")
+        check(photograph.pixels.shape[1])
         painted, mask = painting.colour_strokes(photograph, strokes, region)
         kept = painting.selection(photograph, None, keep, option="--keep")
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
         return edit(photograph.pixels, painted, mask, keep=kept, reach=reach, **shared)
 
-    editing.edit_file(source, target, depth, work, landmarks=landmarks)
+    def by_rows(job: Job) -> Rows:
+        check(job.picture.shape[2])
+        painted = painted_rows.stroke_rows(job, strokes, region)
+        shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
+        return recolor_rows(
+            job.picture.rows,
+            painted,
+            keep=painted_rows.mark_rows(job, keep, "--keep"),
+            reach=reach,
+            statistics="full" if full else "sample",
+            names=(source, str(strokes or "--region")),
+            **shared,
+            **job.settings,
+        )
+
+    editing.edit_file(source, target, depth, work, landmarks=landmarks, factors=3, memory=memory, by_rows=by_rows)

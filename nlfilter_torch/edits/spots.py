@@ -69,7 +69,8 @@ def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> It
         spots, owners = label_spots(places, numbers, spectrum.size)
         factor = spectrum.factor[b]
         columns, unit = _scaled(core[b], factor)
-        sums, weight = spot_sums((factor * unit)[:, places], region[numbers, places], spots, len(owners))
+        inside = factor[:, places] * unit[:, places]
+        sums, weight = spot_sums(inside, region[numbers, places], spots, len(owners))
         yield Spots.of_means(sums / weight, F.one_hot(owners, len(region)).to(region), core[b], columns * unit)
 
 

@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,14 @@ class StoredPicture:
         """(H, W, S)."""
         height, width, *samples = self.rows.shape
         return height, width, samples[0] if samples else 1
+
+    def in_colour(self) -> "StoredPicture":
+        """What it is to be written like once it has colours; no pixel of it. A profile for grey fits no colours."""
+        height, width, samples = self.shape
+        if samples > 2:
+            return self
+        shape = (height, width, 3 + self.alpha)
+        return replace(self, rows=np.broadcast_to(np.zeros((), self.rows.dtype), shape), icc=None)
 
 
 def is_zarr(path: Path) -> bool:

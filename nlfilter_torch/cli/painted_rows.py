@@ -1,0 +1,138 @@
+"""What someone paints or marks on a photograph that is read by rows, by rows as well."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch.cli.by_rows import Job
+from nlfilter_torch.cli.painting import (
+    Rectangle,
+    check_size,
+    check_strokes,
+    coloured_rectangles,
+    opaque,
+    plain_rectangles,
+    with_sliders,
+)
+from nlfilter_torch.streaming.rows import Picture, transparency
+
+Floats = NDArray[np.float32]
+
+
+def _within(rectangle: Rectangle, rows: slice) -> tuple[slice, slice]:
+    """The part of a rectangle that lies in some rows, as counted from the first of these."""
+    top, bottom = (max(row - rows.start, 0) for row in (rectangle.rows.start, rectangle.rows.stop))
+    return slice(top, bottom), rectangle.columns
+
+
+@dataclass(frozen=True)
+class RegionRows:
+    """Regions of a photograph: rows (h, W, K) of their weights.
+
+    Attributes:
+        shape: (H, W, K).
+        mask: the picture of the first region, or None.
+        rectangles: the other regions.
+    """
+
+    shape: tuple[int, int, int]
+    mask: Picture | None
+    rectangles: list[Rectangle]
+    dtype = np.dtype(np.float32)
+
+    def __getitem__(self, rows: slice) -> Floats:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        regions = np.moveaxis(weights, 2, 0)
+        if self.mask is not None:
+            regions[0] = self.mask.tile(rows.start, rows.stop, 0).pixels.mean(1)[0].clamp(0, 1)
+        first = len(regions) - len(self.rectangles)
+        for region, rectangle in zip(regions[first:], self.rectangles, strict=True):
+            region[_within(rectangle, rows)] = 1
+        return weights
+
+
+def region_rows(
+    job: Job, path: Path | None, regions: list[str] | None, alpha: Tensor
+) -> tuple[RegionRows | None, Tensor]:
+    """Regions and sliders (K, k+1), as :func:`slider_regions` has them; None and ``alpha`` where none is given."""
+    picture = None
+    if path is not None:
+        stored = job.open(path)
+        check_size(path, stored.shape[:2], job.size)
+        picture = Picture(stored.rows, str(path))
+    parsed = [with_sliders(text, job.size, alpha) for text in regions or []]
+    sliders = ([] if picture is None else [alpha]) + [own for _, own in parsed]
+    if not sliders:
+        return None, alpha
+    return RegionRows((*job.size, len(sliders)), picture, [rectangle for rectangle, _ in parsed]), torch.stack(sliders)
+
+
+@dataclass(frozen=True)
+class StrokeRows:
+    """Strokes over a photograph: rows (h, W, 4) in RGB, the last channel above 0 where painted.
+
+    Attributes:
+        shape: (H, W, 4).
+        painting: with transparency, or None.
+        rectangles: over it, and their colours (3,).
+    """
+
+    shape: tuple[int, int, int]
+    painting: Picture | None
+    rectangles: list[tuple[Rectangle, Tensor]]
+    dtype = np.dtype(np.float32)
+
+    def __getitem__(self, rows: slice) -> Floats:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        strokes = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        if self.painting is not None:
+            tile = self.painting.tile(rows.start, rows.stop, 0)
+            strokes[..., :3] = tile.pixels[0].permute(1, 2, 0)  # a grey one gives its value to all three
+            strokes[..., 3:] = transparency(tile, "float32")
+        for rectangle, colour in self.rectangles:
+            strokes[_within(rectangle, rows)] = [*colour, 1.0]
+        return strokes
+
+
+def stroke_rows(job: Job, path: Path | None, regions: list[str] | None) -> StrokeRows:
+    """What :func:`colour_strokes` gives, by rows."""
+    check_strokes(path, regions)
+    picture = None
+    if path is not None:
+        stored = job.open(path)
+        check_size(path, stored.shape[:2], job.size)
+        if not stored.alpha:
+            raise opaque(path)
+        picture = Picture(stored.rows, str(path))
+    return StrokeRows((*job.size, 4), picture, coloured_rectangles(job.size, regions))
+
+
+@dataclass(frozen=True)
+class MarkRows:
+    """Rectangles on a photograph: rows (h, W) that are True within them.
+
+    Attributes:
+        shape: (H, W).
+        rectangles: of any number.
+    """
+
+    shape: tuple[int, int]
+    rectangles: list[Rectangle]
+    dtype = np.dtype(bool)
+
+    def __getitem__(self, rows: slice) -> NDArray[np.bool_]:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        marks = np.zeros((rows.stop - rows.start, self.shape[1]), self.dtype)
+        for rectangle in self.rectangles:
+            marks[_within(rectangle, rows)] = True
+        return marks
+
+
+def mark_rows(job: Job, regions: list[str] | None, option: str) -> MarkRows | None:
+    """What :func:`selection` gives for rectangles alone, by rows."""
+    return MarkRows(job.size, plain_rectangles(job.size, regions, option)) if regions else None
