@@ -135,9 +135,7 @@ def fit_strokes(
         smoothness: scales the noise.
         shard: of the image, where other ranks have the rest of it.
     """
-    walk = _per_image(reach, pairs.root).squeeze(2)  # (B or 1, 1)
-    # X = R R^T
-    half = pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt()).mT
+    half = walk_basis(pairs, reach).mT  # R, where X = R R^T
     spot = SPOT * pixels
     dots = Dots.of(painted, half, spot, shard) if spot > 1 else None
 
@@ -167,6 +165,17 @@ def fit_strokes(
     mean = unexplained[:, :-1] / unexplained[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
     return FittedStrokes((solution[:, :, :-1] - solution[:, :, -1:] * share).mT, share.mT)
+
+
+def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
+    """B (B, M, M) with the core ``X = B^T B``: columns u and v of the factor covary by ``(B u)^T (B v)``.
+
+    Args:
+        pairs: of the operator.
+        reach: s in [0, 1), a number or a tensor of shape () or (B,).
+    """
+    walk = _per_image(reach, pairs.root).squeeze(2)  # (B or 1, 1)
+    return pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt())
 
 
 @dataclass(frozen=True, eq=False)

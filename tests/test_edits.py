@@ -8,6 +8,7 @@ import pytest
 import skimage.data
 import torch
 import torch.nn.functional as F
+from skimage.measure import label
 from skimage.transform import resize
 
 from nlfilter_torch import (
@@ -24,7 +25,8 @@ from nlfilter_torch import (
     sharpen,
 )
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
-from nlfilter_torch.edits.spots import MAX_SPOTS, find_spots
+from nlfilter_torch.edits.recolor import colour_guide
+from nlfilter_torch.edits.spots import MAX_SPOTS, find_spots, label_spots
 from tests.problems import noise
 
 LUMINANCE = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
@@ -270,6 +272,29 @@ def test_spots_beyond_the_last_that_is_kept_apart_are_taken_together() -> None:
     assert each.abs().max() <= 1 + 1e-3
     single = dots[0, 1].flatten() > 0  # a dot correlates with itself fully
     torch.testing.assert_close(each[MAX_SPOTS:, single].diagonal(), torch.ones(16), atol=1e-3, rtol=0)
+
+
+def test_spots_are_what_is_connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.edits.spots.MAX_SPOTS", 10**9)
+    for number, size in enumerate([(1, 1), (1, 9), (9, 1), (7, 8), (40, 31)]):
+        for density in (0.1, 0.3, 0.5, 0.8, 1.0):
+            planes = torch.rand(3, *size, generator=torch.Generator().manual_seed(number)) < density
+            planes[0, 0, 0] = True
+            regions, places = planes.flatten(1).nonzero().unbind(1)
+            spots, owners = label_spots(places, regions, size)
+            parts = [label(plane.numpy(), connectivity=2) for plane in planes]
+            counts = torch.tensor([part.max() for part in parts])
+            offsets = counts.cumsum(0) - counts - 1
+            wanted = torch.cat([torch.from_numpy(p[p > 0]) + o for p, o in zip(parts, offsets, strict=True)])
+            assert torch.equal(spots, wanted)
+            assert torch.equal(owners, torch.arange(3).repeat_interleave(counts))
+
+
+def test_a_colour_is_the_same_to_the_last_bit_wherever_it_stands() -> None:
+    image = colour("astronaut", 61, 83)
+    guide = colour_guide(image)
+    for rows in (slice(0, 1), slice(3, 10), slice(20, 61)):
+        assert torch.equal(colour_guide(image[:, :, rows]), guide[:, :, rows])
 
 
 def test_flat_images_stay_flat() -> None:

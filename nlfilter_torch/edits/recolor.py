@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_image, check_same_size
@@ -18,6 +19,9 @@ FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FU
 DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: two colours on one thing are no error
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
+
+CONVERTED = 8192  # pixels that one thread converts at once
+VECTOR = 64  # a multiple of the floats that a processor works on at once
 
 
 @full_precision
@@ -148,7 +152,16 @@ def divide(spots: Spots) -> Tensor:
 
 
 def colour_guide(image: Tensor) -> Tensor:
-    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour."""
+    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour.
+
+    To the last bit the same for a pixel wherever it stands, so that landmarks are the same for a picture read by rows.
+    """
     from kornia.color import rgb_to_lab  # kornia takes half a second to import: only who needs it waits
 
-    return rgb_to_lab(image.clamp(0.0, 1.0)) / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
+    # Powers round differently in the odd pixels that are left over at the end of a tensor, or of a thread's part of it.
+    parts = []
+    for part in image.clamp(0.0, 1.0).flatten(2).split(CONVERTED, dim=2):
+        full = F.pad(part, (0, -part.shape[2] % VECTOR)).unsqueeze(2).contiguous()
+        parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
+    lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
+    return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)

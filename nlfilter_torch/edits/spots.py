@@ -5,13 +5,14 @@ is paint without a gap, is compared by the mean of what it covers, so that few o
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.spectrum import RitzPairs, Spectrum
+from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.strokes import walk_basis
 
 MAX_SPOTS = 64  # of one region; further ones are taken together
 TINY = 1e-6  # variance below which a pixel correlates with nothing
@@ -24,32 +25,24 @@ class Spots:
     Attributes:
         between: correlations of the spots with each other, (J, J), within [-1, 1].
         owners: the region that each spot belongs to, (J, K) of zeros and ones.
-        means: of the spots' factor columns, scaled to unit variance, (J, M).
-        core: X, (M, M), with which the columns u and v of two pixels have the covariance u^T X v.
-        columns: of the pixels that are compared, scaled likewise, multiplied by the core, (M, N).
+        means: of the spots' pixels as unit vectors, of unit length themselves, (J, M).
+        pixels: that are compared, as unit vectors (M, N), whose products are their correlations.
     """
 
     between: Tensor
     owners: Tensor
     means: Tensor
-    core: Tensor
-    columns: Tensor
+    pixels: Tensor
 
     @staticmethod
-    def of_means(means: Tensor, owners: Tensor, core: Tensor, columns: Tensor) -> "Spots":
-        """From the mean columns (J, M) of the spots, those of single pixels being of unit variance."""
-        gram = (means.double() @ core.double() @ means.mT.double()).to(means)
-        scale = gram.diagonal().clamp(min=TINY).rsqrt().unsqueeze(1)
-        return Spots(scale * gram * scale.mT, owners, scale * means, core, columns)
+    def of_means(means: Tensor, owners: Tensor, pixels: Tensor) -> "Spots":
+        """From the mean unit vectors (J, M) of the spots' pixels."""
+        means = means * means.square().sum(1, keepdim=True).clamp(min=TINY).rsqrt()
+        return Spots(means @ means.mT, owners, means, pixels)
 
     def mix(self, weights: Tensor) -> Tensor:
         """Weighted sums (L, N), with weights (L, J), of the correlations of every pixel with the spots."""
-        return (weights @ self.means) @ self.columns
-
-    def at(self, factor: Tensor) -> "Spots":
-        """The same spots, to be compared with other pixels, whose columns of the factor are (M, n)."""
-        columns, unit = _scaled(self.core, factor)
-        return replace(self, columns=columns * unit)
+        return (weights @ self.means) @ self.pixels
 
 
 def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Iterator[Spots]:
@@ -63,37 +56,24 @@ def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> It
     Yields:
         The spots of an image after the other. Differentiable in operator, weights and reach.
     """
-    core = walk_core(spectrum, reach).to(spectrum.factor)
+    basis = walk_basis(spectrum, reach).to(spectrum.factor)
     for b, region in enumerate(regions.flatten(2)):
         numbers, places = (region.detach() > 0).nonzero().unbind(1)
         spots, owners = label_spots(places, numbers, spectrum.size)
-        factor = spectrum.factor[b]
-        columns, unit = _scaled(core[b], factor)
-        inside = factor[:, places] * unit[:, places]
-        sums, weight = spot_sums(inside, region[numbers, places], spots, len(owners))
-        yield Spots.of_means(sums / weight, F.one_hot(owners, len(region)).to(region), core[b], columns * unit)
+        pixels = unit_vectors(basis[b], spectrum.factor[b])
+        sums, weight = spot_sums(pixels[:, places], region[numbers, places], spots, len(owners))
+        yield Spots.of_means(sums / weight, F.one_hot(owners, len(region)).to(region), pixels)
 
 
-def walk_core(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
-    """X (B, M, M), float64, under which columns of the factor covary as walks from one pixel to the other go."""
-    walk = torch.as_tensor(reach).to(pairs.root).reshape(-1, 1)
-    return pairs.gain(lambda eigenvalues: eigenvalues / (1 - walk * eigenvalues))
+def unit_vectors(basis: Tensor, factor: Tensor) -> Tensor:
+    """Columns (M, n) of the factor as unit vectors (M, n) whose products are correlations, by :func:`walk_basis`."""
+    vectors = basis @ factor
+    return vectors * vectors.square().sum(0, keepdim=True).clamp(min=TINY).rsqrt()
 
 
-def unit_columns(core: Tensor, factor: Tensor) -> Tensor:
-    """Columns of the factor (M, n), scaled to unit variance under the core (M, M)."""
-    return factor * _scaled(core, factor)[1]
-
-
-def _scaled(core: Tensor, factor: Tensor) -> tuple[Tensor, Tensor]:
-    """The core times columns (M, n), and what scales each of them to unit variance, (1, n)."""
-    columns = core @ factor
-    return columns, (factor * columns).sum(0, keepdim=True).clamp(min=TINY).rsqrt()
-
-
-def spot_sums(columns: Tensor, weights: Tensor, spots: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Sums (J, M) of weighted columns (M, n) over J = ``count`` spots, and the weights (J, 1) of these."""
-    sums = columns.new_zeros(count, columns.shape[0]).index_add(0, spots, (columns * weights).mT)
+def spot_sums(values: Tensor, weights: Tensor, spots: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Sums (J, M) of weighted values (M, n) over J = ``count`` spots, and the weights (J, 1) of these."""
+    sums = values.new_zeros(count, values.shape[0]).index_add(0, spots, (values * weights).mT)
     return sums, weights.new_zeros(count, 1).index_add(0, spots, weights.unsqueeze(1))
 
 

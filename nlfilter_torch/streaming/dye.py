@@ -8,13 +8,15 @@ from torch import Tensor
 
 from nlfilter_torch.edits.chroma import group_colours, split_luminance
 from nlfilter_torch.edits.recolor import Dye, divide
-from nlfilter_torch.edits.spots import Spots, label_spots, spot_sums, unit_columns, walk_core
+from nlfilter_torch.edits.spots import Spots, label_spots, spot_sums, unit_vectors
 from nlfilter_torch.kernel import Kernel
+from nlfilter_torch.nystrom import nystrom_factor
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.painted import Guide, Painted, gather
 from nlfilter_torch.streaming.rows import Picture, Tile
 from nlfilter_torch.streaming.sampling import Report, Sample
+from nlfilter_torch.strokes import walk_basis
 
 
 @dataclass(frozen=True)
@@ -68,15 +70,15 @@ class FittedDye:
         guide: what is compared of the picture.
         kernel: of the operator.
         marked: what is painted.
-        spots: of the paint.
-        division: weights (K', J) of the correlations with the spots.
+        basis: of the unit vectors that pixels are compared by, (M, M).
+        division: (K', M), from a unit vector to its likeness to each region.
         dye: what becomes of the colours.
     """
 
     guide: Guide
     kernel: Kernel
     marked: Marked
-    spots: Spots
+    basis: Tensor
     division: Tensor
     dye: Dye
 
@@ -84,10 +86,16 @@ class FittedDye:
     def __call__(self, tile: Tile) -> Tensor:
         """The colours (1, 3, h, W) of the rows of a tile of the picture."""
         seen = self.guide.seen(tile)
-        factor, _ = self.kernel.columns(seen.pixels, origin=seen.origin, halo=seen.halo)
-        likeness = self.spots.at(factor[0]).mix(self.division)
-        likeness = likeness[None].unflatten(2, (tile.inner.shape[-2], tile.inner.shape[-1]))
-        return self.dye(tile.inner, likeness, self.marked.planes(tile))
+        features = self.kernel.features(seen.pixels, origin=seen.origin, halo=seen.halo)
+        # Row after row: the rounding of a product depends on its shape, which must not depend on that of the tile.
+        rows = [self.likeness(row) for row in features.split(tile.inner.shape[-1], dim=2)]
+        return self.dye(tile.inner, torch.stack(rows, dim=1)[None], self.marked.planes(tile))
+
+    def likeness(self, features: Tensor) -> Tensor:
+        """How much pixels with features (1, D, n) resemble each region, (K', n)."""
+        kernel = self.kernel
+        factor, _ = nystrom_factor(features, kernel.landmarks, kernel.whitening, kernel.completion)
+        return self.division @ unit_vectors(self.basis, factor[0])
 
 
 @torch.no_grad()
@@ -99,14 +107,14 @@ def fit_dye(
     found = gather(
         picture, guide, kernel, marked.places, marked.weights, lambda colours: split_luminance(colours)[1], report
     )
-    core = walk_core(pairs, reach)[0].to(picture.dtype)
-    spots = _find_spots(found, marked, kernel, core, picture.size)
+    basis = walk_basis(pairs, reach)[0].to(picture.dtype)
+    spots = _find_spots(found, marked, kernel, basis, picture.size)
     sums, weights = spot_sums(found.image[0], marked.weights, marked.regions, marked.count)  # of the chroma, (K', 3)
     old = (sums / weights)[: len(marked.colours)]
-    return FittedDye(guide, kernel, marked, spots, divide(spots), Dye(marked.colours[None], old[None]))
+    return FittedDye(guide, kernel, marked, basis, divide(spots) @ spots.means, Dye(marked.colours[None], old[None]))
 
 
-def _find_spots(found: Sample, marked: Marked, kernel: Kernel, core: Tensor, size: tuple[int, int]) -> Spots:
+def _find_spots(found: Sample, marked: Marked, kernel: Kernel, basis: Tensor, size: tuple[int, int]) -> Spots:
     """The spots of the marked pixels, compared with no pixel yet."""
     order = (marked.regions * (size[0] * size[1]) + marked.places).argsort()
     numbers, owners = label_spots(marked.places[order], marked.regions[order], size)
@@ -114,6 +122,6 @@ def _find_spots(found: Sample, marked: Marked, kernel: Kernel, core: Tensor, siz
     sums, weights, done = torch.zeros(()), torch.zeros(()), 0
     for block in found.blocks(kernel):
         part = numbers[done : done + block.weights.shape[1]]
-        more = spot_sums(unit_columns(core, block.factor[0]), block.weights[0], part, len(owners))
+        more = spot_sums(unit_vectors(basis, block.factor[0]), block.weights[0], part, len(owners))
         sums, weights, done = sums + more[0], weights + more[1], done + len(part)
-    return Spots.of_means(sums / weights, F.one_hot(owners, marked.count).to(core), core, core[:, :0])
+    return Spots.of_means(sums / weights, F.one_hot(owners, marked.count).to(basis), basis[:, :0])

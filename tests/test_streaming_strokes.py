@@ -1,0 +1,352 @@
+"""Strokes on pictures that are read by rows: what they make of one in memory, whatever the tiles, and named errors."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import skimage.data
+import tifffile
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from nlfilter_torch import colorize, recolor
+from nlfilter_torch.cli import main
+from nlfilter_torch.edits.chroma import split_luminance
+from nlfilter_torch.files import read_photograph
+from nlfilter_torch.streaming import sampling, stream_colorize, stream_recolor
+from nlfilter_torch.streaming.painted import read_strokes
+from nlfilter_torch.streaming.rows import Picture
+from tests.test_streaming import LEVEL, Rows, Shrinking, cat
+
+Array = NDArray[Any]
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples and blocks in proportion to a small picture."""
+    monkeypatch.setattr(sampling, "PILOT", 2000)
+    monkeypatch.setattr(sampling, "CHUNK", 300)
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 2500)
+
+
+def paint(height: int, width: int) -> tuple[Array, Array, Array]:
+    """Strokes (H, W, 3) of three colours, two spots of one of them, their mask (H, W, 1), and what is kept (H, W)."""
+    strokes, mask = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 1), np.float32)
+    for top, left, colour, weight in (
+        (0.25, 0.25, (0, 0, 1), 1.0),
+        (0.7, 0.6, (1, 0, 0), 0.7),
+        (0.1, 0.8, (0, 0.7, 0.2), 1.0),
+        (0.8, 0.1, (0, 0, 1), 1.0),
+    ):
+        rows, columns = slice(int(top * height), int(top * height) + 8), slice(int(left * width), int(left * width) + 9)
+        strokes[rows, columns], mask[rows, columns] = colour, weight
+    keep = np.zeros((height, width), np.float32)
+    keep[int(0.22 * height) : int(0.3 * height), int(0.3 * width) : int(0.5 * width)] = 0.8
+    return strokes, mask, keep
+
+
+def planes(rows: Array) -> torch.Tensor:
+    """(1, C, H, W)."""
+    return torch.from_numpy(np.atleast_3d(rows)).permute(2, 0, 1)[None]
+
+
+def rows_of(image: torch.Tensor) -> Array:
+    return image[0].permute(1, 2, 0).numpy()
+
+
+def grey(picture: Array) -> Array:
+    """(H, W)."""
+    return split_luminance(planes(picture))[0][0, 0].numpy()
+
+
+def recoloured(picture: Array, *painted: Array, **options: Any) -> Array:
+    edited = np.empty_like(picture)
+    stream_recolor(picture, edited, *painted, num_landmarks=options.pop("num_landmarks", 50), **options)
+    return edited
+
+
+def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) -> Array:
+    edited = np.empty((*picture.shape[:2], 3), kind or picture.dtype)
+    stream_colorize(picture, edited, *painted, num_landmarks=options.pop("num_landmarks", 50), **options)
+    return edited
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [
+        ({}, False),
+        ({"reach": 0.5, "patch_size": 5}, True),
+        ({"spatial_bandwidth": 60.0, "photometric_bandwidth": 0.2}, True),
+        ({"landmarks": "uniform"}, False),
+    ],
+)
+def test_full_passes_recolour_as_in_memory(options: dict[str, Any], kept: bool, dtype: Any) -> None:
+    picture = cat(83, 121).astype(dtype)
+    strokes, mask, keep = paint(83, 121)
+    held = {"keep": planes(keep.astype(dtype))} if kept else {}
+    whole = recolor(
+        planes(picture),
+        planes(strokes.astype(dtype)),
+        planes(mask.astype(dtype)),
+        num_landmarks=50,
+        tolerance=1e-6 if dtype == np.float32 else None,
+        **held,
+        **options,
+    )
+    given = {"keep": keep} if kept else {}
+    edited = recoloured(picture, strokes, mask, statistics="full", tile_rows=17, **given, **options)
+    assert np.abs(rows_of(whole) - picture).max() > 0.1
+    # Whitening multiplies the rounding of affinities by up to 316; in 32 bits that shows, in 64 it does not.
+    assert np.abs(edited - rows_of(whole)).max() < (2e-5 if dtype == np.float32 else 1e-8)
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "options", [{}, {"strength": 0.3, "patch_size": 3}, {"patch_size": 1, "spatial_bandwidth": 30.0}]
+)
+def test_full_passes_colourise_as_in_memory(options: dict[str, Any], dtype: Any) -> None:
+    picture = grey(cat(83, 121)).astype(dtype)
+    strokes, mask, _ = paint(83, 121)
+
+    def seeded() -> torch.Generator:
+        return torch.Generator().manual_seed(3)
+
+    painted = (planes(strokes.astype(dtype)), planes(mask.astype(dtype)))
+    whole = colorize(planes(picture), *painted, num_landmarks=50, generator=seeded(), **options)
+    edited = coloured(picture, strokes, mask, statistics="full", tile_rows=17, generator=seeded(), **options)
+    assert np.ptp(edited, axis=2).max() > 0.1
+    assert np.abs(edited - rows_of(whole)).max() < (1e-5 if dtype == np.float32 else 1e-7)
+
+
+def test_a_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "PILOT", 1 << 14)
+    picture = cat(270, 350)
+    strokes, mask, keep = paint(270, 350)
+    whole = recolor(planes(picture), planes(strokes), planes(mask), keep=planes(keep), num_landmarks=50)
+    edited = recoloured(picture, strokes, mask, keep=keep, sample=1 << 16)
+    assert 1e-5 < np.abs(edited - rows_of(whole)).max() < LEVEL
+    whole = colorize(planes(grey(picture)), planes(strokes), planes(mask), num_landmarks=50)
+    edited = coloured(picture, strokes, mask, sample=1 << 16)
+    assert 1e-5 < np.abs(edited - rows_of(whole)).max() < LEVEL
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("statistics", ["sample", "full"])
+def test_tiles_of_any_size_give_the_same(statistics: Any) -> None:
+    picture = cat(150, 67)
+    strokes, mask, keep = paint(150, 67)
+    settings = {"statistics": statistics, "sample": 4000}
+    first, *others = (
+        (
+            recoloured(picture, strokes, mask, keep=keep, tile_rows=rows, **settings),
+            coloured(grey(picture), strokes, mask, tile_rows=rows, **settings),
+        )
+        for rows in (1, 16, 64, 4096)
+    )
+    for other in others:
+        assert max(np.abs(one - two).max() for one, two in zip(first, other, strict=True)) < 1e-6
+
+
+def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 600)
+    picture = cat(90, 60)
+    painted = paint(90, 60)
+    settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30}
+    source, *paints = (Rows(rows, most=10 + 4) for rows in (picture, *painted))
+    edited = np.empty_like(picture)
+    stream_recolor(source, edited, paints[0], paints[1], keep=paints[2], **settings)
+    np.testing.assert_array_equal(edited, recoloured(picture, *painted[:2], keep=painted[2], **settings))
+    assert paints[0].read < 60  # where there is paint
+    assert paints[1].read == paints[2].read == 90  # once
+    stream_colorize(source, edited, paints[0], paints[1], **settings)
+    np.testing.assert_array_equal(edited, coloured(picture, *painted[:2], **settings))
+
+
+def test_strokes_may_be_integers_with_transparency() -> None:
+    picture, (strokes, mask, keep) = cat(50, 60), paint(50, 60)
+    layer = np.concatenate([np.rint(strokes * 255), np.rint(mask * 255)], axis=2).astype(np.uint8)
+    opaque = layer[..., 3:] / np.float32(255)
+    for edit in (recoloured, coloured):
+        one = edit(picture, layer)
+        np.testing.assert_array_equal(one, edit(picture, layer[..., :3], opaque))
+        np.testing.assert_array_equal(one, edit(picture, layer[..., :3] / np.float32(255), layer[..., 3]))
+    np.testing.assert_array_equal(
+        recoloured(picture, layer, keep=keep > 0), recoloured(picture, layer, keep=np.ceil(keep))
+    )
+
+
+def test_nothing_is_kept_by_an_empty_mask() -> None:
+    picture, (strokes, mask, keep) = cat(50, 60), paint(50, 60)
+    none = recoloured(picture, strokes, mask, keep=0 * keep)
+    np.testing.assert_allclose(none, recoloured(picture, strokes, mask), atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_transparency_and_depth_are_kept(channels: int) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (40, 50, channels), np.uint8)
+    strokes, mask, _ = paint(40, 50)
+    edited = np.empty((40, 50, 3 + (channels in (2, 4))), np.uint16)
+    stream_colorize(picture, edited, strokes, mask, num_landmarks=20)
+    if channels in (2, 4):
+        np.testing.assert_array_equal(edited[..., 3], picture[..., -1].astype(np.uint16) * 257)
+    if channels > 2:
+        again = np.empty_like(picture)
+        stream_recolor(picture, again, strokes, mask, num_landmarks=20)
+        np.testing.assert_array_equal(again[..., 3:], picture[..., 3:])
+
+
+def test_report_tells_every_stage() -> None:
+    seen: list[str] = []
+    picture, (strokes, mask, _) = cat(40, 60), paint(40, 60)
+    recoloured(picture, strokes, mask, sample=1000, num_landmarks=20, report=lambda *step: seen.append(step[0]))
+    stages = ["Reading strokes", "Looking", "Sampling", "Balancing", "Summing up", "Comparing strokes", "Filtering"]
+    assert list(dict.fromkeys(seen)) == stages
+
+
+def test_painted_pixels_need_memory() -> None:
+    picture, (strokes, mask, _) = cat(90, 120), paint(90, 120)
+    with pytest.raises(MemoryError, match=r"the strokes on source cover \d+ pixels or more .* paint less"):
+        read_strokes(Picture(picture), strokes, 0 * mask + 1, memory=500_000, report=lambda *_: None)
+    for edit in (recoloured, coloured):
+        with pytest.raises(MemoryError, match="the strokes on source cover"):
+            edit(picture, strokes, 0 * mask + 1, memory=3_000_000, num_landmarks=5)
+        with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least"):
+            edit(picture, strokes, mask, memory=1_000_000)
+
+
+@pytest.mark.parametrize("edit", [recoloured, coloured])
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (lambda s, m: (s[1:], m), {}, "strokes must have the height and width of source, 40x50, got 39x50; resize"),
+        (lambda s, m: (s, m[:, 1:]), {}, "stroke_mask must have the height and width of source, 40x50, got 40x49"),
+        (lambda s, m: (s, 0 * m), {}, "stroke_mask must hold a painted pixel, got none; paint at least one"),
+        (lambda s, m: (np.concatenate([s, 0 * m], axis=2),), {}, "strokes must hold a painted pixel, got none"),
+        (lambda s, m: (s, 2 * m), {}, r"stroke_mask must be in \[0, 1\], got values from 0 to 2; clamp or scale it"),
+        (lambda s, m: (s, -m), {}, r"stroke_mask must be in \[0, 1\], got values from -1 to"),
+        (lambda s, m: (s, np.where(m > 0, np.nan, m)), {}, "stroke_mask holds NaN or infinite pixels"),
+        (lambda s, m: (np.where(m > 0, np.nan, s), m), {}, "strokes holds NaN or infinite pixels"),
+        (
+            lambda s, m: (s,),
+            {},
+            "strokes must have 3 channels and a stroke_mask, or 4 channels and none, got 3 without",
+        ),
+        (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 with one; add or drop it"),
+        (lambda s, m: (s, s), {}, "stroke_mask must have 1 channel, got 3"),
+        (lambda s, m: (Shrinking(s, most=100, read=50), m), {}, "strokes must keep its size while it is read"),
+        (lambda s, m: (s, m), {"statistics": "some"}, "statistics must be one of"),
+        (lambda s, m: (s, m), {"sample": 0}, "sample must be at least 1"),
+        (lambda s, m: (s, m), {"tile_rows": 0}, "tile_rows must be at least 1"),
+        (lambda s, m: (s, m), {"patch_size": 4}, "patch_size must be odd"),
+        (lambda s, m: (s, m), {"num_landmarks": 0}, "num_landmarks must be at least 1"),
+        (lambda s, m: (s, m), {"photometric_bandwidth": 0.0}, "photometric_bandwidth must be positive"),
+        (lambda s, m: (s, m), {"spatial_bandwidth": 0.0}, "spatial_bandwidth must be positive"),
+    ],
+)
+def test_what_cannot_be_used_is_named(edit: Any, change: Any, options: dict[str, Any], message: str) -> None:
+    strokes, mask, _ = paint(40, 50)
+    with pytest.raises(ValueError, match=message):
+        edit(cat(40, 50), *change(strokes, mask), **options)
+
+
+def test_what_only_one_of_them_takes_is_named() -> None:
+    picture, (strokes, mask, keep) = cat(40, 50), paint(40, 50)
+    with pytest.raises(ValueError, match="source must have 3 or 4 channels to be recoloured, got 1"):
+        recoloured(grey(picture), strokes, mask)
+    with pytest.raises(ValueError, match="keep must have the height and width of source"):
+        recoloured(picture, strokes, mask, keep=keep[1:])
+    with pytest.raises(ValueError, match=r"reach must be in \[0, 1\), got 1"):
+        recoloured(picture, strokes, mask, reach=1.0)
+    with pytest.raises(ValueError, match="target must have the shape of the source"):
+        stream_recolor(picture, grey(picture), strokes, mask)
+    with pytest.raises(ValueError, match=r"strength must be in \[0, 1\]"):
+        coloured(picture, strokes, mask, strength=2.0)
+    with pytest.raises(ValueError, match="method must be regression where a picture is worked out by rows, got kmeans"):
+        coloured(picture, strokes, mask, method="kmeans")
+    with pytest.raises(ValueError, match="target must have the height and width of the source, three colours"):
+        stream_colorize(picture, grey(picture), strokes, mask)
+    with pytest.raises(ValueError, match="dtype of the target must be one of"):
+        coloured(picture, strokes, mask, kind=np.int64)
+
+
+def test_a_source_that_changes_its_size_is_named() -> None:
+    strokes, mask, _ = paint(40, 30)
+    for edit in (stream_recolor, stream_colorize):
+        source = Shrinking(cat(40, 30), most=100)
+        with pytest.raises(ValueError, match="source must keep its size while it is read, 40 rows of 30"):
+            edit(source, np.empty_like(source.picture), strokes, mask, num_landmarks=20, tile_rows=10)
+
+
+# --- the command line
+
+LITTLE = "0.012"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+
+
+@pytest.fixture
+def photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file of 16 bits, 180x150, beside strokes over it in two files, and a copy in grey."""
+    monkeypatch.setattr(sampling, "PILOT", 8000)
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 6000)
+    picture = skimage.data.chelsea()[20:170, 90:270].astype(np.uint16) * 257
+    tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb", tile=(64, 64), compression="zlib")
+    tifffile.imwrite(tmp_path / "grey.tif", picture[..., 1], photometric="minisblack")
+    layer = np.zeros((150, 180, 4), np.uint8)
+    layer[60:70, 40:50], layer[110:120, 100:120] = (0, 0, 255, 255), (255, 0, 0, 255)
+    Image.fromarray(layer).save(tmp_path / "paint.png")
+    tifffile.imwrite(tmp_path / "paint.tif", layer, photometric="rgb", extrasamples=["unassalpha"], tile=(64, 64))
+    return tmp_path / "in.tif"
+
+
+def run(verb: str, *arguments: object) -> int:
+    return main([verb, *map(str, arguments), "--landmarks", "40"])
+
+
+@pytest.mark.parametrize(
+    ("verb", "source", "options"),
+    [
+        ("recolor", "in.tif", ("--strokes", "paint.tif", "--keep", "5,5,20,20", "--reach", "0.6")),
+        ("recolor", "in.tif", ("--strokes", "paint.png", "--region", "100,20,9,9:#14a028", "--depth", "8")),
+        ("colorize", "grey.tif", ("--strokes", "paint.tif", "--strength", "0.8")),
+        ("colorize", "in.tif", ("--region", "40,60,10,10:blue", "--region", "100,110,20,10:red", "--seed", "3")),
+    ],
+)
+def test_by_rows_as_whole(photo: Path, verb: str, source: str, options: tuple[str, ...]) -> None:
+    folder = photo.parent
+    options = tuple(str(folder / word) if word.startswith("paint") else word for word in options)
+    for name, more in (("whole.tif", ()), ("rows.tif", ("--memory", LITTLE, "--full"))):
+        assert run(verb, folder / source, folder / name, *options, *more) == 0
+    with tifffile.TiffFile(folder / "rows.tif") as file:
+        assert file.pages.first.is_tiled  # what is written by rows is
+    one, other = (read_photograph(folder / name) for name in ("whole.tif", "rows.tif"))
+    assert one.depth == other.depth
+    assert (one.pixels - read_photograph(folder / source).pixels).abs().max() > 0.1
+    assert (one.pixels - other.pixels).abs().max() < (1.1 / 255 if "8" in options else 1e-4)
+
+
+def test_what_cannot_be_done_by_rows_leaves_nothing(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = photo.parent
+    layer = Image.open(folder / "paint.png")
+    layer.crop((0, 0, 180, 149)).save(folder / "small.png")
+    layer.convert("RGB").save(folder / "opaque.png")
+    Image.new("RGBA", layer.size).save(folder / "clear.png")
+    files = set(folder.iterdir())
+    for verb, source, options, sentence in (
+        ("colorize", "in.tif", ("--strokes", folder / "paint.png", "--method", "kmeans"), "method must be regression"),
+        ("recolor", "grey.tif", ("--strokes", folder / "paint.png"), "recolor needs a colour photograph, got a grey"),
+        ("recolor", "in.tif", (), "give --strokes FILE or --region"),
+        ("recolor", "in.tif", ("--strokes", folder / "small.png"), "small.png must be as large as the photograph"),
+        ("recolor", "in.tif", ("--strokes", folder / "opaque.png"), "opaque.png has no transparency"),
+        ("colorize", "in.tif", ("--strokes", folder / "clear.png"), "clear.png must hold a painted pixel, got none"),
+        ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H alone"),
+        ("colorize", "in.tif", ("--region", "1,2,5,4"), "--region must end in a colour"),
+    ):
+        assert run(verb, folder / source, folder / "out.tif", *options, "--memory", LITTLE) == 2
+        assert sentence in capsys.readouterr().err
+    assert run("recolor", photo, folder / "out.tif", "--region", "1,2,5,4:red", "--memory", "0") == 2
+    assert "--memory must be a positive number" in capsys.readouterr().err
+    assert set(folder.iterdir()) == files
