@@ -45,7 +45,9 @@ class Recipe:
     @property
     def factors(self) -> int:
         """Arrays as large as a factor that the hungriest step holds at once."""
-        return 3 if self.defocus.changes() else 2 if self.detail.has_region() or self.colorize.changes() else 1
+        if self.defocus.changes() or self.recolor.changes():
+            return 3
+        return 2 if self.detail.has_region() or self.colorize.changes() else 1
 
     def apply(self, image: Tensor) -> Tensor:
         """Edit a photograph.
