@@ -6,8 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.sharding import Shard, reduce_sum
-
 # A block of affinities is M x CACHED floats; at M = 100 that is 1.6 MB, which the shared cache of a core holds together
 # with its whitened copy. A sweep writes only vectors, so its blocks may be longer, and cost fewer calls.
 CACHED = 4096
@@ -52,24 +50,3 @@ def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Te
         if not storage or length != storage[0].shape[2]:
             storage = [factor.new_empty(batch, marks, length) for _ in range(count)]
         yield block, storage
-
-
-def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor:
-    """``factor @ images^T``, the sum over all pixels to which W reduces them; gathered in float64.
-
-    In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
-
-    Args:
-        factor: (B, M, N).
-        images: (B, C, N).
-        shard: of the image, where other ranks have the rest of it.
-
-    Returns:
-        (B, M, C) in float64. Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
-    """
-    batch, marks, _ = factor.shape
-    step = block_length(batch, factor.device, SWEPT)
-    total = factor.new_zeros(batch, marks, images.shape[1], dtype=torch.float64)
-    for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
-        total = total + rows @ part.mT
-    return reduce_sum(total, shard)

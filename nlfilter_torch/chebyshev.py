@@ -10,9 +10,10 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import SWEPT, moment, pixel_blocks
+from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.newton import SMALLEST_AFFINITY, STALL
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
+from nlfilter_torch.thin import gather, moment, spread
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
@@ -34,7 +35,7 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
 def _start(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
     total = moment(factor, torch.ones_like(diagonal).unsqueeze(1), shard).to(factor)
-    return ((total.mT @ factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
+    return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
 
 
 def solve(
@@ -52,12 +53,12 @@ def solve(
         # One read of the factor: a block gives its row sums, takes its update and adds to the next moment while cached.
         for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
             rows, d = factor[:, :, block], scaling[:, block]
-            sums = d * ((current @ rows).squeeze(1) + diagonal[:, block] * d)  # row sums of W
+            sums = d * (spread(current, rows).squeeze(1) + diagonal[:, block] * d)  # row sums of W
             residual = torch.maximum(residual, (sums - 1).abs().amax(1))
             # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
             step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
             torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
-            next_total += rows @ following[:, block].unsqueeze(2)
+            next_total += gather(following[:, None, block], rows).mT
         residual, next_total = reduce_max(residual, shard), reduce_sum(next_total, shard)
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import check_count, check_image, check_same_size
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
@@ -21,6 +20,7 @@ from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.precision import full_precision
+from nlfilter_torch.thin import moment, spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +105,9 @@ class FittedFilter:
         size = (image.shape[-2], image.shape[-1])
         smoothed = [image.to(factor).flatten(2)]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
-            smoothed.append(scaling * (coefficients.mT @ factor) + remainder * smoothed[-1])
+            smoothed.append(scaling * spread(coefficients.mT, factor) + remainder * smoothed[-1])
         layers = layers_between(torch.stack(smoothed, dim=1)).unflatten(-1, size)  # (B, k+1, C, h, W)
-        explained = (scaling * (self.explained.to(factor).mT @ factor)).unflatten(-1, size)
+        explained = (scaling * spread(self.explained.to(factor).mT, factor)).unflatten(-1, size)
         return layers, explained
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
+from nlfilter_torch.thin import gather, spread
 
 PER_LANDMARK = (32, 160)  # pixels of the sample, least and most: its Jacobian is then within 18 or 8 % of the true one
 EXPLORED = 8192  # pixels that the first guess comes from, at most
@@ -35,10 +36,10 @@ STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it hav
 def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
     """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
 
-    A pixel's equation is ``d (u . total + diagonal d) = 1``, so d is the positive root of a quadratic.
+    A pixel's equation is ``d (u . total + diagonal d) = 1``, so 1/d is the positive root of a quadratic.
     """
-    affinity = (total.mT @ factor).squeeze(1).clamp_(min=SMALLEST_AFFINITY)
-    return 2 / (affinity + torch.sqrt(affinity.square() + 4 * diagonal))
+    half = spread((total / 2).mT, factor).squeeze(1).clamp_(min=SMALLEST_AFFINITY)
+    return (torch.addcmul(diagonal, half, half).sqrt() + half).reciprocal()
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Sample:
 
     def moment(self, scaling: Tensor) -> Tensor:
         """The sample's estimate of ``factor @ d``, (B, M, 1) in float64."""
-        return reduce_sum((self.factor @ (self.weight * scaling).unsqueeze(2)).double(), self.shard)
+        return reduce_sum(gather((self.weight * scaling).unsqueeze(1), self.factor).mT.double(), self.shard)
 
     def jacobian(self, scaling: Tensor) -> Tensor:
         """J, (B, M, M) in float64."""
@@ -79,7 +80,7 @@ class Sample:
 
 def row_residual(factor: Tensor, scaling: Tensor, error: Tensor, shard: Shard | None = None) -> Tensor:
     """Largest ``|d u . error|``, (B,): what row sums lack where d is the root for a total that is off by ``error``."""
-    return reduce_max((scaling * (error.to(factor).mT @ factor).squeeze(1)).abs().amax(1), shard)
+    return reduce_max((scaling * spread(error.to(factor).mT, factor).squeeze(1)).abs().amax(1), shard)
 
 
 def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None) -> tuple[Sample, Tensor]:
@@ -92,12 +93,8 @@ def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: 
     ticks = (torch.arange(count, dtype=torch.float64, device=factor.device) + 0.5) / count
     chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
-    return Sample(_columns(factor, chosen), diagonal.gather(1, chosen), weight, shard), scaling.gather(1, chosen)
-
-
-def _columns(factor: Tensor, chosen: Tensor) -> Tensor:
-    """Columns ``chosen`` (B, n) of the factor, (B, M, n)."""
-    return torch.stack([columns.index_select(1, picked) for columns, picked in zip(factor, chosen, strict=True)])
+    columns = factor.gather(2, chosen.unsqueeze(1).expand(-1, factor.shape[1], -1))
+    return Sample(columns, diagonal.gather(1, chosen), weight, shard), scaling.gather(1, chosen)
 
 
 def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
@@ -110,7 +107,7 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
         chosen = (steps.frac() * pixels).long().sort().values
         few, rest = factor.index_select(2, chosen), diagonal[:, chosen]
     sample = Sample(few, rest, torch.full_like(rest, pixels / few.shape[2]), shard)
-    sums = (sample.moment(torch.ones_like(rest)).to(few).mT @ few).squeeze(1) + rest
+    sums = spread(sample.moment(torch.ones_like(rest)).to(few).mT, few).squeeze(1) + rest
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):
         total = (total + sample.moment(sample.scaling(total))) / 2
@@ -124,7 +121,7 @@ def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
         torch.clamp(scaling_from_moment(columns, diagonal[:, block], row), max=LARGEST, out=scaling[:, block])
-        found += columns @ scaling[:, block].unsqueeze(2)
+        found += gather(scaling[:, None, block], columns).mT
     return scaling, reduce_sum(found, shard)
 
 

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.bandwidth import bandwidth_of_rows
-from nlfilter_torch.blocks import moment
 from nlfilter_torch.checks import (
     check_bandwidth,
     check_choice,
@@ -27,6 +26,7 @@ from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
 from nlfilter_torch.sharding import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import Spectrum, compute_spectrum
+from nlfilter_torch.thin import moment, spread
 
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
 
@@ -166,7 +166,7 @@ class NonlocalOperator:
         flat = vectors.flatten(2)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
         total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1), self.shard).to(self.factor)
-        kernel_sums = (total.mT @ self.factor).squeeze(1) + self.diagonal
+        kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
         bandwidth = torch.as_tensor(self.kernel.photometric_bandwidth).reshape(-1).expand(self.factor.shape[0])
         share = (self.scaling * (self.scaling * self.diagonal)).sum(1)
         return Diagnostics(

@@ -5,9 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import moment
 from nlfilter_torch.differentiation import once_differentiable, outer_product
 from nlfilter_torch.sharding import Shard
+from nlfilter_torch.thin import moment, spread
 
 
 def apply_powers(
@@ -41,7 +41,7 @@ def _powers(
     images, moments = [image], []
     for _ in range(order):
         moments.append(moment(factor, scaling * images[-1], shard).to(factor))
-        images.append(scaling * (moments[-1].mT @ factor) + remainder * images[-1])
+        images.append(scaling * spread(moments[-1].mT, factor) + remainder * images[-1])
     return images, moments
 
 
@@ -100,9 +100,9 @@ class _Powers(torch.autograd.Function):
             adjoint = adjoint + grad[:, i - 1]
             before = images[i - 1]
             total = moment(factor, d * adjoint, ctx.shard).to(factor)
-            affinity = total.mT @ factor  # the image of the adjoint, before scaling
+            affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
             # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
-            grad_scaling += (adjoint * (moments[i - 1].mT @ factor) + before * affinity).sum(1)
+            grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + before * affinity).sum(1)
             grad_remainder += (adjoint * before).sum(1)
             left += [moments[i - 1], total]
             right += [d * adjoint, d * before]

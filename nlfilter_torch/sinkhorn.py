@@ -15,6 +15,7 @@ from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
 from nlfilter_torch.sharding import Shard, reduce_sum
+from nlfilter_torch.thin import gather, spread
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = 1e-3  # a residual that balancing ends above is worth a warning
@@ -99,7 +100,7 @@ class _Balance(torch.autograd.Function):
         weight = scaling.square() * share
         right = _weighted_moment(factor, scaling.square() * share * grad, ctx.shard)
         solution = _conjugate_gradients(factor, weight, right, inverse, ctx.shard)
-        affinity = (solution.to(factor).mT @ factor).squeeze(1)
+        affinity = spread(solution.to(factor).mT, factor).squeeze(1)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(factor)  # (B, M, 2)
         return outer_product(totals, torch.stack([-a, -scaling], dim=1)), -a * scaling, None, None, None
@@ -112,8 +113,8 @@ def _weighted_moment(factor: Tensor, weighted: Tensor, shard: Shard | None, tota
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns, part = factor[:, :, block], weighted[:, block]
         if row is not None:
-            part = part * (row @ columns).squeeze(1)
-        found += columns @ part.unsqueeze(2)
+            part = part * spread(row, columns).squeeze(1)
+        found += gather(part.unsqueeze(1), columns).mT
     return reduce_sum(found, shard)
 
 

@@ -14,10 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import buffered_blocks, moment
+from nlfilter_torch.blocks import buffered_blocks
 from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.sharding import Shard, reduce_sum
+from nlfilter_torch.thin import moment, spread
 
 # Directions of G below this are rounding: float32 eigenvectors from above it are orthonormal to 1e-3.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -121,7 +122,7 @@ class Spectrum(RitzPairs):
         """``V f(S) V^T y`` for images (B, C, N): one read of the factor for the coefficients, one for the result."""
         scaling = self.scaling.unsqueeze(1)
         total = moment(self.factor, scaling * image, self.shard)  # (B, M, C), float64
-        return scaling * ((self.gain(response) @ total).mT.to(self.factor) @ self.factor)
+        return scaling * spread((self.gain(response) @ total).mT.to(self.factor), self.factor)
 
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""

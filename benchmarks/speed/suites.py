@@ -19,7 +19,7 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.blocks import moment
+from nlfilter_torch.thin import moment
 
 
 def filter_calls(case: Case, *, backward: bool) -> dict[str, Call]:

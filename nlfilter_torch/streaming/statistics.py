@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import moment, pixel_blocks
+from nlfilter_torch.blocks import pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.newton import LARGEST, scaling_from_moment
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import whiten_gram
+from nlfilter_torch.thin import moment
 
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
 MAX_PASSES = 12

@@ -1,0 +1,69 @@
+"""Products of a factor with a few rows: what filters, balancing and gradients spend their time in.
+
+They read the factor once and compute next to nothing, so that memory is their limit. BLAS libraries do not reach it:
+MKL multiplies a matrix with one vector on a single core, and with a few by a routine made for many. As a batch of parts
+the same products run on all cores.
+"""
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks
+from nlfilter_torch.sharding import Shard, reduce_sum
+
+FEW = 3  # rows that are quicker together than one by one, and than more
+MOST_SPREAD = 9  # rows; from there on undivided products are no slower
+MOST_GATHERED = 24
+
+
+def spread(rows: Tensor, factor: Tensor) -> Tensor:
+    """``rows @ factor``, (B, R, N), of rows (B, R, M) and a factor (B, M, N)."""
+    if rows.shape[1] > MOST_SPREAD or not _is_parted(rows, factor):
+        return rows @ factor
+    result = factor.new_empty(1, rows.shape[1], factor.shape[2])
+    for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT):
+        parts = _parts(factor[:, :, block])  # (P, M, n / P)
+        for first in range(0, rows.shape[1], FEW):  # the block is in the cache after the first few
+            few = slice(first, first + FEW)
+            result[0, few, block] = torch.bmm(rows[:, few].expand(len(parts), -1, -1), parts).transpose(0, 1).flatten(1)
+    return result
+
+
+def gather(images: Tensor, factor: Tensor) -> Tensor:
+    """``images @ factor^T``, (B, R, M), of images (B, R, N) and a factor (B, M, N)."""
+    if images.shape[1] > MOST_GATHERED or not _is_parted(images, factor):
+        return images @ factor.mT
+    return torch.bmm(_parts(images), _parts(factor).mT).sum(0, keepdim=True)
+
+
+def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor:
+    """``factor @ images^T``, the sum over all pixels to which W reduces them; gathered in float64.
+
+    In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
+
+    Args:
+        factor: (B, M, N).
+        images: (B, C, N).
+        shard: of the image, where other ranks have the rest of it.
+
+    Returns:
+        (B, M, C) in float64. Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
+    """
+    batch, marks, _ = factor.shape
+    step = block_length(batch, factor.device, SWEPT)
+    total = factor.new_zeros(batch, marks, images.shape[1], dtype=torch.float64)
+    for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
+        total = total + gather(part, rows).mT
+    return reduce_sum(total, shard)
+
+
+def _is_parted(thin: Tensor, factor: Tensor) -> bool:
+    """Whether parts pay: for one image on a processor. Autograd would keep every part, and has one product instead."""
+    recorded = torch.is_grad_enabled() and (thin.requires_grad or factor.requires_grad)
+    return factor.device.type == "cpu" and len(factor) == len(thin) == 1 and not recorded
+
+
+def _parts(planes: Tensor) -> Tensor:
+    """Planes (1, R, n) as (P, R, n / P), a part for each core or more, where n can be divided so."""
+    count = 1 << (torch.get_num_threads() - 1).bit_length()
+    return planes[0].unflatten(1, (count if planes.shape[2] % count == 0 else 1, -1)).transpose(0, 1)
