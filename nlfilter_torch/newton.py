@@ -24,6 +24,7 @@ PER_LANDMARK = (32, 160)  # pixels of the sample, least and most: its Jacobian i
 EXPLORED = 8192  # pixels that the first guess comes from, at most
 SHARE = 8  # the part of the pixels that either is, between these bounds
 GUESSES = 3  # steps that it takes towards their fixed point; more gain nothing for the pixels that are not among them
+REFINEMENTS = 3  # steps of Newton's method on the sample; with two the inverse is that of a t still on its way
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly and on no period of the image
 LARGEST = 2.0  # K has a unit diagonal and its entries are not negative but for errors, so that no d exceeds 1
 SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
@@ -105,7 +106,7 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     if 2 * count < pixels:
         steps = torch.arange(count, dtype=torch.float64, device=factor.device) * GOLDEN
         chosen = (steps.frac() * pixels).long().sort().values
-        few, rest = factor.index_select(2, chosen), diagonal[:, chosen]
+        few, rest = factor.gather(2, chosen.expand(*factor.shape[:2], -1)), diagonal[:, chosen]
     sample = Sample(few, rest, torch.full_like(rest, pixels / few.shape[2]), shard)
     sums = spread(sample.moment(torch.ones_like(rest)).to(few).mT, few).squeeze(1) + rest
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
@@ -140,7 +141,7 @@ def solve(
             sample, part = _draw(factor, diagonal, scaling, count, shard)
             # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
             error = found - sample.moment(part)
-            for _ in range(2):
+            for _ in range(REFINEMENTS):
                 part = sample.scaling(total)
                 # J is positive definite; its Cholesky factor, unlike batched LU in MKL, withstands several threads.
                 inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(sample.jacobian(part)).L)

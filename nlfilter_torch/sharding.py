@@ -127,10 +127,10 @@ def from_first(tensor: Tensor, shard: Shard | None) -> Tensor:
 def gather_columns(features: Tensor, indices: Tensor, shard: Shard | None) -> Tensor:
     """Columns (B, D, S) of the features (B, D, N), wherever they are, by their pixels' indices in the whole image."""
     if shard is None:
-        return features[:, :, indices]
+        return features.index_select(2, indices)  # quicker than an index, there and back
     local = indices - shard.first * shard.width
     here = (local >= 0) & (local < features.shape[2])
-    columns = features[:, :, local.clamp(0, features.shape[2] - 1)]
+    columns = features.index_select(2, local.clamp(0, features.shape[2] - 1))
     return reduce_sum(torch.where(here, columns, torch.zeros_like(columns)), shard)
 
 
