@@ -111,6 +111,7 @@ def other_tables(results: Results) -> list[str]:
         ("batches", "A batch of crops and one image of as many pixels, taking turns"),
         ("dense", "Beside the dense filter, on an image that it can do"),
         ("autograd", "Beside the same filter in plain autograd"),
+        ("pauses", "In a loop, and after idle seconds"),
         ("imports", "Imports, one after the other in fresh processes"),
     ):
         rows = [
@@ -165,7 +166,9 @@ def explanation(results: Results) -> str:
         return ""
     floor = main["floor"]
     return (
-        "Times are medians of calls that take turns on the same image. The floor is what cannot be avoided: the matrix "
+        "Times are medians of calls that take turns on the same image, each after a call that does not count, as in a "
+        "loop over pictures; what it costs to come after idle seconds is measured apart. The floor is what cannot be "
+        "avoided: the matrix "
         f"products N x D x M and twice N x M x M ({seconds(floor['products'])} here) and {READS} reads of the factor "
         f"({seconds(floor['read'])} each), every part measured beside the rest in several ways of which the quickest "
         "counts; exponentials, features, landmarks and the memory for the factor are not in it. The other filters are "

@@ -18,7 +18,7 @@ from benchmarks.speed.plan import QUICK
 from benchmarks.speed.suites import SUITES
 from benchmarks.speed.timing import Timing, take_turns
 
-MEASURED = ("main", "growth", "batches", "pictures", "slow", "dense", "autograd", "landmarks", "dtypes")
+MEASURED = ("main", "growth", "batches", "pictures", "pauses", "slow", "dense", "autograd", "landmarks", "dtypes")
 
 
 @pytest.fixture(scope="module")

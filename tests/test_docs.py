@@ -172,7 +172,7 @@ def test_numbers_on_the_page_about_choosing(tmp_path: Path, capsys: pytest.Captu
     guide_pictures.main([str(tmp_path), "--only", "bandwidth"])
     printed = capsys.readouterr().out
     assert "bandwidth 4.0: beta 0.829" in printed
-    assert "bandwidth 16.8: beta 0.9996" in printed
+    assert "bandwidth 16.8: beta 0.9995" in printed
     assert [path.name for path in tmp_path.iterdir()] == ["bandwidth.jpg"]
 
 

@@ -35,6 +35,7 @@ class Plan:
         seconds: that a group of calls takes turns, after the least number of rounds.
         claimed_seconds: the same for the groups that the claims rest on.
         least: rounds.
+        pause: idle seconds before a call whose memory is to be fresh.
         processes: that measure what an import takes.
         probes: cases whose memory is measured.
         threads: counts; none is one, and all.
@@ -55,6 +56,7 @@ class Plan:
     seconds: float = 4.0
     claimed_seconds: float = 30.0
     least: int = 3
+    pause: float = 3.0
     processes: int = 7
     probes: int = 5
     threads: tuple[int, ...] = ()
@@ -81,6 +83,7 @@ QUICK = Plan(
     seconds=0.0,
     claimed_seconds=0.0,
     least=1,
+    pause=0.0,
     processes=1,
     probes=2,
 )

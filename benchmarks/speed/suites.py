@@ -10,7 +10,7 @@ from benchmarks.speed import peers
 from benchmarks.speed.cases import Case
 from benchmarks.speed.plan import Plan, Record, measured, record
 from benchmarks.speed.probe import ALPHA, peak_memory, training_step
-from benchmarks.speed.timing import Call, Timing, discard, take_turns
+from benchmarks.speed.timing import Call, Timing, after_pauses, discard, take_turns
 from nlfilter_torch import (
     NonlocalFilter,
     PolynomialSliders,
@@ -79,6 +79,16 @@ def main_case(plan: Plan) -> Iterator[Record]:
         steps=operator.balancing_steps,
         residual=operator.residual.max().item(),
     )
+
+
+def pauses(plan: Plan) -> Iterator[Record]:
+    """The main operator in a loop, and after idle seconds."""
+    case = plan.case()
+    call = discard(case.operator, case.image())
+    timings = take_turns({"operator, in a loop": call}, threads=case.used_threads, seconds=0.0, least=plan.least)
+    name = "operator, after a pause"
+    timings[name] = after_pauses(name, call, threads=case.used_threads, pause=plan.pause, count=plan.least)
+    yield record("pauses", case, timings)
 
 
 def slow_peers(plan: Plan) -> Iterator[Record]:
@@ -263,6 +273,7 @@ SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
     "batches": batches,
     "pictures": pictures,
     "memory": memory,
+    "pauses": pauses,
     "imports": imports,
     "slow": slow_peers,
     "dense": dense,

@@ -41,6 +41,9 @@ def take_turns(
 ) -> dict[str, Timing]:
     """Time several calls round after round, one sample of each per round.
 
+    Each sample comes after a call that is not counted, so that memory and caches are the call's own, as in a loop over
+    pictures. What it costs to come after something else is measured by :func:`after_pauses`.
+
     Args:
         calls: what to time, by name.
         threads: of torch.
@@ -57,10 +60,25 @@ def take_turns(
         start = time.perf_counter()
         for done in range(1, most + 1):
             for name, call in calls.items():
+                call()
                 samples[name].append(_sample(call, repeats[name]))
             if done >= least and time.perf_counter() - start >= seconds:
                 break
     return {name: _summary(name, samples[name], repeats[name], threads) for name in calls}
+
+
+def after_pauses(name: str, call: Call, *, threads: int, pause: float, count: int) -> Timing:
+    """Time ``count`` calls of which each follows ``pause`` idle seconds.
+
+    By then a virtual machine has given freed memory back to its host, and must ask for it again, page by page.
+    """
+    with set_torch_threads(threads):
+        call()
+        times = []
+        for _ in range(count):
+            time.sleep(pause)
+            times.append(_sample(call, 1))
+    return _summary(name, times, 1, threads)
 
 
 def _calls_per_sample(call: Call) -> int:
