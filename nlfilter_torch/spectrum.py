@@ -76,6 +76,9 @@ class Spectrum(RitzPairs):
     Attributes:
         eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
             gradient is exact, also where they meet.
+        ritz: T, (B, M, M), float64.
+        root: G^(-1/2), (B, M, M), float64.
+        support: (B, M) bool, which of the eigenvalues of T count.
         factor: (B, M, N), before scaling.
         scaling: d, (B, N).
         size: (H, W).

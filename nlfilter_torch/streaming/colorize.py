@@ -50,7 +50,7 @@ def stream_colorize(
     memory: int = 1 << 30,
     report: Report | None = None,
 ) -> None:
-    """Colour a picture of any size, as :func:`colorize` does one in memory.
+    """Colour a picture of any size, as :func:`~nlfilter_torch.colorize` does one in memory.
 
     What the strokes make of a pixel depends on the pixel's own patch and place only, once the sums over all pixels and
     over the painted ones are known: tiles have no seams, and their size makes no difference.
@@ -63,7 +63,8 @@ def stream_colorize(
         stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 where painted; None where the strokes have
             four channels.
         method: ``"regression"``; k-means takes all pixels at once.
-        strength: as of :func:`colorize`, and so are bandwidths, ``patch_size``, ``num_landmarks`` and ``generator``.
+        strength: as of :func:`~nlfilter_torch.colorize`, and so are bandwidths, ``patch_size``, ``num_landmarks`` and
+            ``generator``.
         photometric_bandwidth: in units of the image.
         spatial_bandwidth: in pixels; None is 0.5625 of the short side.
         patch_size: of the patches that are compared.

@@ -55,12 +55,12 @@ def stream_detail(
             carried along. Integers count from 0 to 1, whatever their range.
         target: what takes the rows, in their order, by assignment to a slice, with the source's shape and a dtype of
             its own.
-        alpha: sliders (k+1,), as of :func:`polynomial_filter`; with regions (K, k+1), a row for each, or (k+1,) for
-            all.
+        alpha: sliders (k+1,), as of :func:`~nlfilter_torch.polynomial_filter`; with regions (K, k+1), a row for each,
+            or (k+1,) for all.
         regions: rows (H, W, K), non-negative weights of the pixels of K regions: all that looks like them is edited,
-            as by :func:`enhance`. None edits the whole picture.
-        residual: as of :func:`polynomial_filter`; with it statistics are full, since what the eigenvectors explain
-            depends on pixels that no sample holds enough of.
+            as by :func:`~nlfilter_torch.enhance`. None edits the whole picture.
+        residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since what the
+            eigenvectors explain depends on pixels that no sample holds enough of.
         time: diffusion time of the masks that grow from the regions; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
@@ -71,7 +71,8 @@ def stream_detail(
         tile_rows: rows that are worked out at once; None is as many as ``memory`` has room for.
         memory: bytes that may be used, beside those of source and target.
         report: called with the name of a stage, how much of it is done, and how much there is to do.
-        **options: of :func:`nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are numbers.
+        **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are
+            numbers.
 
     Raises:
         TypeError, ValueError: if an argument does not fit, or the source changes its size meanwhile.

@@ -41,7 +41,7 @@ def stream_recolor(
     report: Report | None = None,
     **options: Any,
 ) -> None:
-    """Recolour a picture of any size, as :func:`recolor` does one in memory.
+    """Recolour a picture of any size, as :func:`~nlfilter_torch.recolor` does one in memory.
 
     What the strokes make of a pixel depends on the pixel's own patch only, once the sums over all pixels and over the
     painted ones are known: tiles have no seams, and their size makes no difference.
@@ -54,7 +54,7 @@ def stream_recolor(
         stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 where painted; None where the strokes have
             four channels.
         keep: likewise, above 0 on spots whose likes are to stay as they are; None is none.
-        reach: as of :func:`recolor`, and so are ``photometric_bandwidth`` and ``patch_size``.
+        reach: as of :func:`~nlfilter_torch.recolor`, and so are ``photometric_bandwidth`` and ``patch_size``.
         photometric_bandwidth: in hundredths of Lab.
         patch_size: of the patches that are compared.
         statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
@@ -62,7 +62,8 @@ def stream_recolor(
         tile_rows: rows that are worked out at once.
         memory: in bytes, beside those of the sources and the target.
         report: called with a stage and how much of it is done.
-        **options: of :func:`nonlocal_operator` but ``guide_channels``, ``tolerance`` and ``patch_weights``.
+        **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``guide_channels``, ``tolerance`` and
+            ``patch_weights``.
 
     Raises:
         TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size meanwhile.

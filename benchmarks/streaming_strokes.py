@@ -1,0 +1,131 @@
+"""Time, memory and exactness of stroke edits that are worked out by rows: ``python -m benchmarks.streaming_strokes``.
+
+The mosaic of ``benchmarks.streaming``, with some strokes on it, is recoloured and colourised from file to file, each in
+a fresh process; figures are taken as there. ``--quick`` runs everything on a fraction of a megapixel.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.streaming import mosaic, write_mosaic
+from nlfilter_torch import colorize, recolor
+from nlfilter_torch.edits.chroma import split_luminance
+from nlfilter_torch.edits.recolor import colour_guide
+from nlfilter_torch.streaming import stream_colorize, stream_recolor
+from nlfilter_torch.streaming.colorize import colorize_rows
+from nlfilter_torch.streaming.files import open_picture, write_picture
+from nlfilter_torch.streaming.recolor import recolor_rows
+
+VERBS = {"recolor": recolor_rows, "colorize": colorize_rows}
+BOXES = (  # (top, left, height, width) as shares of the picture, and RGB
+    ((0.25, 0.25, 0.02, 0.03), (0, 0, 255)),
+    ((0.70, 0.60, 0.02, 0.02), (255, 0, 0)),
+    ((0.10, 0.80, 0.03, 0.01), (0, 180, 50)),
+    ((0.85, 0.15, 0.02, 0.04), (0, 0, 255)),
+)
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Strokes (h, W, 4) with transparency, of which only the rows that are asked for exist."""
+
+    shape: tuple[int, int, int]
+    dtype = np.dtype(np.uint8)
+
+    def __getitem__(self, rows: slice) -> NDArray[np.uint8]:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        strokes = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        for place, colour in BOXES:
+            top, left, height, width = (
+                round(share * side) for share, side in zip(place, 2 * self.shape[:2], strict=True)
+            )
+            inside = slice(max(top - rows.start, 0), max(top + height - rows.start, 0))
+            strokes[inside, left : left + width] = (*colour, 255)
+        return strokes
+
+
+def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
+    """Edit a file in this process, and say what it took."""
+    colour_guide(torch.zeros(1, 3, 1, 1))  # kornia is read when it is first needed
+    forget_peak()
+    before, started = resident("VmRSS"), time.process_time()
+    with open_picture(source, memory) as picture:
+        height, width, _ = picture.shape
+        rows: Iterator[Any] = VERBS[verb](picture.rows, Boxes((height, width, 4)), kind="uint8", memory=memory)
+        write_picture(target, rows, "uint8", picture)
+    return {
+        "verb": verb,
+        "megapixels": height * width / 1e6,
+        "cpu_s": time.process_time() - started,
+        "peak_mib": resident("VmHWM") - before,
+    }
+
+
+def exactness(side: int) -> list[str]:
+    """Largest differences between rows and memory, of each edit."""
+    picture = np.concatenate(list(mosaic(side, side))).astype(np.float32) / np.float32(255)
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    layer = Boxes((side, side, 4))[slice(0, side)].astype(np.float32) / np.float32(255)
+    strokes = torch.from_numpy(layer).permute(2, 0, 1)[None]
+    lines = []
+    for verb, stream, whole in (
+        ("recolor", stream_recolor, recolor(image, strokes[:, :3], strokes[:, 3:])),
+        ("colorize", stream_colorize, colorize(split_luminance(image)[0], strokes[:, :3], strokes[:, 3:])),
+    ):
+        wanted = whole[0].permute(1, 2, 0).numpy()
+
+        def edited(stream: Any = stream, **options: Any) -> NDArray[np.float32]:
+            rows = np.empty_like(picture)
+            stream(picture, rows, layer, **options)
+            return rows
+
+        sampled = edited(sample=side * side // 4, tile_rows=64)
+        other = np.abs(edited(sample=side * side // 4, tile_rows=1000) - sampled).max()
+        some, full = np.abs(sampled - wanted), np.abs(edited(statistics="full") - wanted).max()
+        lines.append(
+            f"{verb}, {side * side / 1e6:.2f} MP: a quarter as sample is off by {255 * some.max():.2f} of 255 at most "
+            f"(RMS {255 * np.sqrt(np.square(some, dtype=np.float64).mean()):.3f}), full passes by {full:.1e} of white; "
+            f"tiles of 64 and 1000 rows differ by {other:.1e}"
+        )
+    return lines
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="Time, memory and exactness of stroke edits worked out by rows.")
+    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
+    parser.add_argument("--work", nargs=3, metavar=("VERB", "IN", "OUT"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.work:
+        verb, source, target = options.work
+        print(json.dumps(work(verb, Path(source), Path(target), 800 * MIB)))
+        return
+    print("| edit | megapixels | processor, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as name:
+        source, target = Path(name) / "in.tif", Path(name) / "out.tif"
+        for side in (300,) if options.quick else (2048, 5000):
+            write_mosaic(source, side)
+            for verb in VERBS:
+                command = [sys.executable, "-m", "benchmarks.streaming_strokes", "--work", verb]
+                done = subprocess.run([*command, str(source), str(target)], check=True, capture_output=True, text=True)
+                run = json.loads(done.stdout.splitlines()[-1])
+                cpu, pixels = run["cpu_s"], run["megapixels"]
+                print(f"| {verb} | {pixels:.1f} | {cpu:.1f} | {cpu / pixels:.2f} | {run['peak_mib']:.0f} |", flush=True)
+    print("\n" + "\n".join(exactness(300 if options.quick else 2048)))
+
+
+if __name__ == "__main__":
+    main()
