@@ -104,8 +104,8 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     Each is drawn by what the ones before leave unexplained of the kernel's unit diagonal (Chen, Epperly, Tropp and
     Webber, 2022). Patches that are rare but unlike all others get a landmark, which a uniform draw would miss, and
     k-means would never move one there. The fourth power is greedier than the residual itself: at h_y = 40/255 the
-    error of W y on the small astronaut of benchmarks.accuracy is 0.6 grey levels with it, 0.85 without, 1.0 without any
-    such start.
+    error of W y on the small astronaut of benchmarks.accuracy is 0.54 grey levels with it, 0.79 with the first power,
+    0.72 where k-means starts from any candidates.
     """
     batch, _, size = points.shape
     draws = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points)
