@@ -101,7 +101,7 @@ class _NystromFactor(torch.autograd.Function):
             kernel, _ = affinity(features[:, :, block], first)
             columns = torch.bmm(whitening, kernel, out=second)  # into a buffer: rows of the factor are far apart
             if complete:
-                norm = torch.sum(torch.mul(columns, columns, out=first), 1, out=norms[:, block])
+                norm = torch.sum(torch.square(columns, out=first), 1, out=norms[:, block])
                 # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
                 if features.device.type != "cpu" or norm.max().item() > 1.0:
                     columns.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
