@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 # A block of affinities is M x CACHED floats; at M = 100 that is 1.6 MB, which the shared cache of a core holds together
-# with its whitened copy. A sweep writes only vectors, so its blocks may be longer, and cost fewer calls.
-CACHED = 4096
+# with its whitened copy. Rows of 4096 floats would start in the same few sets of that cache, and drive each other out;
+# those of 4080 are an odd number of its lines. A sweep writes only vectors, so its blocks may be longer, and cost fewer calls.
+CACHED = 4080
 SWEPT = 16384
 # An accelerator wants long blocks; this one bounds the memory of intermediate results at about 1 GB for M = 100.
 ACCELERATED = 1 << 21

@@ -5,7 +5,7 @@ whitening (M, M) of the affinities, and the Gram matrix of the factor (M, N): N 
 adds reads of the factor, taken as ten. Each of the four is timed in several ways and the quickest counts, so that the
 floor is not slow by a clumsy choice:
 
-- a product as one call on the whole, into memory that was used before, and in blocks of 4096 and 16384 pixels whose
+- a product as one call on the whole, into memory that was used before, and in blocks of 4080 and 16368 pixels whose
   results never leave the cache;
 - a read as ``factor.sum()``, as ``factor @ vector`` and as ``vector @ factor``.
 
@@ -23,7 +23,7 @@ from benchmarks.speed.cases import Case
 from benchmarks.speed.timing import Call, Timing, take_turns
 
 READS = 10
-BLOCKS = (4096, 16384)
+BLOCKS = (4080, 16368)  # an odd number of cache lines, see nlfilter_torch.blocks
 
 
 PARTS = ("affinity", "whitening", "gram", "read")
