@@ -6,11 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# A block of affinities is M x CACHED floats; at M = 100 that is 1.6 MB, which the shared cache of a core holds together
-# with its whitened copy. Rows of 4096 floats would start in the same few sets of that cache, and drive each other out;
-# those of 4080 are an odd number of its lines. A sweep writes only vectors, so its blocks may be longer, and cost fewer calls.
-CACHED = 4080
-SWEPT = 16384
+# Pixels in a block, for each core. One of affinities is M x CACHED floats, at M = 100 0.8 MB, which the cache of a core
+# still holds when its whitened copy is made. Rows of 2048 floats would start in the same few sets of that cache
+# and drive each other out; 2032 are an odd number of its lines. A sweep writes only vectors, so that its blocks may be
+# longer, and cost fewer calls.
+CACHED = 2032
+SWEPT = 8176
 # An accelerator wants long blocks; this one bounds the memory of intermediate results at about 1 GB for M = 100.
 ACCELERATED = 1 << 21
 
@@ -25,13 +26,27 @@ def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
     return torch.from_numpy(np.empty(shape, np.float64 if like.dtype == torch.float64 else np.float32))
 
 
+def strip_count(batch: int, pixels: int, device: torch.device) -> int:
+    """How many strips an image is worked on in: one for each core, unless it is one of a batch or does not divide."""
+    cores = torch.get_num_threads()
+    return cores if batch == 1 and device.type == "cpu" and pixels % cores == 0 else 1
+
+
+def strips(planes: Tensor, count: int) -> Tensor:
+    """A view of (1, C, N) as a batch (P, C, N / P) of strips; of a batch (B, C, N), which counts as one, itself.
+
+    Each core then works on a strip of its own: what it has just computed is in its cache, not in that of another.
+    """
+    return planes if count == 1 else planes[0].unflatten(1, (count, -1)).transpose(0, 1)
+
+
 def block_length(batch: int, device: torch.device, length: int) -> int:
-    """Pixels in a block of about ``length`` over a whole batch."""
-    return max(256, (length if device.type == "cpu" else ACCELERATED) // batch)
+    """Pixels of each image in a block that has about ``length`` for every core."""
+    return max(256, (length * torch.get_num_threads() if device.type == "cpu" else ACCELERATED) // batch)
 
 
 def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = CACHED) -> Iterator[slice]:
-    """Slices that cover ``range(count)``, each of about ``length`` pixels over the whole batch."""
+    """Slices that cover ``range(count)``, each with about ``length`` pixels of the whole batch for every core."""
     step = block_length(batch, device, length)
     for start in range(0, count, step):
         yield slice(start, min(start + step, count))

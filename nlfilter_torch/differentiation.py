@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
+from nlfilter_torch.blocks import strips
 from nlfilter_torch.precision import full_precision
 
 Gradients = tuple[Tensor | None, ...]
@@ -56,6 +57,15 @@ def outer_product(left: Tensor, right: Tensor) -> Tensor:
     if left.shape[2] >= left.shape[1] or torch.compiler.is_compiling():
         return torch.bmm(left, right)
     return OuterProduct(left, right)
+
+
+def strips_of_gradient(gradient: Tensor, count: int) -> Tensor:
+    """:func:`strips` of a gradient (1, M, N), formed or not."""
+    if isinstance(gradient, OuterProduct):
+        return (
+            OuterProduct(gradient.left.expand(count, -1, -1), strips(gradient.right, count)) if count > 1 else gradient
+        )
+    return strips(gradient, count)
 
 
 def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import buffered_blocks, large_empty
-from nlfilter_torch.differentiation import once_differentiable, write_columns
+from nlfilter_torch.blocks import buffered_blocks, large_empty, strip_count, strips
+from nlfilter_torch.differentiation import once_differentiable, strips_of_gradient, write_columns
 
 Completion = Literal["diagonal", "none"]
 
@@ -96,16 +96,19 @@ class _NystromFactor(torch.autograd.Function):
         batch, _, pixels = features.shape
         factor = large_empty((batch, landmarks.shape[2], pixels), features)
         norms = features.new_ones(batch, pixels)  # |u|^2
-        affinity = Affinity(landmarks, complete)
-        for block, (first, second) in buffered_blocks(factor, 2):
-            kernel, _ = affinity(features[:, :, block], first)
-            columns = torch.bmm(whitening, kernel, out=second)  # into a buffer: rows of the factor are far apart
+        count = strip_count(batch, pixels, features.device)
+        affinity = Affinity(_repeat(landmarks, count), complete)
+        whitenings = _repeat(whitening, count)
+        parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
+        for block, (first, second) in buffered_blocks(columns_of, 2):
+            kernel, _ = affinity(parts[:, :, block], first)
+            columns = torch.bmm(whitenings, kernel, out=second)  # into a buffer: rows of the factor are far apart
             if complete:
-                norm = torch.sum(torch.square(columns, out=first), 1, out=norms[:, block])
+                norm = torch.sum(torch.square(columns, out=first), 1, out=norms_of[:, block])
                 # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
                 if features.device.type != "cpu" or norm.max().item() > 1.0:
                     columns.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
-            factor[:, :, block] = columns
+            columns_of[:, :, block] = columns
         diagonal, scale = (1.0 - norms).clamp_(min=0.0), norms.clamp_(min=1.0).rsqrt_()
         ctx.save_for_backward(features, landmarks, whitening, factor, scale)
         ctx.complete = complete
@@ -116,8 +119,14 @@ class _NystromFactor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
-        affinity = Affinity(landmarks, ctx.complete)
         grad_features = large_empty(features.shape, features)
+        batch, pixels = scale.shape
+        count = strip_count(batch, pixels, features.device)
+        landmarks, whitening = _repeat(landmarks, count), _repeat(whitening, count)
+        features, factor = strips(features, count), strips(factor, count)
+        scale, grad_diagonal = (vector.reshape(count * batch, -1) for vector in (scale, grad_diagonal))
+        grad_factor, grad_parts = strips_of_gradient(grad_factor, count), strips(grad_features, count)
+        affinity = Affinity(landmarks, ctx.complete)
         grad_landmarks = torch.zeros_like(landmarks, dtype=torch.float64)
         grad_whitening = torch.zeros_like(whitening, dtype=torch.float64)
         for block, (first, second, third) in buffered_blocks(factor, 3):
@@ -132,6 +141,13 @@ class _NystromFactor(torch.autograd.Function):
             grad_whitening += grad @ kernel.mT
             # K_im = exp(-|x_i - z_m|^2): its derivative is -2 (x_i - z_m) K_im in x_i and the opposite in z_m.
             pull = torch.bmm(whitening.mT, grad, out=third).mul_(kernel)  # (B, M, n)
-            grad_features[:, :, block] = 2.0 * (affinity.landmarks @ pull - centred * pull.sum(1, keepdim=True))
+            grad_parts[:, :, block] = 2.0 * (affinity.landmarks @ pull - centred * pull.sum(1, keepdim=True))
             grad_landmarks += 2.0 * (centred @ pull.mT - affinity.landmarks * pull.sum(2).unsqueeze(1))
+        if count > 1:
+            grad_landmarks, grad_whitening = grad_landmarks.sum(0, keepdim=True), grad_whitening.sum(0, keepdim=True)
         return grad_features, grad_landmarks.to(landmarks), grad_whitening.to(whitening), None
+
+
+def _repeat(matrices: Tensor, count: int) -> Tensor:
+    """Matrices (1, ., .) for each of the strips of an image; those of a batch, (B, ., .), which counts as one, once."""
+    return matrices.repeat(count, 1, 1)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import buffered_blocks
+from nlfilter_torch.blocks import buffered_blocks, strip_count, strips
 from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.sharding import Shard, reduce_sum
@@ -190,15 +190,18 @@ class _Grams(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None) -> Tensor:
-        batch, marks, _ = factor.shape
-        total = factor.new_zeros(batch, 1 if remainder is None else 2, marks, marks, dtype=torch.float64)
+        batch, marks, pixels = factor.shape
+        ctx.save_for_backward(factor, scaling, remainder)
+        count = strip_count(batch, pixels, factor.device)
+        factor, scaling = strips(factor, count), strips(scaling.unsqueeze(1), count)
+        remainder = None if remainder is None else strips(remainder.unsqueeze(1), count)
+        total = factor.new_zeros(len(factor), 1 if remainder is None else 2, marks, marks, dtype=torch.float64)
         for block, (rows, weighted) in buffered_blocks(factor, 2):
-            torch.mul(factor[:, :, block], scaling[:, None, block], out=rows)
+            torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
             total[:, 0] += rows @ rows.mT
             if remainder is not None:
-                total[:, 1] += torch.mul(rows, remainder[:, None, block], out=weighted) @ rows.mT
-        ctx.save_for_backward(factor, scaling, remainder)
-        return total
+                total[:, 1] += torch.mul(rows, remainder[:, :, block], out=weighted) @ rows.mT
+        return total.sum(0, keepdim=True) if count > 1 else total
 
     @staticmethod
     @once_differentiable

@@ -8,7 +8,7 @@ the same products run on all cores.
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks
+from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.sharding import Shard, reduce_sum
 
 FEW = 3  # rows that are quicker together than one by one, and than more
@@ -64,6 +64,5 @@ def _is_parted(thin: Tensor, factor: Tensor) -> bool:
 
 
 def _parts(planes: Tensor) -> Tensor:
-    """Planes (1, R, n) as (P, R, n / P), a part for each core or more, where n can be divided so."""
-    count = 1 << (torch.get_num_threads() - 1).bit_length()
-    return planes[0].unflatten(1, (count if planes.shape[2] % count == 0 else 1, -1)).transpose(0, 1)
+    """Planes (1, R, n) as a batch of strips."""
+    return strips(planes, strip_count(1, planes.shape[2], planes.device))
