@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import accuracy
-from nlfilter_torch import nonlocal_operator
+from nlfilter_torch import captured_energy, nonlocal_operator
 from tests import reference
 from tests.images import photograph
 from tests.problems import SAMPLINGS, build, guides, noise, options, picture, seeded
@@ -365,3 +365,22 @@ def test_backward_gives_finite_gradients_to_everything() -> None:
         assert tensor.grad is not None
         assert tensor.grad.isfinite().all()
         assert tensor.grad.abs().max() > 0
+
+
+def _filtered_and_gradients(threads: int) -> list[torch.Tensor]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        guide = noise(1, 1, 12, 10).requires_grad_()
+        operator = nonlocal_operator(guide, photometric_bandwidth=0.3, num_landmarks=15)
+        filtered = operator @ noise(1, 2, 12, 10)
+        energy = captured_energy(operator.spectrum(), filtered)
+        return [filtered, energy, *torch.autograd.grad(filtered.square().sum() + energy.sum(), guide)]
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_strips_of_pixels_for_several_cores_do_not_change_the_result(threads: int) -> None:
+    for found, alone in zip(_filtered_and_gradients(threads), _filtered_and_gradients(1), strict=True):
+        torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-9)
