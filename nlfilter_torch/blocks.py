@@ -9,9 +9,9 @@ from torch import Tensor
 # Pixels in a block, for each core. One of affinities is M x CACHED floats, at M = 100 0.8 MB, which the cache of a core
 # still holds when its whitened copy is made. Rows of 2048 floats would start in the same few sets of that cache
 # and drive each other out; 2032 are an odd number of its lines. A sweep writes only vectors, so that its blocks may be
-# longer, and cost fewer calls.
+# longer, and cost fewer calls; torch divides vectors among cores from 32768 numbers on, those of two blocks.
 CACHED = 2032
-SWEPT = 8176
+SWEPT = 16400
 # An accelerator wants long blocks; this one bounds the memory of intermediate results at about 1 GB for M = 100.
 ACCELERATED = 1 << 21
 

@@ -30,7 +30,7 @@ LARGEST = 2.0  # K has a unit diagonal and its entries are not negative but for 
 SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
 MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # on an accelerator a look at the residual would stop the queue
-ROUGH = 0.1  # a sweep that gains less than a factor of ten asks for another sample
+ROUGH = 0.2  # a sweep that gains less than a factor of five asks for another sample
 STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it have met rounding
 
 

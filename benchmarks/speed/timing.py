@@ -11,6 +11,7 @@ from torch.utils.benchmark import Measurement, TaskSpec, set_torch_threads, time
 
 Call = Callable[[], Any]
 
+UNCOUNTED = 2.0  # seconds; a call that takes more comes to its own memory and caches on its way
 SHORTEST = 0.01  # seconds; a call that takes less is repeated within one sample, or the clock would count, too
 LONG = 0.5  # seconds; a call that takes more is warm after one
 
@@ -42,7 +43,7 @@ def take_turns(
     """Time several calls round after round, one sample of each per round.
 
     Each sample comes after a call that is not counted, so that memory and caches are the call's own, as in a loop over
-    pictures. What it costs to come after something else is measured by :func:`after_pauses`.
+    pictures, unless it takes seconds. What it costs to come after something else is measured by :func:`after_pauses`.
 
     Args:
         calls: what to time, by name.
@@ -60,7 +61,8 @@ def take_turns(
         start = time.perf_counter()
         for done in range(1, most + 1):
             for name, call in calls.items():
-                call()
+                if not samples[name] or samples[name][-1] < UNCOUNTED:
+                    call()
                 samples[name].append(_sample(call, repeats[name]))
             if done >= least and time.perf_counter() - start >= seconds:
                 break
