@@ -53,8 +53,8 @@ class Plan:
     crops: tuple[int, int, int] = (16, 128, 64)
     dense_side: int = 256
     pictures: tuple[str, ...] = ("retina", "astronaut", "camera", "coffee", "hubble_deep_field")
-    seconds: float = 4.0
-    claimed_seconds: float = 30.0
+    seconds: float = 3.0
+    claimed_seconds: float = 20.0
     least: int = 3
     pause: float = 3.0
     processes: int = 7
