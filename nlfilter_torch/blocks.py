@@ -26,10 +26,15 @@ def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
     return torch.from_numpy(np.empty(shape, np.float64 if like.dtype == torch.float64 else np.float32))
 
 
+def cores() -> int:
+    """How many threads torch has for one operation; 1 for a compiler, which cannot trace the question."""
+    return 1 if torch.compiler.is_compiling() else torch.get_num_threads()
+
+
 def strip_count(batch: int, pixels: int, device: torch.device) -> int:
     """How many strips an image is worked on in: one for each core, unless it is one of a batch or does not divide."""
-    cores = torch.get_num_threads()
-    return cores if batch == 1 and device.type == "cpu" and pixels % cores == 0 else 1
+    count = cores()
+    return count if batch == 1 and device.type == "cpu" and pixels % count == 0 else 1
 
 
 def strips(planes: Tensor, count: int) -> Tensor:
@@ -42,7 +47,7 @@ def strips(planes: Tensor, count: int) -> Tensor:
 
 def block_length(batch: int, device: torch.device, length: int) -> int:
     """Pixels of each image in a block that has about ``length`` for every core."""
-    return max(256, (length * torch.get_num_threads() if device.type == "cpu" else ACCELERATED) // batch)
+    return max(256, (length * cores() if device.type == "cpu" else ACCELERATED) // batch)
 
 
 def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = CACHED) -> Iterator[slice]:

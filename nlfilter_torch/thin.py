@@ -18,20 +18,25 @@ MOST_GATHERED = 24
 
 def spread(rows: Tensor, factor: Tensor) -> Tensor:
     """``rows @ factor``, (B, R, N), of rows (B, R, M) and a factor (B, M, N)."""
-    if rows.shape[1] > MOST_SPREAD or not _is_parted(rows, factor):
+    if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
         return rows @ factor
-    result = factor.new_empty(1, rows.shape[1], factor.shape[2])
+    found = []
     for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT):
         parts = _parts(factor[:, :, block])  # (P, M, n / P)
-        for first in range(0, rows.shape[1], FEW):  # the block is in the cache after the first few
-            few = slice(first, first + FEW)
-            result[0, few, block] = torch.bmm(rows[:, few].expand(len(parts), -1, -1), parts).transpose(0, 1).flatten(1)
-    return result
+        for few in rows.split(FEW, dim=1):  # the block is in the cache after the first few
+            found.append(torch.bmm(few.expand(len(parts), -1, -1), parts).transpose(0, 1).flatten(1))
+    chunks = -(-rows.shape[1] // FEW)
+    images = [
+        torch.cat(found[chunk::chunks], dim=1) if len(found) > chunks else found[chunk] for chunk in range(chunks)
+    ]
+    return (torch.cat(images) if chunks > 1 else images[0]).unsqueeze(0)
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
     """``images @ factor^T``, (B, R, M), of images (B, R, N) and a factor (B, M, N)."""
-    if images.shape[1] > MOST_GATHERED or not _is_parted(images, factor):
+    if torch.compiler.is_compiling():  # the layout of the other would tie a compiler to the number of rows
+        return (factor @ images.mT).mT
+    if not _is_parted(images, factor) or images.shape[1] > MOST_GATHERED:
         return images @ factor.mT
     return torch.bmm(_parts(images), _parts(factor).mT).sum(0, keepdim=True)
 
@@ -59,6 +64,8 @@ def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor
 
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:
     """Whether parts pay: for one image on a processor. Autograd would keep every part, and has one product instead."""
+    if torch.compiler.is_compiling():  # it would take the size of the batch for a constant
+        return False
     recorded = torch.is_grad_enabled() and (thin.requires_grad or factor.requires_grad)
     return factor.device.type == "cpu" and len(factor) == len(thin) == 1 and not recorded
 

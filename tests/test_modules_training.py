@@ -374,7 +374,8 @@ def test_export_of_applying_a_fitted_operator(strict: bool) -> None:
     stream.seek(0)
     loaded = torch.export.load(stream).module()
     for batch in (1, 2, 5):
-        torch.testing.assert_close(loaded(image(3, batch)), fitted(image(3, batch)), atol=1e-6, rtol=0)
+        # The exported program adds pixels up in another order, and the sliders raise its rounding fourfold.
+        torch.testing.assert_close(loaded(image(3, batch)), fitted(image(3, batch)), atol=3e-6, rtol=0)
 
 
 def test_vmap_over_images_and_over_sliders_of_a_fitted_operator() -> None:
