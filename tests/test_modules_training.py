@@ -319,7 +319,7 @@ def test_compiled_layer_gives_the_same(learn: tuple[str, ...]) -> None:
     fast = compiled(run)
     for seed in (0, 1):
         expected, found = run(image(seed)), fast(image(seed))
-        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        torch.testing.assert_close(found, expected, atol=3e-6, rtol=0)  # its pixels are added up in another order
         gradients = [torch.autograd.grad(y.square().mean(), parameters) for y in (found, expected)]
         for ours, theirs in zip(*gradients, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4 * theirs.abs().max().item())
