@@ -61,10 +61,8 @@ def outer_product(left: Tensor, right: Tensor) -> Tensor:
 
 def strips_of_gradient(gradient: Tensor, count: int) -> Tensor:
     """:func:`strips` of a gradient (1, M, N), formed or not."""
-    if isinstance(gradient, OuterProduct):
-        return (
-            OuterProduct(gradient.left.expand(count, -1, -1), strips(gradient.right, count)) if count > 1 else gradient
-        )
+    if isinstance(gradient, OuterProduct) and count > 1:
+        return OuterProduct(gradient.left.expand(count, -1, -1), strips(gradient.right, count))
     return strips(gradient, count)
 
 

@@ -23,13 +23,10 @@ def spread(rows: Tensor, factor: Tensor) -> Tensor:
     found = []
     for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT):
         parts = _parts(factor[:, :, block])  # (P, M, n / P)
-        for few in rows.split(FEW, dim=1):  # the block is in the cache after the first few
-            found.append(torch.bmm(few.expand(len(parts), -1, -1), parts).transpose(0, 1).flatten(1))
-    chunks = -(-rows.shape[1] // FEW)
-    images = [
-        torch.cat(found[chunk::chunks], dim=1) if len(found) > chunks else found[chunk] for chunk in range(chunks)
-    ]
-    return (torch.cat(images) if chunks > 1 else images[0]).unsqueeze(0)
+        # The block is in the cache after the first few.
+        images = [torch.bmm(few.expand(len(parts), -1, -1), parts) for few in rows.split(FEW, dim=1)]
+        found.append(torch.cat(images, dim=1).transpose(0, 1).flatten(1))
+    return torch.cat(found, dim=1).unsqueeze(0)
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
