@@ -30,7 +30,7 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.streaming import stream_detail
 from nlfilter_torch.streaming.detail import detail_rows
 from nlfilter_torch.streaming.files import open_picture, write_picture
-from nlfilter_torch.streaming.tiles import SAMPLE
+from nlfilter_torch.streaming.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 PIECE = 256  # side of a piece of the mosaic
@@ -76,7 +76,7 @@ def write_mosaic(path: Path, side: int) -> None:
     tifffile.imwrite(path, tiles(), shape=shape, dtype=np.uint8, bigtiff=True, photometric="rgb", **options)
 
 
-def work(source: Path, target: Path, statistics: str, landmarks: int, memory: int) -> dict[str, object]:
+def work(source: Path, target: Path, statistics: Statistics, landmarks: int, memory: int) -> dict[str, object]:
     """Filter a file in this process, and say what it took."""
     edit_luminance(torch.zeros(1, 3, 1, 1), lambda y: y)  # kornia is read when it is first needed
     forget_peak()
@@ -92,12 +92,9 @@ def work(source: Path, target: Path, statistics: str, landmarks: int, memory: in
 
     with open_picture(source, memory) as picture:
         rows = detail_rows(
+            Passes("uint8", statistics, memory=memory, report=report),
             picture.rows,
             ALPHA,
-            kind="uint8",
-            statistics=statistics,  # type: ignore[arg-type]
-            memory=memory,
-            report=report,
             num_landmarks=landmarks,
         )
         write_picture(target, rows, "uint8", picture)

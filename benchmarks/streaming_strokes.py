@@ -28,6 +28,7 @@ from nlfilter_torch.streaming import stream_colorize, stream_recolor
 from nlfilter_torch.streaming.colorize import colorize_rows
 from nlfilter_torch.streaming.files import open_picture, write_picture
 from nlfilter_torch.streaming.recolor import recolor_rows
+from nlfilter_torch.streaming.tiles import Passes
 
 VERBS = {"recolor": recolor_rows, "colorize": colorize_rows}
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB
@@ -64,7 +65,7 @@ def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
     before, started = resident("VmRSS"), time.process_time()
     with open_picture(source, memory) as picture:
         height, width, _ = picture.shape
-        rows: Iterator[Any] = VERBS[verb](picture.rows, Boxes((height, width, 4)), kind="uint8", memory=memory)
+        rows: Iterator[Any] = VERBS[verb](Passes("uint8", memory=memory), picture.rows, Boxes((height, width, 4)))
         write_picture(target, rows, "uint8", picture)
     return {
         "verb": verb,

@@ -21,6 +21,7 @@ from nlfilter_torch.streaming import sampling, stream_detail
 from nlfilter_torch.streaming.detail import rows_in_memory
 from nlfilter_torch.streaming.rows import Picture
 from nlfilter_torch.streaming.statistics import balance_by_passes
+from nlfilter_torch.streaming.tiles import Passes
 
 Array = NDArray[Any]
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
@@ -213,12 +214,16 @@ def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_memory_gives_the_size_of_tiles() -> None:
     picture = Picture(np.zeros((20_000, 200), np.uint8))
-    rows = [rows_in_memory(picture, memory, 4, 1 << 16, False) for memory in (10**8, 10**9, 10**10)]
+
+    def rows_within(memory: int, masked: bool = False) -> int:
+        return rows_in_memory(picture, Passes("uint8", sample=1 << 16, memory=memory), 4, masked)
+
+    rows = [rows_within(memory) for memory in (10**8, 10**9, 10**10)]
     assert 200 * 150 * 4 * rows[0] < 10**8 < 200 * 150 * 4 * 8 * rows[0]
     assert rows[0] < rows[1] == rows[2]  # longer tiles are no faster
-    assert rows_in_memory(picture, 10**8, 4, 1 << 16, True) < rows[0]
+    assert rows_within(10**8, masked=True) < rows[0]
     with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least, but 10 MB may be used; allow more"):
-        rows_in_memory(picture, 10**7, 4, 1 << 16, False)
+        rows_within(10**7)
     with pytest.raises(MemoryError, match="source needs 4 MB of memory at least, but 0 MB may be used"):
         streamed(cat(60, 80), memory=1000)
 

@@ -18,6 +18,7 @@ from nlfilter_torch.files import read_photograph
 from nlfilter_torch.streaming import sampling, stream_colorize, stream_recolor
 from nlfilter_torch.streaming.painted import read_strokes
 from nlfilter_torch.streaming.rows import Picture
+from nlfilter_torch.streaming.tiles import Passes
 from tests.test_streaming import LEVEL, Rows, Shrinking, cat
 
 Array = NDArray[Any]
@@ -211,7 +212,7 @@ def test_report_tells_every_stage() -> None:
 def test_painted_pixels_need_memory() -> None:
     picture, (strokes, mask, _) = cat(90, 120), paint(90, 120)
     with pytest.raises(MemoryError, match=r"the strokes on source cover \d+ pixels or more .* paint less"):
-        read_strokes(Picture(picture), strokes, 0 * mask + 1, memory=500_000, report=lambda *_: None)
+        read_strokes(Picture(picture), strokes, 0 * mask + 1, Passes("uint8", memory=500_000))
     for edit in (recoloured, coloured):
         with pytest.raises(MemoryError, match="the strokes on source cover"):
             edit(picture, strokes, 0 * mask + 1, memory=3_000_000, num_landmarks=5)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -21,6 +21,7 @@ from nlfilter_torch.streaming.files import (
     write_picture,
 )
 from nlfilter_torch.streaming.sampling import Report
+from nlfilter_torch.streaming.tiles import Passes
 
 Memory = Annotated[
     float | None,
@@ -81,10 +82,9 @@ class Job:
         """(H, W)."""
         return self.picture.shape[0], self.picture.shape[1]
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What every edit by rows is told."""
-        return {"kind": self.kind, "memory": max(self.memory, 1), "report": self.report}
+    def passes(self, full: bool) -> Passes:
+        """Over the photograph, from every pixel or from a sample of them."""
+        return Passes(self.kind, "full" if full else "sample", memory=max(self.memory, 1), report=self.report)
 
     def open(self, path: Path) -> StoredPicture:
         """Another picture, read by rows as long as the job takes."""

@@ -75,14 +75,13 @@ def colorize(
         painted = painted_rows.stroke_rows(job, strokes, region)
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
         return colorize_rows(
+            job.passes(full),
             job.picture.rows,
             painted,
             method=method.value,
             strength=strength,
-            statistics="full" if full else "sample",
             names=(source, str(strokes or "--region")),
             **shared,
-            **job.settings,
         )
 
     editing.edit_file(source, target, depth, work, landmarks=landmarks, memory=memory, by_rows=by_rows, coloured=True)

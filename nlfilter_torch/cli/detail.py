@@ -183,6 +183,7 @@ def detail(
     def by_rows(job: Job) -> Rows:
         regions, own = painted_rows.region_rows(job, mask, region, sliders)
         return detail_rows(
+            job.passes(full),
             job.picture.rows,
             own,
             regions,
@@ -190,14 +191,12 @@ def detail(
             residual=residual,
             time=spread,
             channels=channels.value,
-            statistics="full" if full else "sample",
             photometric_bandwidth=options.parse_bandwidth(bandwidth),
             spatial_bandwidth=spatial_bandwidth,
             patch_size=patch_size,
             num_landmarks=landmarks,
             landmarks=sampling.value,
             generator=torch.Generator().manual_seed(seed),
-            **job.settings,
         )
 
     edit_by_rows(Path(source), Path(target), None if depth is None else DEPTHS[depth], allowed, by_rows)

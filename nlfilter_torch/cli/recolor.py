@@ -64,14 +64,13 @@ def recolor(
         painted = painted_rows.stroke_rows(job, strokes, region)
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
         return recolor_rows(
+            job.passes(full),
             job.picture.rows,
             painted,
             keep=painted_rows.mark_rows(job, keep, "--keep"),
             reach=reach,
-            statistics="full" if full else "sample",
             names=(source, str(strokes or "--region")),
             **shared,
-            **job.settings,
         )
 
     editing.edit_file(source, target, depth, work, landmarks=landmarks, factors=3, memory=memory, by_rows=by_rows)

@@ -20,13 +20,13 @@ from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
 from nlfilter_torch.streaming.sampling import Report, Sample
 from nlfilter_torch.streaming.tiles import (
     SAMPLE,
+    Passes,
     Rows,
     Statistics,
-    check_settings,
     check_target,
     fill,
+    in_silence,
     rows_that_fit,
-    work_out,
 )
 from nlfilter_torch.strokes import FittedStrokes, check_share, fit_strokes
 
@@ -90,17 +90,13 @@ def stream_colorize(
         >>> bool((blue > red)[:, :17].all()), bool((red > blue)[:, 23:].all())
         (True, True)
     """
-    height, width, *samples = source.shape
-    check_target(
-        target,
-        (height, width, 3 if samples in ([], [1], [3]) else 4),
-        "the height and width of the source, three colours, and transparency where that has it",
-    )
+    check_target(target, source, coloured=True)
+    passes = Passes(np.dtype(target.dtype).name, statistics, sample, tile_rows, memory, report or in_silence)
     rows = colorize_rows(
+        passes,
         source,
         strokes,
         stroke_mask,
-        kind=np.dtype(target.dtype).name,
         method=method,
         strength=strength,
         photometric_bandwidth=photometric_bandwidth,
@@ -108,21 +104,16 @@ def stream_colorize(
         patch_size=patch_size,
         num_landmarks=num_landmarks,
         generator=generator,
-        statistics=statistics,
-        sample=sample,
-        tile_rows=tile_rows,
-        memory=memory,
-        report=report,
     )
     fill(target, rows)
 
 
 def colorize_rows(
+    passes: Passes,
     source: RowSource,
     strokes: RowSource,
     stroke_mask: RowSource | None = None,
     *,
-    kind: str,
     method: str = "regression",
     strength: float = 1.0,
     photometric_bandwidth: float = 40 / 255,
@@ -130,14 +121,9 @@ def colorize_rows(
     patch_size: int = 5,
     num_landmarks: int = 100,
     generator: torch.Generator | None = None,
-    statistics: Statistics = "sample",
-    sample: int = SAMPLE,
-    tile_rows: int | None = None,
-    memory: int = 1 << 30,
-    report: Report | None = None,
     names: tuple[str, str] = ("source", "strokes"),
 ) -> Rows:
-    """The rows (h, W, S) of :func:`stream_colorize` as dtype ``kind``, as they are asked for.
+    """The rows (h, W, S) of :func:`stream_colorize`, as they are asked for.
 
     Errors call source and strokes by ``names``.
     """
@@ -147,7 +133,6 @@ def colorize_rows(
             "method must be regression where a picture is worked out by rows, got kmeans, which takes all pixels at "
             "once; choose regression, or allow more memory"
         )
-    check_settings(kind, statistics, sample, tile_rows)
     check_share(strength, "strength")
     check_positive(photometric_bandwidth, "photometric_bandwidth")
     check_patch_size(patch_size)
@@ -156,18 +141,16 @@ def colorize_rows(
     guide = Guide(source, names[0], lambda colours: reduce_channels(colours, "luminance"))
     bandwidth = LOCALITY * min(guide.size) if spatial_bandwidth is None else spatial_bandwidth
     check_positive(bandwidth, "spatial_bandwidth")
-    report = report or (lambda stage, done, rows: None)
-    painted = read_strokes(guide, strokes, stroke_mask, memory=memory, report=report, name=names[1])
+    painted = read_strokes(guide, strokes, stroke_mask, passes, name=names[1])
 
     planes = patch_size**2 + 2
-    check_room(guide, len(painted.places), planes, memory)
+    check_room(guide, len(painted.places), planes, passes.memory)
     rows = rows_that_fit(
         guide,
-        memory,
+        passes,
         floats=planes + num_landmarks + 40,
         planes=planes,
         num_landmarks=num_landmarks,
-        sample=sample,
         held=len(painted.places) * floats_of_painted(planes),
     )
     values = split_luminance(painted.colours[None, :, None])[1][:, :, 0]  # (1, 3, n)
@@ -175,9 +158,7 @@ def colorize_rows(
     for stage in (FAR, NEAR):
         kernel, pairs = fit_spectrum(
             guide,
-            statistics=statistics,
-            sample=sample,
-            report=report,
+            passes,
             patch_size=int(min(patch_size, stage.patch_size)),
             photometric_bandwidth=stage.photometric * photometric_bandwidth,
             spatial_bandwidth=stage.spatial * bandwidth,
@@ -185,13 +166,13 @@ def colorize_rows(
             generator=generator,
         )
         part = strength if stage is FAR else 0.0
-        chroma, values = fit_chroma(picture, guide, kernel, pairs, painted, values, stage, part, report)
+        chroma, values = fit_chroma(picture, guide, kernel, pairs, painted, values, stage, part, passes.report)
         fitted.append(chroma)
 
     def edit(tile: Tile) -> Tensor:
         return merge_luminance(tile.inner, fitted[0](tile) + fitted[1](tile))
 
-    yield from work_out(guide, edit, kind, patch_size // 2, tile_rows or rows, report)
+    yield from passes.work_out(guide, edit, patch_size // 2, rows)
 
 
 @dataclass(frozen=True, eq=False)

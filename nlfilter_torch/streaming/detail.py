@@ -1,6 +1,7 @@
 """Detail sliders for pictures whose factor fits no memory: statistics from passes or a sample, then tile after tile."""
 
 import math
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,18 +12,18 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.masks import blend_regions
-from nlfilter_torch.streaming.fitting import MASK_SHARE, FittedMasks, fit_masks, fit_picture
+from nlfilter_torch.streaming.fitting import FittedMasks, fit_masks, fit_picture, for_masks
 from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
 from nlfilter_torch.streaming.sampling import Report
 from nlfilter_torch.streaming.tiles import (
     SAMPLE,
+    Passes,
     Rows,
     Statistics,
-    check_settings,
     check_target,
     fill,
+    in_silence,
     rows_that_fit,
-    work_out,
 )
 
 
@@ -86,45 +87,36 @@ def stream_detail(
         >>> np.array_equal(edited, picture)
         True
     """
-    check_target(target, tuple(source.shape))
+    check_target(target, source)
+    passes = Passes(np.dtype(target.dtype).name, statistics, sample, tile_rows, memory, report or in_silence)
     rows = detail_rows(
+        passes,
         source,
         alpha,
         regions,
-        kind=np.dtype(target.dtype).name,
         residual=residual,
         time=time,
         width=width,
         channels=channels,
-        statistics=statistics,
-        sample=sample,
-        tile_rows=tile_rows,
-        memory=memory,
-        report=report,
         **options,
     )
     fill(target, rows)
 
 
 def detail_rows(
+    passes: Passes,
     source: RowSource,
     alpha: Tensor,
     regions: RowSource | None = None,
     *,
-    kind: str,
     residual: float | None = None,
     time: float = 1.0,
     width: float = 4.0,
     channels: Literal["luminance", "all"] = "luminance",
-    statistics: Statistics = "sample",
-    sample: int = SAMPLE,
-    tile_rows: int | None = None,
-    memory: int = 1 << 30,
-    report: Report | None = None,
     name: str = "source",
     **options: Any,
 ) -> Rows:
-    """The rows (h, W, S) of :func:`stream_detail` as dtype ``kind``, from the first to the last, as they are asked for.
+    """The rows (h, W, S) of :func:`stream_detail`, from the first to the last, as they are asked for.
 
     Errors call the source ``name``.
     """
@@ -133,11 +125,9 @@ def detail_rows(
     check_positive(time, "time")
     check_positive(width, "width")
     check_choice(channels, "channels", ("luminance", "all"))
-    check_settings(kind, statistics, sample, tile_rows)
     if residual is not None and not math.isfinite(residual):
         raise ValueError(f"residual must be finite, got {residual}; pass a number or None")
-    report = report or (lambda stage, done, rows: None)
-    rows = tile_rows or rows_in_memory(picture, memory, alpha.shape[-1], sample, regions is not None, **options)
+    rows = rows_in_memory(picture, passes, alpha.shape[-1], regions is not None, **options)
     generator, masks = options.get("generator"), None
     if regions is not None:
         if alpha.ndim == 2 and len(alpha) != regions.shape[-1]:
@@ -146,30 +136,14 @@ def detail_rows(
             )
         alpha = alpha.expand(regions.shape[-1], -1)
         own = {} if generator is None else {"generator": generator.clone_state()}  # as if each were made alone
-        masks = fit_masks(
-            picture,
-            regions,
-            time=time,
-            width=width,
-            statistics=statistics,
-            sample=sample,
-            report=report,
-            **options | own,
-        )
-    fitted = fit_picture(
-        picture,
-        alpha.shape[-1] - 1,
-        channels=channels,
-        statistics=statistics if residual is None else "full",
-        sample=sample,
-        report=report,
-        **options,
-    )
+        masks = fit_masks(picture, regions, passes, time=time, width=width, **options | own)
+    exact = passes if residual is None else replace(passes, statistics="full")
+    fitted = fit_picture(picture, alpha.shape[-1] - 1, exact, channels=channels, **options)
 
     def edit(tile: Tile) -> Tensor:
         return _edit(tile, fitted, masks, alpha, residual, channels)
 
-    yield from work_out(picture, edit, kind, fitted.kernel.patch_weights.shape[0] // 2, rows, report)
+    yield from passes.work_out(picture, edit, fitted.kernel.patch_weights.shape[0] // 2, rows)
 
 
 def _edit(
@@ -194,9 +168,8 @@ def _edit(
 
 def rows_in_memory(
     picture: Picture,
-    memory: int,
+    passes: Passes,
     sliders: int,
-    sample: int,
     masked: bool,
     *,
     num_landmarks: int = 100,
@@ -204,7 +177,7 @@ def rows_in_memory(
     guide_channels: str = "luminance",
     **_: Any,
 ) -> int:
-    """Rows of a tile that can be worked out in ``memory`` bytes.
+    """Rows of a tile that can be worked out in the memory of the passes.
 
     Raises:
         MemoryError: if there is not one, or no room for the samples.
@@ -215,5 +188,5 @@ def rows_in_memory(
     planes = patch_size**2 * (picture.colours if in_colour else 1)
     # A tile: features and factor, or coordinates and their differences from a centre, and some images.
     floats = num_landmarks * (3 if masked else 1) + planes + (3 * sliders + 8) * picture.colours
-    sample = sample // MASK_SHARE if masked else sample
-    return rows_that_fit(picture, memory, floats=floats, planes=planes, num_landmarks=num_landmarks, sample=sample)
+    passes = for_masks(passes) if masked else passes
+    return rows_that_fit(picture, passes, floats=floats, planes=planes, num_landmarks=num_landmarks)

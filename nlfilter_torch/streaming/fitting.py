@@ -1,7 +1,7 @@
 """A picture that is read by rows to the filter and the masks of the whole, a few M-vectors each."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -19,9 +19,12 @@ from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
 from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
 from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, sum_up
-from nlfilter_torch.streaming.tiles import Statistics
+from nlfilter_torch.streaming.tiles import Passes
 
-MASK_SHARE = 2  # patches in colour are three times as large
+
+def for_masks(passes: Passes) -> Passes:
+    """With half the sample: patches in colour are three times as large."""
+    return replace(passes, sample=max(1, passes.sample // 2))
 
 
 @torch.no_grad()
@@ -29,11 +32,9 @@ MASK_SHARE = 2  # patches in colour are three times as large
 def fit_picture(
     picture: Picture,
     order: int,
+    passes: Passes,
     *,
     channels: Literal["luminance", "all"],
-    statistics: Statistics,
-    sample: int,
-    report: Report,
     **options: Any,
 ) -> FittedFilter:
     """The filter of a picture, as :func:`fit_filter` makes it of an image in memory."""
@@ -41,17 +42,15 @@ def fit_picture(
     def image(colours: Tensor) -> Tensor:
         return reduce_channels(colours, "luminance") if channels == "luminance" else colours
 
-    kernel, balancing, sums = _gather(picture, image, order, statistics, sample, False, report, **options)
+    kernel, balancing, sums = _gather(picture, image, order, passes, spectral=False, **options)
     return FittedFilter(kernel, balancing, sums.coefficients(), sums.explained())
 
 
 @torch.no_grad()
 @full_precision
-def fit_spectrum(
-    picture: Picture, *, statistics: Statistics, sample: int, report: Report, **options: Any
-) -> tuple[Kernel, RitzPairs]:
+def fit_spectrum(picture: Picture, passes: Passes, **options: Any) -> tuple[Kernel, RitzPairs]:
     """Kernel and eigenvalues of a picture, with the options of :func:`nonlocal_operator`."""
-    kernel, _, sums = _gather(picture, lambda c: c[:, :1], 1, statistics, sample, True, report, **options)
+    kernel, _, sums = _gather(picture, lambda c: c[:, :1], 1, passes, spectral=True, **options)
     return kernel, RitzPairs.of_sums(sums.grams, sums.dtype)
 
 
@@ -85,12 +84,10 @@ class FittedMasks:
 def fit_masks(
     picture: Picture,
     regions: RowSource,
+    passes: Passes,
     *,
     time: float,
     width: float,
-    statistics: Statistics,
-    sample: int,
-    report: Report,
     **options: Any,
 ) -> FittedMasks:
     """The masks of regions, rows (H, W, K) of weights, as :func:`enhance` has them.
@@ -105,10 +102,9 @@ def fit_masks(
         )
     shared = {name: value for name, value in options.items() if name in SHARED}
     shared |= {"photometric_bandwidth": MASK_BANDWIDTH, "guide_channels": "all"}
-    count = max(1, sample // MASK_SHARE)
-    kernel, balancing, sums = _gather(picture, lambda c: c, 1, statistics, count, True, report, **shared)
+    kernel, balancing, sums = _gather(picture, lambda c: c, 1, for_masks(passes), spectral=True, **shared)
     core = RitzPairs.of_sums(sums.grams, sums.dtype).basis(lambda eigenvalues: eigenvalues.pow(time))
-    centres = core @ _region_means(picture, regions, kernel, balancing, report)
+    centres = core @ _region_means(picture, regions, kernel, balancing, passes.report)
     return FittedMasks(kernel, balancing, core, centres.mT, picture.pixels / width)
 
 
@@ -143,13 +139,13 @@ def _gather(
     picture: Picture,
     image: Image,
     order: int,
-    statistics: Statistics,
-    sample: int,
+    passes: Passes,
+    *,
     spectral: bool,
-    report: Report,
     **options: Any,
 ) -> tuple[Kernel, Tensor, Sums]:
     """Kernel, moment t of balancing, and the sums for the first ``order`` powers of W."""
+    report = passes.report
     pilot = take_pilot(picture, image, report, **options)
     kernel, balancing = pilot.kernel, pilot.balancing
     completed = kernel.completion == "diagonal"
@@ -161,11 +157,11 @@ def _gather(
         report(stage, 0, 1)
         return (block for part in chosen for block in part.blocks(kernel))
 
-    drawn = sample < picture.pixels
+    drawn = passes.sample < picture.pixels
     if drawn:
-        chosen = sample_by_influence(picture, pilot, image, sample, report, spectral=spectral)
+        chosen = sample_by_influence(picture, pilot, image, passes.sample, report, spectral=spectral)
         balancing = balance_by_passes(lambda: some("Balancing"), balancing, completed=completed)
-    if drawn and statistics == "sample":
+    if drawn and passes.statistics == "sample":
         return kernel, balancing, sum_up(lambda: some("Summing up"), balancing, order)
     balancing = balance_by_passes(lambda: every("Balancing"), balancing, completed=completed)
     return kernel, balancing, sum_up(lambda: every("Summing up"), balancing, order)

@@ -10,6 +10,7 @@ from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.streaming.rows import Picture, RowSource, Tile, transparency
 from nlfilter_torch.streaming.sampling import Report, Sample, patches_at, scaled_patches
+from nlfilter_torch.streaming.tiles import Passes
 
 Look = Callable[[Tensor], Tensor]  # colours (1, C, H, W) to the guide that is compared
 Planes = Callable[[int, int], Tensor]  # of the rows from the first to before the second
@@ -48,7 +49,7 @@ class Painted:
 
 
 def read_strokes(
-    picture: Picture, strokes: RowSource, mask: RowSource | None, *, memory: int, report: Report, name: str = "strokes"
+    picture: Picture, strokes: RowSource, mask: RowSource | None, passes: Passes, *, name: str = "strokes"
 ) -> Painted:
     """Find what is painted over a picture, and in which colours.
 
@@ -56,8 +57,7 @@ def read_strokes(
         picture: below the paint.
         strokes: rows (H, W, 3), read where painted only; or (H, W, 4), whose last channel is the mask.
         mask: rows (H, W) or (H, W, 1), or None.
-        memory: bytes that painted pixels may take.
-        report: told of the progress.
+        passes: whose memory painted pixels may take.
         name: of the strokes, for messages.
 
     Raises:
@@ -79,9 +79,9 @@ def read_strokes(
         return torch.from_numpy(transparency(over.tile(start, stop, 0), "float32"))[..., 0]
 
     if mask is None:
-        painted = _read(picture, opacity, colours, name, memory, report)
+        painted = _read(picture, opacity, colours, name, passes)
     else:
-        painted = _read(picture, _weights(picture, mask, "stroke_mask"), colours, "stroke_mask", memory, report)
+        painted = _read(picture, _weights(picture, mask, "stroke_mask"), colours, "stroke_mask", passes)
     if len(painted.places) == 0:
         raise ValueError(
             f"{name if mask is None else 'stroke_mask'} must hold a painted pixel, got none; paint at least one"
@@ -89,9 +89,9 @@ def read_strokes(
     return painted
 
 
-def read_mask(picture: Picture, mask: RowSource, name: str, *, memory: int, report: Report) -> Painted:
+def read_mask(picture: Picture, mask: RowSource, name: str, passes: Passes) -> Painted:
     """Find the pixels that a mask, rows (H, W) or (H, W, 1), has above 0; errors as of :func:`read_strokes`."""
-    return _read(picture, _weights(picture, mask, name), None, name, memory, report)
+    return _read(picture, _weights(picture, mask, name), None, name, passes)
 
 
 def _weights(picture: Picture, mask: RowSource, name: str) -> Planes:
@@ -111,12 +111,12 @@ def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
     return Picture(rows, name)
 
 
-def _read(picture: Picture, weights: Planes, colours: Planes | None, name: str, memory: int, report: Report) -> Painted:
+def _read(picture: Picture, weights: Planes, colours: Planes | None, name: str, passes: Passes) -> Painted:
     """The pixels whose weights (h, W) are above 0, and their colours out of (3, h, W)."""
     (height, width), step = picture.size, picture.statistics_rows
     places, found, shown, count = [], [], [], 0
     for start in range(0, height, step):
-        report("Reading strokes", start, height)
+        passes.report("Reading strokes", start, height)
         stop = min(start + step, height)
         plane = weights(start, stop).flatten()
         if not bool(((plane >= 0) & (plane <= 1)).all()):
@@ -125,7 +125,7 @@ def _read(picture: Picture, weights: Planes, colours: Planes | None, name: str, 
             )
         chosen = plane.nonzero().squeeze(1)
         count += len(chosen)
-        check_room(picture, count, 0, memory)
+        check_room(picture, count, 0, passes.memory)
         places.append(chosen + start * width)
         found.append(plane[chosen].to(picture.dtype))
         if colours is not None and len(chosen):

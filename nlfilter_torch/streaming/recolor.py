@@ -13,13 +13,13 @@ from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget
 from nlfilter_torch.streaming.sampling import Report
 from nlfilter_torch.streaming.tiles import (
     SAMPLE,
+    Passes,
     Rows,
     Statistics,
-    check_settings,
     check_target,
     fill,
+    in_silence,
     rows_that_fit,
-    work_out,
 )
 from nlfilter_torch.strokes import check_share
 
@@ -80,45 +80,36 @@ def stream_recolor(
         >>> np.array_equal(recoloured[:, :18], picture[:, :18])
         True
     """
-    check_target(target, tuple(source.shape))
+    check_target(target, source)
+    passes = Passes(np.dtype(target.dtype).name, statistics, sample, tile_rows, memory, report or in_silence)
     rows = recolor_rows(
+        passes,
         source,
         strokes,
         stroke_mask,
-        kind=np.dtype(target.dtype).name,
         keep=keep,
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
         patch_size=patch_size,
-        statistics=statistics,
-        sample=sample,
-        tile_rows=tile_rows,
-        memory=memory,
-        report=report,
         **options,
     )
     fill(target, rows)
 
 
 def recolor_rows(
+    passes: Passes,
     source: RowSource,
     strokes: RowSource,
     stroke_mask: RowSource | None = None,
     *,
-    kind: str,
     keep: RowSource | None = None,
     reach: float = 0.8,
     photometric_bandwidth: float = 0.12,
     patch_size: int = 3,
-    statistics: Statistics = "sample",
-    sample: int = SAMPLE,
-    tile_rows: int | None = None,
-    memory: int = 1 << 30,
-    report: Report | None = None,
     names: tuple[str, str] = ("source", "strokes"),
     **options: Any,
 ) -> Rows:
-    """The rows (h, W, S) of :func:`stream_recolor` as dtype ``kind``, as they are asked for.
+    """The rows (h, W, S) of :func:`stream_recolor`, as they are asked for.
 
     Errors call source and strokes by ``names``.
     """
@@ -127,37 +118,32 @@ def recolor_rows(
         raise ValueError(
             f"{names[0]} must have 3 or 4 channels to be recoloured, got {picture.samples}; colourise it instead"
         )
-    check_settings(kind, statistics, sample, tile_rows)
     check_share(reach, "reach", below=True)
     check_patch_size(patch_size)
     landmarks = options.get("num_landmarks", 100)
     check_count(landmarks, "num_landmarks")
-    report = report or (lambda stage, done, rows: None)
-    painted = read_strokes(picture, strokes, stroke_mask, memory=memory, report=report, name=names[1])
-    held = None if keep is None else read_mask(picture, keep, "keep", memory=memory, report=report)
+    painted = read_strokes(picture, strokes, stroke_mask, passes, name=names[1])
+    held = None if keep is None else read_mask(picture, keep, "keep", passes)
     marked = Marked.of(painted, held)
 
     planes = 3 * patch_size**2 + 2
-    check_room(picture, len(marked.places), planes, memory)
+    check_room(picture, len(marked.places), planes, passes.memory)
     rows = rows_that_fit(
         picture,
-        memory,
+        passes,
         # Features and factor, its product with the core and one more, shares of the colours, and some images.
         floats=planes + 4 * landmarks + 6 * marked.count + 40,
         planes=planes,
         num_landmarks=landmarks,
-        sample=sample,
         held=len(marked.places) * floats_of_painted(planes),
     )
     kernel, pairs = fit_spectrum(
         guide,
-        statistics=statistics,
-        sample=sample,
-        report=report,
+        passes,
         photometric_bandwidth=photometric_bandwidth,
         patch_size=patch_size,
         guide_channels="all",
         **options,
     )
-    fitted = fit_dye(picture, guide, kernel, pairs, marked, reach, report)
-    yield from work_out(picture, fitted, kind, patch_size // 2, tile_rows or rows, report)
+    fitted = fit_dye(picture, guide, kernel, pairs, marked, reach, passes.report)
+    yield from passes.work_out(picture, fitted, patch_size // 2, rows)

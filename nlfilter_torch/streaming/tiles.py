@@ -1,6 +1,7 @@
 """What every edit by rows shares: how many rows fit the memory, and tile after tile from a source to a target."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_count
 from nlfilter_torch.streaming import sampling
-from nlfilter_torch.streaming.rows import KINDS, Picture, RowTarget, Tile, stored_as, transparency
+from nlfilter_torch.streaming.rows import KINDS, Picture, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.streaming.sampling import Report
 
 SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
@@ -20,23 +21,55 @@ Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
 Rows = Iterator[tuple[slice, NDArray[Any]]]
 
 
-def check_settings(kind: str, statistics: Statistics, sample: int, tile_rows: int | None) -> None:
-    """Raise unless these are what every edit by rows takes."""
-    check_choice(statistics, "statistics", ("sample", "full"))
-    check_choice(kind, "dtype of the target", KINDS)
-    check_count(sample, "sample")
-    if tile_rows is not None:
-        check_count(tile_rows, "tile_rows")
+def in_silence(stage: str, done: int, rows: int) -> None:
+    """Report nothing."""
 
 
-def coloured_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """Shape of the rows (H, W, 3 or 4) that a grey or coloured source of this shape becomes in colour."""
-    samples = shape[2] if len(shape) == 3 else 1
-    return shape[0], shape[1], 3 if samples in (1, 3) else 4
+@dataclass(frozen=True)
+class Passes:
+    """How any edit goes over the rows of a picture.
+
+    Attributes:
+        kind: dtype of what comes out.
+        statistics: from a sample of the pixels or from all of them.
+        sample: number of its pixels.
+        tile_rows: rows that are worked out at once; None is as many as the memory has room for.
+        memory: bytes that may be used.
+        report: told of the progress.
+    """
+
+    kind: str
+    statistics: Statistics = "sample"
+    sample: int = SAMPLE
+    tile_rows: int | None = None
+    memory: int = 1 << 30
+    report: Report = in_silence
+
+    def __post_init__(self) -> None:
+        """Raise unless all of them fit."""
+        check_choice(self.statistics, "statistics", ("sample", "full"))
+        check_choice(self.kind, "dtype of the target", KINDS)
+        check_count(self.sample, "sample")
+        if self.tile_rows is not None:
+            check_count(self.tile_rows, "tile_rows")
+
+    def work_out(self, picture: Picture, edit: Edit, margin: int, rows: int) -> Rows:
+        """The edited rows, so many at a time unless ``tile_rows`` says it, with the transparency that they had."""
+        for tile in picture.tiles(margin, self.tile_rows or rows):
+            self.report("Filtering", tile.start, picture.size[0])
+            with torch.no_grad():
+                values = stored_as(edit(tile), self.kind)
+            whole = np.concatenate([values, transparency(tile, self.kind)], axis=2)
+            yield slice(tile.start, tile.start + len(values)), whole
+        self.report("Filtering", picture.size[0], picture.size[0])
 
 
-def check_target(target: RowTarget, shape: tuple[int, ...], what: str = "the shape of the source") -> None:
-    """Raise unless rows of this shape can be assigned to the target."""
+def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False) -> None:
+    """Raise unless the source can be read, and the target takes its rows, or those that it becomes in colour."""
+    picture, shape, what = Picture(source), tuple(source.shape), "the shape of the source"
+    if coloured:
+        shape = (*picture.size, 3 if picture.samples in (1, 3) else 4)
+        what = "the height and width of the source, three colours, and transparency where that has it"
     if tuple(target.shape) != shape:
         raise ValueError(f"target must have {what}, {shape}, got {tuple(target.shape)}; make one of that shape")
 
@@ -47,45 +80,33 @@ def fill(target: RowTarget, rows: Rows) -> None:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
 
 
-def work_out(picture: Picture, edit: Edit, kind: str, margin: int, rows: int, report: Report) -> Rows:
-    """The edited rows, a tile at a time, with the transparency that they had."""
-    for tile in picture.tiles(margin, rows):
-        report("Filtering", tile.start, picture.size[0])
-        with torch.no_grad():
-            values = stored_as(edit(tile), kind)
-        yield slice(tile.start, tile.start + len(values)), np.concatenate([values, transparency(tile, kind)], axis=2)
-    report("Filtering", picture.size[0], picture.size[0])
-
-
 def rows_that_fit(
     picture: Picture,
-    memory: int,
+    passes: Passes,
     *,
     floats: int,
     planes: int,
     num_landmarks: int,
-    sample: int,
     held: int = 0,
 ) -> int:
-    """Rows of a tile that can be worked out in ``memory`` bytes.
+    """Rows of a tile that can be worked out in the memory of the passes.
 
     Args:
         picture: to be edited.
-        memory: in bytes.
+        passes: over its rows.
         floats: for each pixel of a tile.
         planes: features of a pixel.
         num_landmarks: M.
-        sample: pixels of the sample.
         held: floats that are held beside it.
 
     Raises:
         MemoryError: if there is not one, or no room for the samples.
     """
-    size = 8 if picture.dtype == torch.float64 else 4
+    size, memory = (8 if picture.dtype == torch.float64 else 4), passes.memory
     row = picture.size[1] * floats * size
     # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
-    later = (pilot + min(picture.pixels, sample)) * planes + block * (num_landmarks + planes + 8)
+    later = (pilot + min(picture.pixels, passes.sample)) * planes + block * (num_landmarks + planes + 8)
     least = size * (held + max(pilot * (num_landmarks + 3 * planes), later))
     if max(row, least) > memory:
         raise MemoryError(
