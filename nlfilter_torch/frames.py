@@ -74,9 +74,14 @@ class FittedFilter:
         residual: float | Tensor | None = None,
         origin: tuple[int, int] = (0, 0),
         halo: tuple[int, int] = (0, 0),
+        by_rows: bool = False,
     ) -> Tensor:
-        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`."""
-        layers, explained = self._smoothed(image, guide, origin, halo)
+        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`.
+
+        ``by_rows`` works out one row after the other: the rounding of a product depends on its shape, which is then the
+        same for tiles of any height.
+        """
+        layers, explained = self._smoothed(image, guide, origin, halo, by_rows=by_rows)
         filtered = weigh_layers(layers, alpha)
         if residual is not None:
             missed = _without(image.to(filtered), halo) - explained
@@ -84,7 +89,13 @@ class FittedFilter:
         return filtered.to(image.dtype)
 
     def _smoothed(
-        self, image: Tensor, guide: Tensor | None, origin: tuple[int, int], halo: tuple[int, int]
+        self,
+        image: Tensor,
+        guide: Tensor | None,
+        origin: tuple[int, int],
+        halo: tuple[int, int],
+        *,
+        by_rows: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Layers (B, k+1, C, H, W) and explained part (B, C, H, W), in the kernel's dtype."""
         channels = self.moments.shape[3]
@@ -98,17 +109,23 @@ class FittedFilter:
         kernel = replace(
             self.kernel, landmarks=self.kernel.landmarks.expand(batch), whitening=self.kernel.whitening.expand(batch)
         )
-        factor, diagonal = kernel.columns(image if guide is None else guide, origin=origin, halo=halo)
-        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor)).unsqueeze(1)
-        remainder = scaling.square() * diagonal.unsqueeze(1)
+        features = kernel.features(image if guide is None else guide, origin=origin, halo=halo)
         image = _without(image, halo)
         size = (image.shape[-2], image.shape[-1])
-        smoothed = [image.to(factor).flatten(2)]
+        step = size[1] if by_rows else features.shape[2]
+        parts = zip(features.split(step, dim=2), image.to(features).flatten(2).split(step, dim=2), strict=True)
+        layers, explained = zip(*(self._smooth(kernel, *part) for part in parts), strict=True)
+        return torch.cat(layers, dim=-1).unflatten(-1, size), torch.cat(explained, dim=-1).unflatten(-1, size)
+
+    def _smooth(self, kernel: Kernel, features: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Layers (B, k+1, C, n) and explained part (B, C, n) of pixels (B, C, n) with features (B, D, n)."""
+        factor, diagonal = kernel.factor(features)
+        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor)).unsqueeze(1)
+        remainder = scaling.square() * diagonal.unsqueeze(1)
+        smoothed = [image]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(scaling * spread(coefficients.mT, factor) + remainder * smoothed[-1])
-        layers = layers_between(torch.stack(smoothed, dim=1)).unflatten(-1, size)  # (B, k+1, C, h, W)
-        explained = (scaling * spread(self.explained.to(factor).mT, factor)).unflatten(-1, size)
-        return layers, explained
+        return layers_between(torch.stack(smoothed, dim=1)), scaling * spread(self.explained.to(factor).mT, factor)
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:

@@ -46,7 +46,10 @@ class Kernel:
             halo: rows at the top and at the bottom of a tile that only patches reach into; they get no columns. Half a
                 patch, or as many as there are before the border of the whole guide.
         """
-        features = self.features(guide, origin=origin, halo=halo)
+        return self.factor(self.features(guide, origin=origin, halo=halo))
+
+    def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
         return nystrom_factor(features, self.landmarks, self.whitening, self.completion)
 
     def features(self, guide: Tensor, *, origin: tuple[int, int], halo: tuple[int, int]) -> Tensor:

@@ -26,6 +26,7 @@ from nlfilter_torch.streaming.tiles import (
     check_target,
     fill,
     in_silence,
+    row_by_row,
     rows_that_fit,
 )
 from nlfilter_torch.strokes import FittedStrokes, check_share, fit_strokes
@@ -148,7 +149,7 @@ def colorize_rows(
     rows = rows_that_fit(
         guide,
         passes,
-        floats=planes + num_landmarks + 40,
+        floats=planes + 40,
         planes=planes,
         num_landmarks=num_landmarks,
         held=len(painted.places) * floats_of_painted(planes),
@@ -190,8 +191,7 @@ class FittedChroma:
     @full_precision
     def __call__(self, tile: Tile) -> Tensor:
         """(1, 3, h, W), for the rows of a tile of the guide."""
-        factor, _ = self.kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
-        return self.strokes(factor).unflatten(2, (tile.inner.shape[-2], tile.inner.shape[-1]))
+        return row_by_row(self.kernel, tile, lambda features: self.strokes(self.kernel.factor(features)[0]))
 
 
 @torch.no_grad()

@@ -158,7 +158,7 @@ def _edit(
     image = tile.pixels if channels == "all" else reduce_channels(tile.pixels, "luminance")
 
     def filtered(sliders: Tensor) -> Tensor:
-        return fitted(image, sliders, tile.pixels, residual=residual, origin=tile.origin, halo=tile.halo)
+        return fitted(image, sliders, tile.pixels, residual=residual, origin=tile.origin, halo=tile.halo, by_rows=True)
 
     def edit(inner: Tensor) -> Tensor:
         return filtered(alpha) if masks is None else blend_regions(inner, masks(tile), alpha, filtered)
@@ -186,7 +186,6 @@ def rows_in_memory(
     check_count(patch_size, "patch_size")
     in_colour = masked or guide_channels == "all"
     planes = patch_size**2 * (picture.colours if in_colour else 1)
-    # A tile: features and factor, or coordinates and their differences from a centre, and some images.
-    floats = num_landmarks * (3 if masked else 1) + planes + (3 * sliders + 8) * picture.colours
+    floats = planes + (3 * sliders + 8) * picture.colours  # features, and some images
     passes = for_masks(passes) if masked else passes
     return rows_that_fit(picture, passes, floats=floats, planes=planes, num_landmarks=num_landmarks)

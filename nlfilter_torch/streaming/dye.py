@@ -10,12 +10,12 @@ from nlfilter_torch.edits.chroma import group_colours, split_luminance
 from nlfilter_torch.edits.recolor import Dye, divide
 from nlfilter_torch.edits.spots import Spots, label_spots, spot_sums, unit_vectors
 from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.nystrom import nystrom_factor
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.painted import Guide, Painted, gather
 from nlfilter_torch.streaming.rows import Picture, Tile
 from nlfilter_torch.streaming.sampling import Report, Sample
+from nlfilter_torch.streaming.tiles import row_by_row
 from nlfilter_torch.strokes import walk_basis
 
 
@@ -85,17 +85,12 @@ class FittedDye:
     @full_precision
     def __call__(self, tile: Tile) -> Tensor:
         """The colours (1, 3, h, W) of the rows of a tile of the picture."""
-        seen = self.guide.seen(tile)
-        features = self.kernel.features(seen.pixels, origin=seen.origin, halo=seen.halo)
-        # Row after row: the rounding of a product depends on its shape, which must not depend on that of the tile.
-        rows = [self.likeness(row) for row in features.split(tile.inner.shape[-1], dim=2)]
-        return self.dye(tile.inner, torch.stack(rows, dim=1)[None], self.marked.planes(tile))
+        likeness = row_by_row(self.kernel, self.guide.seen(tile), self.likeness)
+        return self.dye(tile.inner, likeness, self.marked.planes(tile))
 
     def likeness(self, features: Tensor) -> Tensor:
-        """How much pixels with features (1, D, n) resemble each region, (K', n)."""
-        kernel = self.kernel
-        factor, _ = nystrom_factor(features, kernel.landmarks, kernel.whitening, kernel.completion)
-        return self.division @ unit_vectors(self.basis, factor[0])
+        """How much pixels with features (1, D, n) resemble each region, (1, K', n)."""
+        return (self.division @ unit_vectors(self.basis, self.kernel.factor(features)[0][0]))[None]
 
 
 @torch.no_grad()

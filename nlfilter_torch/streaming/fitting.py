@@ -19,7 +19,7 @@ from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
 from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
 from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, sum_up
-from nlfilter_torch.streaming.tiles import Passes
+from nlfilter_torch.streaming.tiles import Passes, row_by_row
 
 
 def for_masks(passes: Passes) -> Passes:
@@ -74,9 +74,13 @@ class FittedMasks:
 
     def __call__(self, tile: Tile) -> Tensor:
         """Masks (1, K, h, W) in (0, 1]."""
-        coordinates = self.core.to(tile.pixels) @ _columns(tile, self.kernel, self.balancing)
+        return row_by_row(self.kernel, tile, self.masks)
+
+    def masks(self, features: Tensor) -> Tensor:
+        """Of pixels with features (1, D, n): (1, K, n)."""
+        coordinates = self.core.to(features) @ _columns(self.kernel, features, self.balancing)
         exponents = self.scale * squared_distances(coordinates, self.centres.to(coordinates))
-        return torch.exp(-exponents.clamp(max=FARTHEST)).unflatten(2, (tile.inner.shape[-2], tile.inner.shape[-1]))
+        return torch.exp(-exponents.clamp(max=FARTHEST))
 
 
 @torch.no_grad()
@@ -121,7 +125,8 @@ def _region_means(picture: Picture, regions: RowSource, kernel: Kernel, balancin
             raise ValueError("regions must be non-negative and finite, got others; clamp them at 0")
         if not bool((weights > 0).any()):
             continue
-        columns = _columns(picture.tile(start, stop, margin), kernel, balancing)
+        tile = picture.tile(start, stop, margin)
+        columns = _columns(kernel, kernel.features(tile.pixels, origin=tile.origin, halo=tile.halo), balancing)
         total += (columns @ weights.to(columns)).double()
         weight += weights.double().sum(0)
     if not bool((weight > 0).all()):
@@ -129,9 +134,9 @@ def _region_means(picture: Picture, regions: RowSource, kernel: Kernel, balancin
     return total / weight
 
 
-def _columns(tile: Tile, kernel: Kernel, balancing: Tensor) -> Tensor:
-    """F (1, M, n) of the rows of a tile."""
-    factor, diagonal = kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
+def _columns(kernel: Kernel, features: Tensor, balancing: Tensor) -> Tensor:
+    """F (1, M, n) of pixels with features (1, D, n)."""
+    factor, diagonal = kernel.factor(features)
     return factor * scaling_from_moment(factor, diagonal, balancing.to(factor)).unsqueeze(1)
 
 

@@ -131,8 +131,7 @@ def recolor_rows(
     rows = rows_that_fit(
         picture,
         passes,
-        # Features and factor, its product with the core and one more, shares of the colours, and some images.
-        floats=planes + 4 * landmarks + 6 * marked.count + 40,
+        floats=planes + 6 * marked.count + 40,  # features, shares of the colours, and some images
         planes=planes,
         num_landmarks=landmarks,
         held=len(marked.places) * floats_of_painted(planes),

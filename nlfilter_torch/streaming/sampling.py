@@ -15,7 +15,7 @@ from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, 
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.newton import scaling_from_moment
-from nlfilter_torch.nystrom import Affinity, Completion, nystrom_factor, whitener
+from nlfilter_torch.nystrom import Affinity, Completion, whitener
 from nlfilter_torch.spectrum import CUT
 from nlfilter_torch.streaming.rows import Picture, Tile
 from nlfilter_torch.streaming.statistics import Block, start_balancing, sum_up
@@ -57,8 +57,7 @@ class Sample:
             self.weights.split(CHUNK, dim=1),
             strict=True,
         ):
-            columns = nystrom_factor(features, kernel.landmarks, kernel.whitening, kernel.completion)
-            yield Block(*columns, image, weights)
+            yield Block(*kernel.factor(features), image, weights)
 
 
 def all_blocks(picture: Picture, kernel: Kernel, image: Image, report: Report, stage: str) -> Iterator[Block]:
@@ -150,8 +149,7 @@ def take_pilot(
         torch.cat(values, dim=2)[:, :, order[len(candidates) :]],
         torch.full((1, len(even)), weight, dtype=picture.dtype),
     )
-    columns = nystrom_factor(sample.features, kernel.landmarks, kernel.whitening, completion)
-    return Pilot(kernel, sample, start_balancing(*columns, weight), rest.initial_seed())
+    return Pilot(kernel, sample, start_balancing(*kernel.factor(sample.features), weight), rest.initial_seed())
 
 
 def sample_by_influence(

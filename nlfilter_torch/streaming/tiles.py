@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_count
+from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.streaming import sampling
 from nlfilter_torch.streaming.rows import KINDS, Picture, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.streaming.sampling import Report
@@ -80,6 +81,15 @@ def fill(target: RowTarget, rows: Rows) -> None:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
 
 
+def row_by_row(kernel: Kernel, tile: Tile, work: Callable[[Tensor], Tensor]) -> Tensor:
+    """What ``work`` makes of the features (1, D, W) of every row of a tile, (1, C, W) each, as (1, C, h, W).
+
+    The rounding of a product depends on its shape: a row's is the same in tiles of any height.
+    """
+    features = kernel.features(tile.pixels, origin=tile.origin, halo=tile.halo)
+    return torch.stack([work(row) for row in features.split(tile.inner.shape[-1], dim=2)], dim=2)
+
+
 def rows_that_fit(
     picture: Picture,
     passes: Passes,
@@ -104,13 +114,14 @@ def rows_that_fit(
     """
     size, memory = (8 if picture.dtype == torch.float64 else 4), passes.memory
     row = picture.size[1] * floats * size
+    at_hand = picture.size[1] * 4 * num_landmarks  # the factor of one row, and products as large
     # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
     later = (pilot + min(picture.pixels, passes.sample)) * planes + block * (num_landmarks + planes + 8)
-    least = size * (held + max(pilot * (num_landmarks + 3 * planes), later))
+    least = size * (held + at_hand + max(pilot * (num_landmarks + 3 * planes), later))
     if max(row, least) > memory:
         raise MemoryError(
             f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {memory / 1e6:.0f} MB may be "
             "used; allow more, or use fewer landmarks"
         )
-    return max(1, min((memory - size * held) // (2 * row), TILE_PIXELS // picture.size[1]))
+    return max(1, min((memory - size * (held + at_hand)) // (2 * row), TILE_PIXELS // picture.size[1]))
