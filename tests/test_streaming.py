@@ -19,6 +19,7 @@ from nlfilter_torch.landmarks import candidate_pixels
 from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.streaming import sampling, stream_detail
 from nlfilter_torch.streaming.detail import rows_in_memory
+from nlfilter_torch.streaming.influence import draw, sample_by_influence
 from nlfilter_torch.streaming.rows import Picture
 from nlfilter_torch.streaming.statistics import balance_by_passes
 from nlfilter_torch.streaming.tiles import Passes
@@ -176,11 +177,33 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> 
 
     pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=30)
     for spectral in (False, True):
-        parts = sampling.sample_by_influence(picture, pilot, image, 3000, lambda *_: None, spectral=spectral)
+        parts = sample_by_influence(picture, pilot, image, 3000, lambda *_: None, spectral=spectral)
         assert len(parts) > 1
         weights = sampling.Sample.together(parts).weights
         assert 2500 < weights.numel() < 3500
         assert abs(float(weights.sum()) / picture.pixels - 1) < 0.1
+
+
+def test_draws_follow_the_rates_and_leave_no_gap() -> None:
+    generator = np.random.default_rng(0)
+    rates = torch.from_numpy(generator.random(500).clip(0.01)) * 0.9
+    rates[::50] = 1.0
+    drawn, rounds = torch.zeros(500), 4000
+    for _ in range(rounds):
+        chosen, counts = draw(rates, generator)
+        assert (chosen.diff() > 0).all()
+        assert counts.max() <= 2
+        assert abs(int(counts.sum()) - float(rates.sum())) <= 1
+        drawn[chosen] += counts
+    assert (drawn[::50] == rounds).all()
+    # Six deviations of a count whose variance is at most that of independent draws.
+    assert ((drawn / rounds - rates).abs() < 6 * (rates / rounds).sqrt()).all()
+
+
+def test_draws_meet_no_period() -> None:
+    rates, ways = torch.full((4000,), 0.25, dtype=torch.float64), np.random.default_rng(0)
+    even = [int((draw(rates, ways)[0] % 4 == 1).sum()) for _ in range(20)]  # a texture of four pixels
+    assert max(abs(count - 250) for count in even) < 100
 
 
 def test_a_residual_takes_every_pixel() -> None:

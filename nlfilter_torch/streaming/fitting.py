@@ -16,8 +16,9 @@ from nlfilter_torch.masks import FARTHEST, squared_distances
 from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
+from nlfilter_torch.streaming.influence import sample_by_influence
 from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
-from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
+from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, take_pilot
 from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, sum_up
 from nlfilter_torch.streaming.tiles import Passes, row_by_row
 
