@@ -24,7 +24,7 @@ from nlfilter_torch import (
     recolor,
     sharpen,
 )
-from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.recolor import colour_guide
 from nlfilter_torch.edits.spots import MAX_SPOTS, find_spots, label_spots
 from tests.problems import noise
@@ -555,3 +555,10 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
 def test_bad_input(edit: Callable[..., torch.Tensor], image: torch.Tensor, arguments: dict, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         edit(image, **arguments)
+
+
+def test_means_of_regions_are_exact_on_large_images() -> None:
+    mask = box(300, 300, 600, 600, size=(1400, 1400)) * 0.7
+    image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)
+    wanted = (image.double() * mask.double()).sum((2, 3)) / mask.double().sum()
+    torch.testing.assert_close(region_means(image, mask)[:, 0].double(), wanted, rtol=0, atol=1e-7)

@@ -44,8 +44,17 @@ def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tens
         counts = numbers <= labels.amax(1, keepdim=True)  # (B, K)
         members = labels.unsqueeze(1) == torch.where(counts, numbers, 0).unsqueeze(2)  # (B, K, N)
     regions = members * weights.flatten(2)
-    means = regions @ chroma.flatten(2).mT / regions.sum(2, keepdim=True)
-    return regions.unflatten(2, chroma.shape[-2:]), means, counts
+    regions = regions.unflatten(2, chroma.shape[-2:])
+    return regions, region_means(chroma, regions), counts
+
+
+def region_means(image: Tensor, regions: Tensor) -> Tensor:
+    """Means (B, K, C) of an image (B, C, H, W) over regions (B, K, H, W) of weights; summed up in float64.
+
+    In float32 the sums over megapixels would differ in the fifth digit from those over the painted pixels alone.
+    """
+    weights = regions.flatten(2).double()
+    return (weights @ image.flatten(2).double().mT / weights.sum(2, keepdim=True)).to(image)
 
 
 def _label(chroma: Tensor, painted: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_image, check_same_size
-from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.spots import Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -97,7 +97,7 @@ def recolor(
     marked = own if held is None else torch.cat([own, held], dim=1)
     found = [spots.mix(divide(spots)) for spots in find_spots(spectrum, marked, reach)]
     likeness = torch.stack(found).unflatten(2, spectrum.size)
-    old = regions.flatten(2) @ split_luminance(pixels)[1].flatten(2).mT / regions.sum((2, 3)).unsqueeze(2)
+    old = region_means(split_luminance(pixels)[1], regions)
     return Dye(colours, old)(pixels, likeness, marked).to(image.dtype)
 
 

@@ -62,7 +62,7 @@ def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> It
         spots, owners = label_spots(places, numbers, spectrum.size)
         pixels = unit_vectors(basis[b], spectrum.factor[b])
         sums, weight = spot_sums(pixels[:, places], region[numbers, places], spots, len(owners))
-        yield Spots.of_means(sums / weight, F.one_hot(owners, len(region)).to(region), pixels)
+        yield Spots.of_means((sums / weight).to(pixels), F.one_hot(owners, len(region)).to(region), pixels)
 
 
 def unit_vectors(basis: Tensor, factor: Tensor) -> Tensor:
@@ -72,9 +72,14 @@ def unit_vectors(basis: Tensor, factor: Tensor) -> Tensor:
 
 
 def spot_sums(values: Tensor, weights: Tensor, spots: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Sums (J, M) of weighted values (M, n) over J = ``count`` spots, and the weights (J, 1) of these."""
-    sums = values.new_zeros(count, values.shape[0]).index_add(0, spots, (values * weights).mT)
-    return sums, weights.new_zeros(count, 1).index_add(0, spots, weights.unsqueeze(1))
+    """Sums (J, M) of weighted values (M, n) over J = ``count`` spots, and the weights (J, 1) of these, in float64.
+
+    Numbers are added one after the other: in float32 a spot of thousands of pixels would lose the last two digits.
+    """
+    sums = values.new_zeros(count, values.shape[0], dtype=torch.float64)
+    total = weights.new_zeros(count, 1, dtype=torch.float64)
+    weighted = (values * weights).mT.double()
+    return sums.index_add(0, spots, weighted), total.index_add(0, spots, weights.unsqueeze(1).double())
 
 
 def label_spots(places: Tensor, regions: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -105,7 +105,7 @@ def fit_dye(
     basis = walk_basis(pairs, reach)[0].to(picture.dtype)
     spots = _find_spots(found, marked, kernel, basis, picture.size)
     sums, weights = spot_sums(found.image[0], marked.weights, marked.regions, marked.count)  # of the chroma, (K', 3)
-    old = (sums / weights)[: len(marked.colours)]
+    old = (sums / weights)[: len(marked.colours)].to(basis)
     return FittedDye(guide, kernel, marked, basis, divide(spots) @ spots.means, Dye(marked.colours[None], old[None]))
 
 
@@ -119,4 +119,4 @@ def _find_spots(found: Sample, marked: Marked, kernel: Kernel, basis: Tensor, si
         part = numbers[done : done + block.weights.shape[1]]
         more = spot_sums(unit_vectors(basis, block.factor[0]), block.weights[0], part, len(owners))
         sums, weights, done = sums + more[0], weights + more[1], done + len(part)
-    return Spots.of_means(sums / weights, F.one_hot(owners, marked.count).to(basis), basis[:, :0])
+    return Spots.of_means((sums / weights).to(basis), F.one_hot(owners, marked.count).to(basis), basis[:, :0])
