@@ -133,10 +133,20 @@ def _lloyd(points: Tensor, start: Tensor) -> Tensor:
     together = max(1, CACHED_SCORES // (points.shape[2] * start.shape[2]))
     if points.device.type == "cpu" and together < points.shape[0]:
         return torch.cat([_lloyd(*part) for part in zip(points.split(together), start.split(together), strict=True)])
-    assignment = assign(points, start)
+    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # distances, or sums and sizes, in a product
+    centres = start
     for _ in range(ITERATIONS):
-        assignment = assign(points, cluster_means(points, assignment, start))
-    return assignment
+        score = _closeness(extended, centres)
+        # Whatever is nearest, twice where there is a tie: finding the index would take longer than the products.
+        sums = extended @ score.eq_(score.amax(2, keepdim=True))  # (B, D + 1, M)
+        sizes = sums[:, -1:]
+        centres = torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), start)
+    return _closeness(extended, centres).max(dim=2).indices
+
+
+def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
+    """Half the squared length of points, (B, D + 1, S) with ones, less half their squared distance to centres."""
+    return extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)  # (B, S, M)
 
 
 def assign(points: Tensor, centres: Tensor) -> Tensor:
