@@ -1,12 +1,21 @@
-"""Guides and operators that the tests share: seeded noise, photographs, and any guide at all for hypothesis."""
+"""What the tests share: seeded noise, photographs, strokes on them, operators, and any guide at all for hypothesis."""
 
+from functools import cache
+
+import skimage.data
 import torch
 from hypothesis import strategies as st
+from skimage.transform import resize
 
 from nlfilter_torch import NonlocalOperator, nonlocal_operator
 from tests.images import photograph
 
 SAMPLINGS = ("kmeans", "uniform", "random")
+LUMINANCE = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
+
+# Where the astronaut, reduced to 64x64, shows one thing only.
+SUIT = (slice(None), slice(None), slice(36, 50), slice(8, 15))
+BACKGROUND = (slice(None), slice(None), slice(2, 18), slice(40, 46))
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -19,6 +28,27 @@ def noise(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> tor
 
 def picture(name: str, height: int, width: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
     return torch.from_numpy(photograph(name, height, width).copy()).to(dtype)[None, None]
+
+
+@cache
+def colour(name: str, height: int = 64, width: int = 64) -> torch.Tensor:
+    """A photograph (1, 3, height, width), reduced."""
+    picture = getattr(skimage.data, name)() / 255
+    return torch.from_numpy(resize(picture, (height, width), anti_aliasing=True)).permute(2, 0, 1)[None].float()
+
+
+def box(top: int, left: int, height: int = 4, width: int = 4, size: tuple[int, int] = (64, 64)) -> torch.Tensor:
+    mask = torch.zeros(1, 1, *size)
+    mask[..., top : top + height, left : left + width] = 1
+    return mask
+
+
+def paint(red: float, green: float, blue: float, mask: torch.Tensor) -> torch.Tensor:
+    return torch.tensor([red, green, blue]).view(1, 3, 1, 1) * mask
+
+
+def luminance(image: torch.Tensor) -> torch.Tensor:
+    return (image * LUMINANCE.to(image)).sum(1, keepdim=True)
 
 
 @st.composite

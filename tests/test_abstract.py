@@ -1,0 +1,42 @@
+"""Abstraction: its power, its tones and lines, and what is like nothing else."""
+
+import torch
+
+from nlfilter_torch import abstract
+from tests.problems import colour, luminance
+
+
+def test_abstraction_fades_with_its_power() -> None:
+    image = colour("chelsea", 48, 72)
+    torch.testing.assert_close(abstract(image, power=0.0), image, atol=1e-5, rtol=0)
+    changes = [float((abstract(image, power=p) - image).square().mean().sqrt()) for p in (1e-5, 1e-3, 0.1, 1.0)]
+    assert changes == sorted(changes)
+    assert changes[0] < 1e-4
+    assert changes[2] > 0.01
+
+
+def test_what_is_like_nothing_else_is_not_blackened() -> None:
+    """A border that few landmarks stand for stays between its two fields, and these stay what they are."""
+    image = torch.full((1, 1, 40, 60), 0.4)
+    image[..., 30:] = 0.9
+    image[..., 29] = 0.65
+    found = abstract(image, num_landmarks=100)
+    torch.testing.assert_close(found[..., 29], image[..., 29], atol=0.01, rtol=0)
+    assert found.min() > 0.34
+    assert found.max() < 0.98
+
+
+def test_tones_and_lines() -> None:
+    image = colour("chelsea", 48, 72)
+    plain, toned, lined = abstract(image), abstract(image, tones=4), abstract(image, edges=1.0)
+
+    def near_a_tone(picture: torch.Tensor) -> float:
+        """Share of pixels close to one of the tones, which lie half-way between thirds."""
+        return float(((luminance(picture) * 3 - 0.5).frac().sub(0.5).abs() > 0.4).float().mean())
+
+    assert near_a_tone(toned) > 2 * near_a_tone(plain)
+    assert (luminance(lined) <= luminance(plain) + 1e-5).all()
+    assert (luminance(lined) < 0.5 * luminance(plain)).float().mean() > 0.02
+    torch.testing.assert_close(abstract(image, edges=0.5) + 0, (plain + lined) / 2, atol=0.1, rtol=0)
+    grey = abstract(luminance(image), tones=4, edges=1.0)
+    assert grey.shape == (1, 1, 48, 72)

@@ -1,0 +1,51 @@
+"""Colourising: colours come back from strokes, and luminance stays what it was."""
+
+import numpy as np
+import torch
+
+from nlfilter_torch import colorize
+from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from tests.problems import box, colour, luminance, paint
+
+
+def test_colours_come_back_from_strokes() -> None:
+    image = colour("coffee", 60, 90)
+    mask = torch.zeros(1, 1, 60, 90)
+    for row, column in np.random.default_rng(0).integers(0, (56, 86), (12, 2)):
+        mask[..., row : row + 4, column : column + 4] = 1
+    found = colorize(luminance(image), image * mask, mask)
+    assert (luminance(found) - luminance(image)).abs().max() < 1e-4
+    assert (found - image).square().mean() < 0.3 * (luminance(image) - image).square().mean()
+    pieces = colorize(luminance(image), image * mask, mask, method="kmeans")
+    assert (luminance(pieces) - luminance(image)).abs().max() < 1e-4
+    assert not torch.equal(pieces, found)
+
+
+def test_strength_decides_what_becomes_of_the_rest() -> None:
+    grey = torch.full((1, 1, 40, 40), 0.2)
+    grey[..., 20:] = 0.8
+    stroke = box(10, 4, size=(40, 40))
+
+    def chroma(strength: float) -> torch.Tensor:
+        found = colorize(grey, paint(0.4, 0.1, 0.1, stroke), stroke, strength=strength, num_landmarks=40)
+        return split_luminance(found)[1][..., 26:].abs().mean()
+
+    assert chroma(0.0) < 0.01 < chroma(0.5) < chroma(1.0)
+
+
+def test_one_pixel_and_all_pixels_may_be_painted() -> None:
+    image = colour("chelsea", 40, 60)
+    dot = box(20, 30, 1, 1, size=(40, 60))
+    wanted = split_luminance(image)[1][..., 20:21, 30:31]
+    found = split_luminance(colorize(luminance(image), image * dot, dot))[1]
+    torch.testing.assert_close(found[..., 20:21, 30:31], wanted, atol=0.02, rtol=0)
+    full = colorize(luminance(image), image, torch.ones(1, 1, 40, 60))
+    assert (full - image).abs().mean() < 0.01
+
+
+def test_a_colour_too_strong_for_its_luminance_is_weakened() -> None:
+    grey, chroma = torch.tensor([0.05, 0.5, 0.98]).view(1, 1, 1, 3), paint(1, 0, 0, torch.ones(1, 1, 1, 3))
+    found = merge_luminance(grey, split_luminance(chroma)[1])
+    assert found.min() >= 0
+    assert found.max() <= 1
+    torch.testing.assert_close(luminance(found), grey)

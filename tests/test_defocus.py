@@ -1,0 +1,64 @@
+"""Defocus: the subject stays sharp, the rest does not, and neither bleeds into the other."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from nlfilter_torch import defocus
+from tests.problems import box, colour
+
+
+def gradient_energy(image: torch.Tensor, mask: torch.Tensor) -> float:
+    rows, columns = image.diff(dim=2)[..., :-1], image.diff(dim=3)[..., :-1, :]
+    return float(((rows.square() + columns.square()) * mask[..., :-1, :-1]).sum())
+
+
+@pytest.mark.parametrize("aperture", ["disc", "gaussian"])
+def test_the_subject_stays_sharp_and_the_rest_does_not(aperture: str) -> None:
+    image = colour("astronaut", 128, 128)
+    region = box(15, 47, 15, 15, size=(128, 128)) + box(65, 10, 40, 8, size=(128, 128))
+    blurred = defocus(image, region, radius=4.0, aperture=aperture)
+    assert torch.equal(blurred[(region > 0).expand_as(image)], image[(region > 0).expand_as(image)])
+    face = box(22, 45, 20, 18, size=(128, 128))
+    assert gradient_energy(blurred, face) >= 0.95 * gradient_energy(image, face)
+    far = box(0, 95, 60, 33, size=(128, 128))  # the shuttle
+    assert gradient_energy(blurred, far) < 0.3 * gradient_energy(image, far)
+    assert blurred.min() >= image.min() - 1e-4
+    assert blurred.max() <= image.max() + 1e-4
+
+
+def test_the_subject_does_not_bleed() -> None:
+    """A white subject on black leaves no glow, where a plain blur would."""
+    image = torch.zeros(1, 1, 60, 60)
+    image[..., 20:40, 20:40] = 1
+    blurred = defocus(image, box(22, 22, 16, 16, size=(60, 60)), radius=5.0, num_landmarks=40)
+    outside = torch.ones(1, 1, 60, 60)
+    outside[..., 17:43, 17:43] = 0
+    plain = F.avg_pool2d(image, 9, stride=1, padding=4)
+    assert blurred[outside > 0].max() < 0.15 * plain[outside > 0].max()
+
+
+def test_a_dot_may_be_in_focus_and_everything_may() -> None:
+    image = colour("astronaut")
+    assert torch.equal(defocus(image, torch.ones(1, 1, 64, 64), radius=3.0), image)
+    dot = box(40, 10, 1, 1)
+    blurred = defocus(image, dot, radius=3.0)
+    assert torch.equal(blurred[..., 40, 10], image[..., 40, 10])
+    near, far = box(36, 8, 8, 6), box(4, 44, 20, 16)
+    assert gradient_energy(blurred, near) / gradient_energy(image, near) > 0.8
+    assert gradient_energy(blurred, far) / gradient_energy(image, far) < 0.5
+
+
+def test_odd_pixels_of_the_subject_do_not_bring_the_background_into_focus() -> None:
+    image = colour("astronaut", 128, 128)
+    region = box(65, 10, 40, 8, size=(128, 128))
+    odd = box(65, 10, 2, 8, size=(128, 128))  # shows the backdrop
+    image = torch.where(odd > 0, image[..., 10:11, 85:86], image)
+    blurred = defocus(image, region, radius=4.0)
+    far = box(0, 95, 60, 33, size=(128, 128))
+    assert gradient_energy(blurred, far) < 0.3 * gradient_energy(image, far)
+
+
+def test_flat_images_stay_flat() -> None:
+    flat = torch.full((1, 3, 24, 30), 0.3)
+    torch.testing.assert_close(defocus(flat, box(4, 4, size=(24, 30))), flat, atol=1e-5, rtol=0)

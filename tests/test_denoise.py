@@ -1,0 +1,37 @@
+"""Denoising: photographs come closer to what they were, and noise is estimated."""
+
+import pytest
+import torch
+
+from nlfilter_torch import denoise, estimate_noise
+from tests.problems import colour
+
+
+@pytest.mark.parametrize("level", [10, 25])
+def test_denoising_brings_the_photograph_closer(level: int) -> None:
+    clean = colour("chelsea", 64, 96)
+    noisy = clean + level / 255 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    for given in (level / 255, None):
+        gain = 10 * torch.log10(
+            (noisy - clean).square().mean() / (denoise(noisy, noise_level=given) - clean).square().mean()
+        )
+        assert gain > (2.0 if level == 10 else 5.0)
+
+
+def test_no_noise_means_no_change() -> None:
+    image = colour("coffee", 32, 48)
+    assert torch.equal(denoise(image, noise_level=0.0), image)
+    flat = torch.full((1, 1, 20, 20), 0.5)
+    assert torch.equal(denoise(flat), flat)
+    each = denoise(torch.cat([image, image]), noise_level=torch.tensor([0.0, 0.1]))
+    assert torch.equal(each[:1], image)
+    assert not torch.equal(each[1:], image)
+
+
+def test_noise_is_estimated() -> None:
+    level = 15 / 255
+    noisy = 0.5 + level * torch.randn(2, 3, 80, 80, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(estimate_noise(noisy), torch.full((2,), level), atol=0.003, rtol=0)
+    ramp = torch.linspace(0, 1, 80).expand(1, 1, 80, 80) + torch.linspace(0, 1, 80).unsqueeze(1)
+    assert estimate_noise(ramp).item() < 1e-6
+    assert estimate_noise(torch.rand(1, 1, 2, 2, generator=torch.Generator().manual_seed(0))).item() == 0

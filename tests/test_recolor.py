@@ -1,0 +1,156 @@
+"""Recolouring: who takes a colour and who keeps his own, and the groups, spots and means that it is worked out from."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from skimage.measure import label
+
+from nlfilter_torch import nonlocal_operator, recolor
+from nlfilter_torch.edits.chroma import group_colours, region_means, split_luminance
+from nlfilter_torch.edits.recolor import colour_guide
+from nlfilter_torch.edits.spots import MAX_SPOTS, find_spots, label_spots
+from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
+
+
+def blue_suit(image: torch.Tensor, **options: object) -> torch.Tensor:
+    stroke = box(37, 8)
+    return recolor(image, paint(0.1, 0.3, 0.9, stroke), stroke, **options)
+
+
+def test_recolour_keeps_luminance_and_what_is_unlike() -> None:
+    image = colour("astronaut")
+    edited = blue_suit(image)
+    assert (luminance(edited) - luminance(image)).abs().max() <= 1 / 255
+    assert torch.equal(edited[BACKGROUND], image[BACKGROUND])
+    assert (edited == image).all(1).float().mean() > 0.5
+    suit = edited[SUIT]
+    assert (suit[:, 2] > suit[:, 0]).float().mean() > 0.9
+    assert (image[SUIT][:, 2] < image[SUIT][:, 0]).all()
+    assert edited.min() >= -1e-6
+    assert edited.max() <= 1 + 1e-6
+
+
+def test_recolour_within_two_levels_outside_a_kept_region() -> None:
+    image, stroke = colour("coffee", 64, 96), box(38, 20, size=(64, 96))
+    keep = box(2, 40, 4, 50, size=(64, 96))
+    edited = recolor(image, paint(0.1, 0.6, 0.2, stroke), stroke, keep=keep)
+    kept = (keep > 0).expand_as(image)
+    assert (edited - image)[kept].abs().max() <= 2 / 255
+    painted = (stroke > 0)[0, 0]
+    assert (edited[0, 1][painted] > edited[0, 0][painted]).all()
+
+
+def test_one_stroke_does_not_spill() -> None:
+    """Odd pixels under it, here of the backdrop, are painted but do not take their likes along."""
+    image, stroke = colour("astronaut"), box(37, 8, 5, 5)
+    image = torch.where(box(37, 8, 1, 5) > 0, image[..., 6:7, 42:43], image)
+    edited = recolor(image, paint(0.1, 0.3, 0.9, stroke), stroke)
+    assert torch.equal(edited[BACKGROUND], image[BACKGROUND])
+    assert (edited[SUIT][:, 2] > edited[SUIT][:, 0]).float().mean() > 0.9
+    assert (edited != image).any(1).float().mean() < 0.4
+
+
+def test_a_pixel_a_hundred_dots_and_everything_may_be_painted() -> None:
+    image = colour("astronaut")
+    dot = box(40, 10, 1, 1)
+    suit = recolor(image, paint(0.1, 0.3, 0.9, dot), dot)[SUIT]
+    assert (suit[:, 2] > suit[:, 0]).float().mean() > 0.7
+    dots = torch.zeros(1, 1, 64, 64)
+    dots[..., 1::6, 1::6] = 1  # 121 spots of one colour
+    for mask in (dots, torch.ones(1, 1, 64, 64)):
+        edited = recolor(image, paint(0.1, 0.3, 0.9, mask), mask)
+        inside = (mask > 0)[0, 0]
+        assert (edited[0, 2][inside] >= edited[0, 0][inside] - 1e-4).all()
+        assert (luminance(edited) - luminance(image)).abs().max() <= 1 / 255
+
+
+def test_two_colours_reach_their_own_likes() -> None:
+    image = torch.full((1, 3, 40, 40), 0.5)
+    image[:, 0, :, :20], image[:, 2, :, 20:] = 0.8, 0.8  # reddish, bluish
+    left, right = box(4, 4, size=(40, 40)), box(30, 30, size=(40, 40))
+    strokes = paint(0, 1, 0, left) + paint(1, 1, 0, right)
+    edited = recolor(image, strokes, left + right, num_landmarks=40)
+    wanted = split_luminance(paint(0, 1, 0, torch.ones(1, 1, 1, 1)))[1]
+    chroma = split_luminance(edited)[1]
+    for columns, chroma_wanted in (
+        (slice(0, 16), wanted),
+        (slice(24, 40), split_luminance(paint(1, 1, 0, torch.ones(1, 1, 1, 1)))[1]),
+    ):
+        cosine = F.cosine_similarity(chroma[..., columns], chroma_wanted.expand_as(chroma[..., columns]), dim=1)
+        assert cosine.min() > 0.99
+
+
+def test_overlapping_strokes_are_decided_by_the_colour_on_top() -> None:
+    """Strokes are one picture: what was painted last is what it shows."""
+    image = colour("astronaut")
+    under, over = box(36, 8, 6, 6), box(37, 9, 4, 4)
+    strokes = torch.where(over > 0, paint(0.1, 0.3, 0.9, over), paint(0, 0.8, 0, under))
+    regions, colours, counts = group_colours(split_luminance(strokes)[1], torch.maximum(under, over))
+    assert counts.all()
+    assert regions.sum((2, 3)).tolist() == [[20.0, 16.0]]
+    edited = recolor(image, strokes, torch.maximum(under, over))
+    assert torch.isfinite(edited).all()
+    assert colours.shape == (1, 2, 3)
+
+
+def test_a_grey_stroke_takes_colour_away() -> None:
+    stroke = box(37, 8)
+    edited = recolor(colour("astronaut"), paint(0.5, 0.5, 0.5, stroke), stroke)
+    assert (
+        split_luminance(edited[SUIT])[1].abs().mean() < 0.1 * split_luminance(colour("astronaut")[SUIT])[1].abs().mean()
+    )
+
+
+def test_a_colour_is_the_same_to_the_last_bit_wherever_it_stands() -> None:
+    image = colour("astronaut", 61, 83)
+    guide = colour_guide(image)
+    for rows in (slice(0, 1), slice(3, 10), slice(20, 61)):
+        assert torch.equal(colour_guide(image[:, :, rows]), guide[:, :, rows])
+
+
+def test_groups_of_colours_are_kept_apart_image_by_image() -> None:
+    chroma = torch.zeros(2, 3, 1, 40)
+    chroma[0, 0] = torch.arange(40) * 0.1  # forty colours
+    regions, means, counts = group_colours(chroma, torch.ones(2, 1, 1, 40))
+    assert regions.shape == (2, 16, 1, 40)
+    assert counts[0].all()
+    assert counts[1].tolist() == [True] + [False] * 15
+    torch.testing.assert_close(regions[0].sum(0), torch.ones(1, 40))  # further ones joined the nearest
+    assert torch.equal(means[1], torch.zeros(16, 3))
+
+
+def test_means_of_regions_are_exact_on_large_images() -> None:
+    mask = box(300, 300, 600, 600, size=(1400, 1400)) * 0.7
+    image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)
+    wanted = (image.double() * mask.double()).sum((2, 3)) / mask.double().sum()
+    torch.testing.assert_close(region_means(image, mask)[:, 0].double(), wanted, rtol=0, atol=1e-7)
+
+
+def test_spots_beyond_the_last_that_is_kept_apart_are_taken_together() -> None:
+    image = colour("astronaut")
+    spectrum = nonlocal_operator(image, num_landmarks=40, photometric_bandwidth=0.2, guide_channels="all").spectrum()
+    dots = torch.zeros(1, 2, 64, 64)
+    dots[:, 0, 1::4, 1::4], dots[:, 1, 3::16, 3::16] = 0.5, 1.0  # 256 and 16
+    (spots,) = find_spots(spectrum, dots, 0.5)
+    assert spots.owners.sum(0).tolist() == [MAX_SPOTS, 16]
+    torch.testing.assert_close(spots.between.diagonal(), torch.ones(MAX_SPOTS + 16), atol=1e-4, rtol=0)
+    each = spots.mix(torch.eye(MAX_SPOTS + 16))
+    assert each.abs().max() <= 1 + 1e-3
+    single = dots[0, 1].flatten() > 0  # a dot correlates with itself fully
+    torch.testing.assert_close(each[MAX_SPOTS:, single].diagonal(), torch.ones(16), atol=1e-3, rtol=0)
+
+
+def test_spots_are_what_is_connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.edits.spots.MAX_SPOTS", 10**9)
+    for number, size in enumerate([(1, 1), (1, 9), (9, 1), (7, 8), (40, 31)]):
+        for density in (0.1, 0.3, 0.5, 0.8, 1.0):
+            planes = torch.rand(3, *size, generator=torch.Generator().manual_seed(number)) < density
+            planes[0, 0, 0] = True
+            regions, places = planes.flatten(1).nonzero().unbind(1)
+            spots, owners = label_spots(places, regions, size)
+            parts = [label(plane.numpy(), connectivity=2) for plane in planes]
+            counts = torch.tensor([part.max() for part in parts])
+            offsets = counts.cumsum(0) - counts - 1
+            wanted = torch.cat([torch.from_numpy(p[p > 0]) + o for p, o in zip(parts, offsets, strict=True)])
+            assert torch.equal(spots, wanted)
+            assert torch.equal(owners, torch.arange(3).repeat_interleave(counts))

@@ -1,0 +1,68 @@
+"""Tone, sharpening and the detail of regions: what they raise, and what they leave alone."""
+
+import pytest
+import torch
+
+from nlfilter_torch import adjust_tone, enhance, nonlocal_operator, polynomial_filter, sharpen
+from nlfilter_torch.edits.chroma import split_luminance
+from tests.problems import BACKGROUND, SUIT, box, colour, luminance
+
+
+def test_tone_holds_mean_and_colours() -> None:
+    image = colour("coffee", 40, 60)
+    strong = adjust_tone(image, contrast=1.4, clarity=3.0)
+    torch.testing.assert_close(strong.mean((2, 3)), image.mean((2, 3)), atol=1e-5, rtol=0)
+    torch.testing.assert_close(split_luminance(strong)[1], split_luminance(image)[1], atol=1e-5, rtol=0)
+    assert luminance(strong).std() > 1.2 * luminance(image).std()
+    torch.testing.assert_close(adjust_tone(image), image, atol=1e-5, rtol=0)
+    grey = luminance(image)
+    operator = nonlocal_operator(grey)
+    mean = grey.mean()
+    expected = mean + polynomial_filter(operator, grey - mean, torch.tensor([1.0, 1.0, 3.0, 1.4]))
+    torch.testing.assert_close(adjust_tone(grey, contrast=1.4, clarity=3.0), expected)
+
+
+def test_sharpening_raises_edges_and_spares_noise() -> None:
+    clean = luminance(colour("astronaut", 96, 96))
+    noisy = clean + 10 / 255 * torch.randn(2, 1, 96, 96, generator=torch.Generator().manual_seed(0))
+    sharp = sharpen(noisy, amount=5.0)
+    direction = torch.stack([clean.diff(dim=3)[..., :-1, :], clean.diff(dim=2)[..., :-1]])
+    strength = direction.norm(dim=0)
+    strong = strength > strength.quantile(0.95)
+
+    def slope(image: torch.Tensor) -> torch.Tensor:
+        mean = image.mean(0, keepdim=True)
+        gradient = torch.stack([mean.diff(dim=3)[..., :-1, :], mean.diff(dim=2)[..., :-1]])
+        return ((gradient * direction).sum(0) / strength)[strong].mean()
+
+    wall = (slice(None), slice(None), slice(2, 18), slice(58, 70))
+    assert slope(sharp) > 1.2 * slope(noisy)
+    assert (sharp[0] - sharp[1])[wall[1:]].std() < 1.2 * (noisy[0] - noisy[1])[wall[1:]].std()
+    torch.testing.assert_close(sharpen(clean, amount=1.0), clean, atol=1e-5, rtol=0)
+    assert not torch.equal(sharpen(clean), sharpen(clean, guide_blur=0.0))
+
+
+def test_detail_reaches_the_likes_of_a_region_only() -> None:
+    image = colour("astronaut")
+    sliders = torch.tensor([4.0, 4.0, 4.0, 1.0])
+    whole = enhance(image, sliders)
+    torch.testing.assert_close(enhance(image, torch.ones(4)), image, atol=1e-5, rtol=0)
+    part = enhance(image, sliders, box(37, 8))
+    change, full = (part - image).abs().mean(1), (whole - image).abs().mean(1)
+    assert change[0, 36:50, 8:15].mean() > 0.4 * full[0, 36:50, 8:15].mean()
+    assert change[0, 2:18, 40:46].mean() < 0.15 * full[0, 2:18, 40:46].mean()
+    none = enhance(image, sliders, box(37, 8), negative=box(37, 8))
+    assert (none - image).abs().mean() < (part - image).abs().mean()
+    two = enhance(
+        image, torch.stack([sliders, torch.tensor([0.0, 0.0, 1.0, 1.0])]), torch.cat([box(37, 8), box(4, 42)], 1)
+    )
+    assert (two - part).abs()[BACKGROUND].max() > 0
+    everything = enhance(image, sliders, torch.ones(1, 1, 64, 64))
+    assert torch.isfinite(everything).all()
+    dot = enhance(image, sliders, box(40, 10, 1, 1))
+    share = [((dot - image).abs()[place].mean() / (whole - image).abs()[place].mean()) for place in (SUIT, BACKGROUND)]
+    assert share[0] > 3 * share[1]
+    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+        enhance(image, sliders, negative=box(1, 1))
+    with pytest.raises(ValueError, match=r"alpha must have shape \(1, k\+1\)"):
+        enhance(image, torch.ones(2, 4), box(1, 1))
