@@ -1,0 +1,196 @@
+"""What of a layer learns, where it starts, what it may become, and sliders that come from elsewhere."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nlfilter_torch import (
+    DiffusionMask,
+    NonlocalAffinity,
+    NonlocalFilter,
+    PolynomialSliders,
+    detail_layers,
+    diffusion_mask,
+    estimate_bandwidth,
+    nonlocal_operator,
+    polynomial_filter,
+)
+from nlfilter_torch.features import patch_window
+from tests.layers import ALPHA, EVERYTHING, OPTIONS, backward, everything, image, untouched
+from tests.problems import noise
+
+
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_only_what_is_named_learns(name: str) -> None:
+    layer = NonlocalFilter(ALPHA, learn=(name,), spatial_bandwidth=9.0, **OPTIONS)
+    assert len(list(layer.parameters())) == 1
+    for gradient in backward(layer, image()).values():
+        assert gradient.isfinite().all()
+        assert gradient.abs().max() > 0
+
+
+def test_every_parameter_gets_a_gradient() -> None:
+    assert set(backward(everything(), image())) == {
+        "affinity.photometric_bandwidth.logarithm",
+        "affinity.spatial_bandwidth.logarithm",
+        "affinity.patch_weights.logits",
+        "sliders.alpha",
+        "sliders.residual",
+    }
+
+
+def test_learning_starts_from_the_function() -> None:
+    operator = nonlocal_operator(image(), spatial_bandwidth=9.0, **OPTIONS)
+    expected = polynomial_filter(operator, image(), torch.tensor(ALPHA), residual=ALPHA[0])
+    torch.testing.assert_close(everything()(image()), expected, atol=1e-5, rtol=0)
+
+
+def test_automatic_bandwidth_learns_a_factor() -> None:
+    layer = NonlocalFilter(ALPHA, learn=("photometric_bandwidth",), num_landmarks=20)
+    expected = NonlocalFilter(ALPHA, num_landmarks=20)(image())
+    torch.testing.assert_close(layer(image()), expected, atol=1e-5, rtol=0)
+    with torch.no_grad():
+        layer.affinity.photometric_bandwidth.logarithm += math.log(1.5)
+    wider = nonlocal_operator(image(), photometric_bandwidth=1.5 * estimate_bandwidth(image()), num_landmarks=20)
+    torch.testing.assert_close(
+        layer(image()), polynomial_filter(wider, image(), torch.tensor(ALPHA)), atol=1e-5, rtol=0
+    )
+    assert "photometric_bandwidth=1.5 * auto" in repr(layer)
+
+
+def test_learned_numbers_are_shown_as_they_are() -> None:
+    text = repr(everything())
+    for part in ("photometric_bandwidth=0.2", "spatial_bandwidth=9", "residual=3.0", "5x5"):
+        assert part in text
+    assert "time=2.5, width=3" in repr(DiffusionMask(time=2.5, width=3.0, learn=("time", "width")))
+
+
+@pytest.mark.parametrize("rate", [1.0, 30.0])
+def test_positive_things_stay_positive_under_any_step(rate: float) -> None:
+    layer = everything()
+    optimizer = torch.optim.SGD(layer.parameters(), lr=rate)
+    mask = DiffusionMask(learn=("time", "width"))
+    for parameter in (*layer.parameters(), *mask.parameters()):
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    torch.optim.SGD(mask.parameters(), lr=rate).step()
+    for positive in (layer.affinity.photometric_bandwidth(), mask.time(), mask.width(), layer.affinity.patch_weights()):
+        assert (positive > 0).all()
+    torch.testing.assert_close(layer.affinity.patch_weights().sum(), torch.tensor(1.0))
+
+
+def test_a_given_window_is_the_start_of_patch_weights() -> None:
+    window = patch_window(3) + 0.01
+    layer = NonlocalAffinity(patch_weights=window, learn="patch_weights", **OPTIONS)
+    torch.testing.assert_close(layer.patch_weights(), (window / window.sum()).float())
+    fixed = NonlocalAffinity(patch_weights=window, **OPTIONS)
+    torch.testing.assert_close(fixed(image()) @ image(), layer(image()) @ image(), atol=1e-5, rtol=0)
+    assert not list(fixed.parameters())
+
+
+def test_mask_learns_time_and_width() -> None:
+    spectrum = nonlocal_operator(image(), **OPTIONS).spectrum()
+    region = noise(2, 1, 12, 13, dtype=torch.float32)
+    layer = DiffusionMask(time=1.5, width=6.0, learn=("time", "width"))
+    torch.testing.assert_close(layer(spectrum, region), diffusion_mask(spectrum, region, time=1.5, width=6.0))
+    for gradient in backward(layer, spectrum, region).values():
+        assert gradient.isfinite()
+        assert gradient != 0
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4), (2, 4, 12, 13), (1, 4, 12, 13), (2, 6)])
+def test_sliders_of_a_call_come_from_elsewhere(shape: tuple[int, ...]) -> None:
+    layer = NonlocalFilter(ALPHA, learn=(), **OPTIONS)
+    alpha = noise(*shape, seed=5, dtype=torch.float32).requires_grad_()
+    filtered = layer(image(), alpha=alpha)
+    torch.testing.assert_close(filtered, polynomial_filter(nonlocal_operator(image(), **OPTIONS), image(), alpha))
+    filtered.square().mean().backward()
+    assert (alpha.grad != 0).all()
+
+
+def test_sliders_of_a_call_train_the_network_that_finds_them() -> None:
+    layer = NonlocalFilter(learn=(), **OPTIONS)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = nn.Conv2d(3, 4, 3, padding=1)
+    layer(image(), alpha=network(image())).square().mean().backward()
+    assert all((p.grad != 0).any() for p in network.parameters())
+
+
+def test_held_layers_take_sliders_of_a_call() -> None:
+    operator, alpha = nonlocal_operator(image(), **OPTIONS), noise(2, 4, seed=5, dtype=torch.float32)
+    sliders = PolynomialSliders(ALPHA)
+    layers = detail_layers(operator, image())
+    torch.testing.assert_close(sliders.combine(layers, alpha), sliders(operator, image(), alpha))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: NonlocalFilter(learn=("alpha", "gamma")), ValueError, r"learn must name 'alpha', .*, got 'gamma'"),
+        (lambda: NonlocalFilter(learn="bandwidth"), ValueError, "got 'bandwidth'"),
+        (lambda: NonlocalAffinity(learn=("alpha",)), ValueError, "learn must name 'photometric_bandwidth'"),
+        (lambda: PolynomialSliders(learn=("time",)), ValueError, "learn must name 'alpha', 'residual'"),
+        (lambda: DiffusionMask(learn=("alpha",)), ValueError, "learn must name 'time', 'width'"),
+        (lambda: NonlocalFilter(photometric_bandwidth=0.0), ValueError, "photometric_bandwidth must be positive"),
+        (
+            lambda: NonlocalFilter(photometric_bandwidth=-1.0, learn="photometric_bandwidth"),
+            ValueError,
+            "photometric_bandwidth must be positive and finite, got -1",
+        ),
+        (
+            lambda: NonlocalFilter(photometric_bandwidth="car"),
+            ValueError,
+            "photometric_bandwidth must be one of 'auto'",
+        ),
+        (lambda: NonlocalFilter(spatial_bandwidth=-3.0), ValueError, "spatial_bandwidth must be positive"),
+        (lambda: NonlocalFilter(learn="spatial_bandwidth"), ValueError, "spatial_bandwidth must be a number of pixels"),
+        (lambda: NonlocalFilter(patch_size=4, learn="patch_weights"), ValueError, "patch_size must be odd"),
+        (lambda: DiffusionMask(width=0.0), ValueError, "width must be positive"),
+        (lambda: DiffusionMask(time=-1.0, learn="time"), ValueError, "time must be positive"),
+        (lambda: NonlocalFilter((1.0,)), ValueError, "alpha must have at least two entries"),
+        (lambda: NonlocalFilter((1.0, math.nan)), ValueError, "alpha must be finite"),
+    ],
+)
+def test_bad_construction_is_one_clear_sentence(
+    make: Callable[[], nn.Module], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (
+            lambda f: f(image(), alpha=torch.ones(3, 4)),
+            ValueError,
+            "alpha must have the batch size of the layers, 2, got 3",
+        ),
+        (lambda f: f(image(), alpha=torch.ones(2, 4, 5, 5)), ValueError, "alpha must have the height and width"),
+        (lambda f: f(image(), alpha=torch.ones(2, 1)), ValueError, "alpha must have at least two entries"),
+        (lambda f: f(image(), alpha=torch.ones(2, 2, 2)), ValueError, "alpha must have shape"),
+        (lambda f: f(image(), guide=image(batch=3)), ValueError, "batch size"),
+        (lambda f: f(image(), mask=torch.ones(2, 1, 5, 5)), ValueError, "mask must have the height and width"),
+        (lambda f: f(image().to(torch.float8_e4m3fn)), TypeError, "must be of a floating-point dtype .*float8"),
+        (lambda f: f(image(), guide=image().to(torch.int32)), TypeError, "guide must be of a floating-point dtype"),
+        (lambda f: f(image().to(torch.complex64)), TypeError, "must be of a floating-point dtype"),
+    ],
+)
+def test_bad_call_leaves_the_parameters_untouched(
+    call: Callable[[nn.Module], Tensor], error: type[Exception], message: str
+) -> None:
+    layer = everything()
+    with untouched(layer), pytest.raises(error, match=message):
+        call(layer).mean().backward()
+
+
+def test_a_bandwidth_that_left_its_range_is_told() -> None:
+    layer = everything()
+    with torch.no_grad():
+        layer.affinity.photometric_bandwidth.logarithm.fill_(math.nan)
+    with pytest.raises(ValueError, match="photometric_bandwidth must be positive and finite"):
+        layer(image())
