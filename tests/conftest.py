@@ -1,8 +1,14 @@
-"""Settings shared by every test."""
+"""Settings and fixtures shared by every test."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+
+if TYPE_CHECKING:
+    from nlfilter_torch.app.session import Session
 
 # Fixed examples: a test that passed does not fail tomorrow. No deadline: shared machines are slow at times.
 settings.register_profile(
@@ -20,3 +26,17 @@ settings.load_profile("fixed")
 def generator() -> torch.Generator:
     """A source of randomness that is not the global one."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> "Session":
+    """The editor's, with a small photograph open: cat.png, in the folder that it saves in."""
+    # Not above: tests of the filter run where nothing that reads files is installed.
+    from nlfilter_torch.app.session import Session
+    from nlfilter_torch.files import Photograph, write_photograph
+    from tests.problems import cat
+
+    write_photograph(Photograph(cat()), tmp_path / "cat.png")
+    session = Session(tmp_path)
+    session.open(tmp_path / "cat.png")
+    return session

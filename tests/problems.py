@@ -17,6 +17,9 @@ LUMINANCE = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
 SUIT = (slice(None), slice(None), slice(36, 50), slice(8, 15))
 BACKGROUND = (slice(None), slice(None), slice(2, 18), slice(40, 46))
 
+# A stroke over the small cat, in pixels.
+LINE = [(20.0, 20.0), (40.0, 22.0)]
+
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
@@ -37,6 +40,11 @@ def colour(name: str, height: int = 64, width: int = 64) -> torch.Tensor:
     return torch.from_numpy(resize(picture, (height, width), anti_aliasing=True)).permute(2, 0, 1)[None].float()
 
 
+def cat(step: int = 3) -> torch.Tensor:
+    """(1, 3, 100, 150) in [0, 1] for a step of 3."""
+    return torch.from_numpy(skimage.data.chelsea()[::step, :450:step].copy()).permute(2, 0, 1)[None].float() / 255
+
+
 def box(top: int, left: int, height: int = 4, width: int = 4, size: tuple[int, int] = (64, 64)) -> torch.Tensor:
     mask = torch.zeros(1, 1, *size)
     mask[..., top : top + height, left : left + width] = 1
@@ -49,6 +57,11 @@ def paint(red: float, green: float, blue: float, mask: torch.Tensor) -> torch.Te
 
 def luminance(image: torch.Tensor) -> torch.Tensor:
     return (image * LUMINANCE.to(image)).sum(1, keepdim=True)
+
+
+def difference(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Largest difference in grey levels of 255, within what a screen can show."""
+    return float((a.clamp(0, 1) - b.clamp(0, 1)).abs().max()) * 255
 
 
 @st.composite

@@ -1,0 +1,62 @@
+"""What the editor draws: pictures, masks, strokes and responses; and the range of its controls."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nlfilter_torch.app import controls, drawing
+from nlfilter_torch.brush import Stroke
+from nlfilter_torch.recipe import STEPS, Recipe
+from nlfilter_torch.steps import Detail
+from tests.problems import cat
+
+
+def decoded(content: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def test_pictures() -> None:
+    image = cat()
+    found = torch.from_numpy(decoded(drawing.picture(image)).copy()).permute(2, 0, 1)[None] / 255
+    assert (found - image).square().mean().sqrt() * 255 < 3
+    assert decoded(drawing.picture(image[:, :1])).shape == (100, 150)
+    mask = torch.linspace(0, 1, 15000).view(1, 1, 100, 150)
+    layer = decoded(drawing.mask_picture(mask))
+    assert layer.shape == (100, 150, 4)
+    assert (layer[0, 0, 3], layer[-1, -1, 3]) == (0, drawing.OPACITY)
+
+
+def test_strokes_are_drawn_as_painted() -> None:
+    svg = drawing.strokes_svg(
+        [Stroke(((0.5, 0.25),), 0.1, "in"), Stroke(((0.0, 0.0), (1.0, 1.0)), 0.1, "#aabbcc")], (100, 200)
+    )
+    assert 'd="M100.0 25.0L100.0 25.0" stroke="#22c55e" stroke-width="20.0"' in svg
+    assert 'd="M0.0 0.0L200.0 100.0" stroke="#aabbcc"' in svg
+
+
+def test_response_has_a_line_for_each_region_and_a_dot_for_each_eigenvalue() -> None:
+    eigenvalues = torch.tensor([1.0, 0.5, 0.0])
+    svg = drawing.response_svg(eigenvalues, [("red", (3.0, 1.0)), ("blue", (0.0, 0.0, 1.0))])
+    assert svg.count("<polyline") == 2
+    assert svg.count("<circle") == 6
+    assert svg.count('class="mark"') == 3
+    # Gains from 0 to 3 lie between y = 112 and y = 10; sliders (3, 1) give 3, 2, 1.
+    assert [f'cy="{y:.1f}" r="1.6" fill="red"' in svg for y in (10.0, 44.0, 78.0)] == [True] * 3
+
+
+@pytest.mark.parametrize(
+    "control", [c for step in controls.OF_STEP.values() for c in step] + list(controls.detail_sliders("inside", 3))
+)
+def test_controls_stay_within_what_a_step_takes(control: controls.Control) -> None:
+    recipe = Recipe(Detail((1.0,) * 3, (1.0,) * 3))
+    wanted, is_valid = STEPS[control.step].VALID[control.entry]
+    assert control.low <= control.read(recipe) <= control.high
+    for value in (control.low, control.high):
+        entries = control.entries(recipe, value)
+        changed = entries[control.entry]
+        assert is_valid(list(changed) if isinstance(changed, tuple) else changed), wanted
+        step = type(getattr(recipe, control.step))(**entries) if control.index is None else Detail((1.0,) * 3, changed)
+        assert control.read(Recipe(**{control.step: step})) == value

@@ -1,0 +1,158 @@
+"""Files that the editor opens and saves: as the command line writes them, and refusals that leave all as it was."""
+
+import io
+import socket
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+from PIL import Image
+
+import nlfilter_torch.files
+from nlfilter_torch.app.session import Session
+from nlfilter_torch.cli import main
+from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.recipe import Recipe
+from tests.problems import LINE, cat, difference
+
+
+@pytest.fixture
+def photo(session: Session) -> Path:
+    """The file that is open."""
+    return session.folder / "cat.png"
+
+
+def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> None:
+    """All steps together, to 1/255."""
+    session.set("detail", alpha=(1.5, 1.5, 1.5, 1.0))
+    session.add_stroke("detail", LINE, 0.03, "in")
+    session.set("detail", inside=(0.2, 0.5, 1.0, 1.0))
+    session.add_stroke("recolor", LINE, 0.03, "#2040e0")
+    session.add_stroke("defocus", LINE, 0.05, "in")
+    session.set("abstract", edges=0.5)
+    saved = read_photograph(session.save("out.png")).pixels
+    edit = session.save_preset("edit.json")
+    assert Recipe.find(str(edit)) == session.recipe
+    assert main(["apply", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
+    assert difference(saved, read_photograph(photo.with_name("cli.png")).pixels) <= 1
+    assert difference(saved, session.recipe.apply(cat())) <= 1
+
+
+def test_sliders_alone_are_a_preset_of_detail(session: Session, photo: Path) -> None:
+    session.set("detail", alpha=(3.0, 3.0, 4.0, 1.05), bandwidth=12.0)
+    saved, edit = session.save("out.png"), session.save_preset("edit.json")
+    assert main(["detail", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
+    assert difference(read_photograph(saved).pixels, read_photograph(photo.with_name("cli.png")).pixels) <= 1
+
+
+def test_grey_photographs_become_coloured_files(tmp_path: Path) -> None:
+    write_photograph(Photograph(reduce_channels(cat(), "luminance"), "uint16"), tmp_path / "grey.png")
+    session = Session(tmp_path)
+    session.open(tmp_path / "grey.png")
+    session.add_stroke("colorize", LINE, 0.03, "#2040e0")
+    assert session.render().shape == (1, 3, 100, 150)
+    saved = read_photograph(session.save("colour.png"))
+    assert saved.pixels.shape == (1, 3, 100, 150)
+    assert saved.depth == "uint16"
+
+
+@pytest.mark.parametrize(
+    ("name", "photograph", "wanted"),
+    [
+        ("a.jpg", Photograph(cat(9)), "a-edited.jpg"),
+        ("a.PNG", Photograph(cat(9)), "a-edited.png"),
+        ("a.jpg", Photograph(cat(9), "uint16"), "a-edited.png"),
+        ("a.jpg", Photograph(cat(9), alpha=cat(9)[:, :1]), "a-edited.png"),
+        ("a", Photograph(cat(9), "float32"), "a-edited.tif"),
+    ],
+)
+def test_names_to_save_under(session: Session, name: str, photograph: Photograph, wanted: str) -> None:
+    assert session.opened is not None
+    session.opened = type(session.opened)(name, photograph, session.preview)
+    assert session.suggested_name() == wanted
+    session.save(wanted)  # which can hold it
+    assert Session(session.folder).suggested_name() == ""
+
+
+def test_files_that_are_no_images_leave_all_as_it_was(session: Session, tmp_path: Path) -> None:
+    session.set("abstract", power=0.1)
+    opened, recipe = session.opened, session.recipe
+    with pytest.raises(ValueError, match=r"^notes\.txt is not a PNG, JPEG, TIFF or WebP image"):
+        session.open_bytes(b"dear diary", "notes.txt")
+    with pytest.raises(ValueError, match=r"^empty\.png is empty"):
+        session.open_bytes(b"", "empty.png")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        session.open(tmp_path / "none.png")
+    assert (session.opened, session.recipe) == (opened, recipe)
+
+
+def test_a_photograph_too_large_for_the_machine(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = type("Memory", (), {"available": 8 * 10**9})
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    content = io.BytesIO()
+    Image.new("L", (10_000, 10_000)).save(content, format="PNG")
+    opened = session.opened
+    with pytest.raises(MemoryError, match=r"^huge\.png has 10000x10000 pixels and needs about .* GB of memory"):
+        session.open_bytes(content.getvalue(), "huge.png")
+    assert session.opened is opened
+
+
+def test_an_edit_too_large_for_the_machine(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = type("Memory", (), {"available": 10**6})
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    session.add_stroke("defocus", LINE, 0.05, "in")
+    with pytest.raises(MemoryError, match=r"cat\.png has 150x100 pixels and needs"):
+        session.save("out.png")
+    assert not (session.folder / "out.png").exists()
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b.png", "/tmp/b.png", ".hidden.png", "a\0.png", "../b.png"])
+def test_names_that_lead_out_of_the_folder(session: Session, name: str) -> None:
+    for save in (session.save, session.save_preset):
+        with pytest.raises(ValueError, match="the name must be one of a file"):
+            save(name)
+
+
+def test_saving_what_cannot_be_saved(session: Session, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"must end in \.png, \.jpg"):
+        session.save("out.gif")
+    with pytest.raises(ValueError, match=r"must end in \.json"):
+        session.save_preset("out.png")
+    with pytest.raises(ValueError, match="there is nothing to save"):
+        Session(tmp_path).save("out.png")
+    session.folder = tmp_path / "gone"
+    with pytest.raises(ValueError, match="does not exist"):
+        session.save("out.png")
+
+
+def test_an_interrupted_save_leaves_the_old_file(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = session.save("out.png")
+    before = target.read_bytes()
+    session.set("abstract", power=0.5)
+
+    def break_off(image: Image.Image, stream: io.BytesIO, **options: object) -> None:
+        stream.write(before[:100])
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(nlfilter_torch.files.Image.Image, "save", break_off)
+    with pytest.raises(OSError, match="no space left"):
+        session.save("out.png")
+    assert target.read_bytes() == before
+    assert sorted(file.name for file in session.folder.iterdir()) == ["cat.png", "out.png"]
+
+
+def test_app_says_what_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["app", "--out", str(tmp_path / "gone"), "--no-open"]) == 2
+    assert "does not exist; make the folder first" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2
+    assert f"cannot listen on --host 127.0.0.1 --port {port}" in capsys.readouterr().err
+    monkeypatch.delitem(sys.modules, "nlfilter_torch.app.server")
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    assert main(["app", "--out", str(tmp_path), "--no-open"]) == 2
+    assert "the editor needs nicegui, which is not installed" in capsys.readouterr().err
