@@ -1,0 +1,258 @@
+"""Detail by rows on the command line: the result of one in memory, and what happens when something breaks."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import tifffile
+import torch
+import zarr
+from PIL import Image
+
+from nlfilter_torch.cli import main
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.streaming.tiff_rows import TiffRows
+from tests.test_streaming_files import PROFILE, Array, cat
+
+LITTLE = "0.03"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples and blocks in proportion to small pictures."""
+    monkeypatch.setattr("nlfilter_torch.streaming.sampling.PILOT", 8000)
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 6000)
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    """An RGBA file of 16 bits with a profile, 300x200."""
+    picture = cat(200, 300, 4).astype(np.float32) / 255
+    planes = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    photograph = Photograph(planes[:, :3], "uint16", planes[:, 3:], PROFILE)
+    write_photograph(photograph, tmp_path / "in.tif")
+    return tmp_path / "in.tif"
+
+
+def detail(*arguments: object) -> int:
+    return main(["detail", *map(str, arguments), "--landmarks", "40"])
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".png"])
+@pytest.mark.parametrize("options", [(), ("--channels", "all", "--depth", "8"), ("--region", "40,60,20,20:0,1,1,1")])
+def test_detail_by_rows_is_detail(photo: Path, tmp_path: Path, suffix: str, options: tuple[str, ...]) -> None:
+    source = photo.with_suffix(suffix)
+    write_photograph(read_photograph(photo), source)
+    whole, rows = tmp_path / f"whole{suffix}", tmp_path / f"rows{suffix}"
+    assert detail(source, whole, *options) == 0
+    assert detail(source, rows, *options, "--memory", LITTLE, "--full") == 0
+    one, other = read_photograph(whole), read_photograph(rows)
+    assert (one.pixels - other.pixels).abs().max() < (1.1 / 255 if "8" in options else 1e-4)
+    assert one.alpha is not None
+    assert other.alpha is not None
+    assert torch.equal(one.alpha, other.alpha)
+    assert (one.depth, one.icc) == (other.depth, other.icc)
+
+
+def test_detail_by_rows_happens_by_itself(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = psutil.virtual_memory()._replace(available=int(25e6))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    assert detail(photo, tmp_path / "out.tif") == 0
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.is_tiled
+
+
+def test_a_mask_of_the_picture_is_read_by_rows(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mask = np.zeros((200, 300), np.uint8)
+    mask[60:80, 40:60] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    options = ("--alpha", "0,1,1,1", "--memory", LITTLE)
+    assert detail(photo, tmp_path / "mask.tif", "--mask", tmp_path / "mask.png", *options) == 0
+    assert detail(photo, tmp_path / "region.tif", "--region", "40,60,20,20", *options) == 0
+    one, other = (read_photograph(tmp_path / name).pixels for name in ("mask.tif", "region.tif"))
+    assert torch.equal(one, other)
+    Image.fromarray(mask[1:]).save(tmp_path / "small.png")
+    assert detail(photo, tmp_path / "out.tif", "--mask", tmp_path / "small.png", "--memory", LITTLE) == 2
+    assert "small.png must be as large as the photograph, 300x200, but is 300x199" in capsys.readouterr().err
+
+
+def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = cat(200, 300)
+    zarr.create_array(store=tmp_path / "in.zarr", data=picture, chunks=(64, 64, 3))
+    write_photograph(Photograph(torch.from_numpy(picture).permute(2, 0, 1)[None] / 255), tmp_path / "in.png")
+    for _ in range(2):  # the second time it takes the place of the first
+        assert detail(tmp_path / "in.zarr", tmp_path / "out.zarr", "--full") == 0
+    assert detail(tmp_path / "in.png", tmp_path / "out.png") == 0
+    wanted = read_photograph(tmp_path / "out.png").pixels[0].permute(1, 2, 0).numpy() * 255
+    assert np.abs(zarr.open_array(tmp_path / "out.zarr", mode="r")[:] - wanted).max() < 1.01
+    assert not list(tmp_path.glob(".*"))
+
+    (tmp_path / "folder.zarr").mkdir()
+    for source, target, message in (
+        ("in.zarr", "folder.zarr", "is a folder, but no array of zarr that could be replaced"),
+        ("folder.zarr", "new.zarr", "is no array of zarr"),
+        ("none.zarr", "new.zarr", "is no array of zarr"),
+        ("in.zarr", "no/new.zarr", "does not exist; make it first"),
+        ("in.zarr", "new.gif", "must end in .png, .jpg, .webp or .tif"),
+    ):
+        assert detail(tmp_path / source, tmp_path / target) == 2
+        assert message in capsys.readouterr().err
+    zarr.create_array(store=tmp_path / "line.zarr", data=np.zeros(5))
+    assert detail(tmp_path / "line.zarr", tmp_path / "new.zarr") == 2
+    assert "line.zarr must have the shape (H, W) or (H, W, S), got (5,)" in capsys.readouterr().err
+
+
+def test_zarr_is_needed_for_zarr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    assert detail(tmp_path / "in.zarr", tmp_path / "out.zarr") == 2
+    assert "install nlfilter-torch[zarr]" in capsys.readouterr().err
+
+
+def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rich.console import Console
+
+    from nlfilter_torch.cli import progress
+
+    shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
+    monkeypatch.setattr(progress, "Console", lambda stderr: shown)
+    with progress.stages() as report:
+        report("Looking", 1, 4)
+        report("Filtering", 3, 4)
+    text = shown.export_text()
+    shown.file.close()
+    assert "Filtering" in text
+    assert "75%" in text
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The sentence of a `detail` that fails, which must leave no trace in the folder of its output."""
+    folder = Path(str(arguments[1])).parent
+    before = set(folder.iterdir())
+    assert detail(*arguments) == 2
+    assert set(folder.iterdir()) == before
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("how", ["cut", "grown"])
+def test_a_file_that_changes_while_it_is_read_is_named(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    read, calls = TiffRows._decode, []
+
+    def change(self: TiffRows, first: int, last: int) -> Array:
+        calls.append(first)
+        if len(calls) == 3:
+            with photo.open("r+b") as stream:
+                stream.truncate(3000 if how == "cut" else 3 * photo.stat().st_size)
+        self.bands.clear()
+        return read(self, first, last)
+
+    monkeypatch.setattr(TiffRows, "_decode", change)
+    size = photo.stat().st_size
+    sentence = refused(capsys, photo, tmp_path / "out.tif", "--memory", LITTLE)
+    assert f"in.tif changed while it was read, from {size} to " in sentence
+
+
+def test_damage_in_the_middle_is_named(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with tifffile.TiffFile(photo) as file:
+        offset = file.pages.first.dataoffsets[-1]
+    content = bytearray(photo.read_bytes())
+    content[offset : offset + 50] = bytes(50)
+    photo.write_bytes(content)
+    sentence = refused(capsys, photo, tmp_path / "out.tif", "--memory", LITTLE)
+    assert "in.tif is damaged or cut short" in sentence
+
+
+@pytest.fixture
+def file_limit() -> Any:
+    """A limit in bytes to the size of files, which a full disk has, too."""
+    from contextlib import contextmanager
+
+    @contextmanager
+    def limit(size: int) -> Iterator[None]:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limit
+
+
+@pytest.mark.parametrize("target", ["out.tif", "out.png", "out.zarr"])
+def test_a_full_disk_is_named(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], file_limit: Any, target: str
+) -> None:
+    with file_limit(20_000):
+        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE)
+    assert f"{target} cannot be written: File too large; make room there or write elsewhere" in sentence
+
+
+def test_a_folder_that_cannot_be_written_is_named(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+    for target in ("out.tif", "out.zarr"):
+        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE)
+        assert "is read-only; choose another" in sentence
+
+
+def test_what_is_too_large_to_be_put_together_is_named(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "needs " in refused(capsys, photo, tmp_path / "out.tif", "--memory", "0.001")
+    sentence = refused(capsys, photo, tmp_path / "out.png", "--memory", "0.003")
+    assert "out.png takes 4 MB to be put together, but 3 MB may be used; write a TIFF file, or allow more" in sentence
+    write_photograph(read_photograph(photo), photo.with_suffix(".png"))
+    sentence = refused(capsys, photo.with_suffix(".png"), tmp_path / "out.tif", "--memory", "0.0001")
+    assert "in.png has 300x200 pixels and needs about" in sentence
+    for wrong in ("0", "-1", "nan", "inf"):
+        assert "--memory must be a positive number" in refused(capsys, photo, tmp_path / "o.tif", "--memory", wrong)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("target", ["out.tif", "out.zarr"])
+def test_interrupted_work_leaves_nothing_that_looks_finished(
+    photo: Path, tmp_path: Path, number: signal.Signals, target: str
+) -> None:
+    program = (
+        "import sys, time\n"
+        "from nlfilter_torch.streaming import detail, rows, tiles\n"
+        "def slow(original):\n"
+        "    def edit(*arguments):\n"
+        "        time.sleep(0.05)\n"
+        "        return original(*arguments)\n"
+        "    return edit\n"
+        "detail._edit, tiles.TILE_PIXELS = slow(detail._edit), 300\n"
+        "tiles.sampling.PILOT = rows.STATISTICS_PIXELS = 8000\n"
+        "from nlfilter_torch.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    arguments = ["detail", str(photo), str(tmp_path / target), "--landmarks", "40", "--memory", LITTLE]
+    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.glob(f".{target}.*.part")):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.send_signal(number)
+        assert process.wait(60) != 0
+    finally:
+        process.kill()
+        process.wait()
+    assert not (tmp_path / target).exists()
+    left = list(tmp_path.glob(".*"))
+    assert bool(left) == (number == signal.SIGKILL)  # only what could not tidy up leaves a hidden part
