@@ -1,4 +1,4 @@
-"""The editor's page: a large picture, the controls beside it, and what happens when one of them is moved."""
+"""The editor's page: the easel, the controls beside it, and what happens when one of them is moved."""
 
 import asyncio
 import secrets
@@ -10,10 +10,10 @@ from typing import Any
 from nicegui import events, ui
 
 from nlfilter_torch.app import drawing
-from nlfilter_torch.app.panel import BRUSHES, Brush, Panel
+from nlfilter_torch.app.easel import Easel
+from nlfilter_torch.app.panel import Brush, Panel
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
-from nlfilter_torch.brush import Stroke
 from nlfilter_torch.recipe import Recipe
 
 EXPECTED = (ValueError, OSError, MemoryError)  # of a file or a value that cannot be used; their text says why
@@ -32,11 +32,7 @@ class Editor:
     def __init__(self, session: Session) -> None:
         self.session = session
         self.brush = Brush()
-        self.pictures: dict[str, bytes] = {}
         self._token = secrets.token_urlsafe(16)
-        self._frame = 0
-        self._step = "detail"  # whose controls are shown
-        self._line: list[tuple[float, float]] = []  # of the stroke that is being painted
         self._wanted: list[str | None] = []  # the last step of the picture to draw next; the newest counts
         self._drawing = False
         self._jobs: set[asyncio.Future[None]] = set()
@@ -50,7 +46,7 @@ class Editor:
         self._build_header()
         with ui.element("div").classes("desk"):
             with ui.element("div").classes("easel"):
-                self._build_picture()
+                self._easel = Easel(self.session, self.brush, self._token, self._painted, self._complain)
             with ui.column().classes("panel"):
                 self._panel = Panel(self)
         ui.keyboard(on_key=self._key)
@@ -61,6 +57,11 @@ class Editor:
     def recipe(self) -> Recipe:
         """The edit as it is."""
         return self.session.recipe
+
+    @property
+    def pictures(self) -> dict[str, bytes]:
+        """Files of the pictures that the page shows, by their kind."""
+        return self._easel.pictures
 
     # Layout
 
@@ -89,39 +90,6 @@ class Editor:
         upload = ui.upload(auto_upload=True, on_upload=action)
         return upload.props(f'accept="{accept}"').classes("hidden")
 
-    def _build_picture(self) -> None:
-        with ui.element("div").classes("canvas"):
-            with ui.element("div").classes("welcome") as self._welcome:
-                ui.icon("photo", size="64px")
-                ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
-                ui.label("PNG, JPEG, TIFF or WebP. It stays on this machine.").classes("hint")
-            self._photo = ui.interactive_image(
-                events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
-            ).classes("photo")
-            with self._photo:
-                self._mask = ui.element("img").classes("over mask").props('alt="mask"')
-                self._before = ui.element("img").classes("over before").props('alt="before"')
-                ui.element("div").classes("edge")
-                ui.label("before").classes("tag")
-            # A pointer that hovers is no news; one that paints is.
-            self._photo.on(
-                "mouse",
-                lambda event: self._pointer(*event.args),
-                js_handler="(e) => { if (e.buttons || e.mouse_event_type != 'pointermove') "
-                "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
-            )
-        self._photo.set_visibility(False)
-        self._welcome.on("pointerdown", lambda: self._complain("open a photograph first; there is nothing to paint on"))
-        with ui.row().classes("bar"):
-            ui.label("Before").classes("hint")
-            wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
-            wipe.props('dense aria-label="Before and after"')
-            wipe.on("update:model-value", js_handler="(v) => document.documentElement.style.setProperty('--wipe', v)")
-            self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self._draw_strokes).props("dense")
-            self._show_mask = ui.checkbox("Mask", value=True, on_change=lambda: self._draw_mask()).props("dense")
-            ui.space()
-            self._size = ui.label("").classes("hint")
-
     # Changes
 
     def change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
@@ -134,9 +102,12 @@ class Editor:
 
     def switch(self, step: str) -> None:
         """Show another step's strokes."""
-        self._step = step
-        self._draw_strokes()
-        self._draw_mask()
+        self._easel.switch(step)
+
+    def _painted(self) -> None:
+        """A stroke is complete."""
+        self._panel.follow()
+        self._redraw()
 
     def _undo(self) -> None:
         if self.session.undo():
@@ -152,28 +123,11 @@ class Editor:
         if event.action.keydown and event.modifiers.ctrl and str(event.key).lower() == "z":
             self._redo() if event.modifiers.shift else self._undo()
 
-    def _pointer(self, kind: str, x: float, y: float) -> None:
-        """A stroke begins, goes on, or ends."""
-        if self._step not in BRUSHES or self.session.opened is None:
-            return
-        if kind == "pointerdown":
-            self._line = [(x, y)]
-        elif not self._line:
-            return
-        elif kind == "pointermove":
-            self._line.append((x, y))
-        else:
-            line, self._line = self._line, []
-            self.session.add_stroke(self._step, line, self.brush.radius[self._step], self.brush.paint(self._step))
-            self._panel.follow()
-            self._redraw()
-        self._draw_strokes()
-
     # Pictures
 
     def _redraw(self, upto: str | None = None) -> None:
         """Draw the picture anew, as soon as the one that is being drawn is done."""
-        self._draw_strokes()
+        self._easel.draw_strokes()
         if self.session.opened is None:
             return
         self._wanted = [upto]
@@ -185,42 +139,12 @@ class Editor:
         try:
             while self._wanted:
                 upto = self._wanted.pop()
-                await self._run("Working", partial(self._draw, upto))
-                self._show("after", self._photo)
+                await self._run("Working", partial(self._easel.draw, upto))
+                self._easel.show()
                 self._draw_response()
-                self._draw_mask(moving=upto is not None)
+                self._easel.draw_mask(moving=upto is not None)
         finally:
             self._drawing = False
-
-    def _draw(self, upto: str | None) -> None:
-        self.pictures["after"] = drawing.picture(self.session.render(upto))
-        mask = self.session.preview.mask(self.recipe.detail)
-        self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
-
-    def _show(self, kind: str, element: ui.element) -> None:
-        self._frame += 1
-        address = f"/picture/{self._token}/{kind}?{self._frame}"
-        if isinstance(element, ui.interactive_image):
-            element.set_source(address)
-        else:
-            element.props(f'src="{address}"')
-
-    def _draw_mask(self, *, moving: bool = False) -> None:
-        """Show the mask, but not over a picture that someone is looking at while moving a slider."""
-        shown = bool(self._show_mask.value and self._step == "detail" and self.pictures.get("mask")) and not moving
-        if shown:
-            self._show("mask", self._mask)
-        self._mask.set_visibility(shown)
-
-    def _draw_strokes(self) -> None:
-        strokes: tuple[Stroke, ...] = ()
-        if self.session.opened is not None and self._show_strokes.value:
-            strokes = getattr(self.recipe, self._step).strokes
-            if self._line:
-                height, width = self.session.preview.size
-                points = tuple((x / width, y / height) for x, y in self._line)
-                strokes += (Stroke(points, self.brush.radius[self._step], self.brush.paint(self._step)),)
-            self._photo.set_content(drawing.strokes_svg(strokes, self.session.preview.size))
 
     def _draw_response(self) -> None:
         detail = self.recipe.detail
@@ -240,18 +164,11 @@ class Editor:
 
     async def _open(self, read: Callable[[], None]) -> None:
         await self._run("Opening", read)
-        opened, preview = self.session.opened, self.session.preview
+        opened = self.session.opened
         if opened is None:
             return
-        height, width = opened.photograph.pixels.shape[-2:]
         self._title.set_text(opened.name)
-        self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
-        self._photo.style(f"width: min(100%, calc((100vh - 130px) * {preview.size[1] / preview.size[0]:.4f}))")
-        self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
-        self._show("before", self._before)
-        self._show("before", self._photo)
-        self._welcome.set_visibility(False)
-        self._photo.set_visibility(True)
+        self._easel.open(opened)
         self._panel.follow()
         self._redraw()
 

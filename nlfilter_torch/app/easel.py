@@ -1,0 +1,143 @@
+"""The easel: the large picture, what lies over it, and the brush that paints on it."""
+
+from collections.abc import Callable
+
+from nicegui import ui
+
+from nlfilter_torch.app import drawing
+from nlfilter_torch.app.panel import BRUSHES, Brush
+from nlfilter_torch.app.session import Opened, Session
+from nlfilter_torch.brush import Stroke
+
+
+class Easel:
+    """A photograph with its mask, its strokes and a look at how it was; built into the element that is open.
+
+    Args:
+        session: whose photograph it is.
+        brush: to paint with.
+        token: in the addresses of the pictures.
+        painted: called when a stroke is complete.
+        complain: called with a sentence for the user.
+
+    Attributes:
+        pictures: files of what is shown, by their kind.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        brush: Brush,
+        token: str,
+        painted: Callable[[], None],
+        complain: Callable[[str], None],
+    ) -> None:
+        self.pictures: dict[str, bytes] = {}
+        self._session = session
+        self._brush = brush
+        self._token = token
+        self._painted = painted
+        self._frame = 0
+        self._step = "detail"  # whose strokes are shown
+        self._line: list[tuple[float, float]] = []  # of the stroke that is being painted
+        with ui.element("div").classes("canvas"):
+            with ui.element("div").classes("welcome") as self._welcome:
+                ui.icon("photo", size="64px")
+                ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
+                ui.label("PNG, JPEG, TIFF or WebP. It stays on this machine.").classes("hint")
+            self._photo = ui.interactive_image(
+                events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
+            ).classes("photo")
+            with self._photo:
+                self._mask = ui.element("img").classes("over mask").props('alt="mask"')
+                self._before = ui.element("img").classes("over before").props('alt="before"')
+                ui.element("div").classes("edge")
+                ui.label("before").classes("tag")
+            # A pointer that hovers is no news; one that paints is.
+            self._photo.on(
+                "mouse",
+                lambda event: self._pointer(*event.args),
+                js_handler="(e) => { if (e.buttons || e.mouse_event_type != 'pointermove') "
+                "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
+            )
+        self._photo.set_visibility(False)
+        self._welcome.on("pointerdown", lambda: complain("open a photograph first; there is nothing to paint on"))
+        with ui.row().classes("bar"):
+            ui.label("Before").classes("hint")
+            wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
+            wipe.props('dense aria-label="Before and after"')
+            wipe.on("update:model-value", js_handler="(v) => document.documentElement.style.setProperty('--wipe', v)")
+            self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
+            self._show_mask = ui.checkbox("Mask", value=True, on_change=lambda: self.draw_mask()).props("dense")
+            ui.space()
+            self._size = ui.label("").classes("hint")
+
+    def open(self, opened: Opened) -> None:
+        """Show a photograph that was opened."""
+        preview = self._session.preview
+        height, width = opened.photograph.pixels.shape[-2:]
+        self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
+        self._photo.style(f"width: min(100%, calc((100vh - 130px) * {preview.size[1] / preview.size[0]:.4f}))")
+        self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
+        self._show("before", self._before)
+        self._show("before", self._photo)
+        self._welcome.set_visibility(False)
+        self._photo.set_visibility(True)
+
+    def switch(self, step: str) -> None:
+        """Show another step's strokes."""
+        self._step = step
+        self.draw_strokes()
+        self.draw_mask()
+
+    def draw(self, upto: str | None) -> None:
+        """Work the picture out, up to a step or with all of them, and its mask; this may be done in a thread."""
+        self.pictures["after"] = drawing.picture(self._session.render(upto))
+        mask = self._session.preview.mask(self._session.recipe.detail)
+        self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
+
+    def show(self) -> None:
+        """Show the picture that was worked out."""
+        self._show("after", self._photo)
+
+    def draw_mask(self, *, moving: bool = False) -> None:
+        """Show the mask, but not over a picture that someone is looking at while moving a slider."""
+        shown = bool(self._show_mask.value and self._step == "detail" and self.pictures.get("mask")) and not moving
+        if shown:
+            self._show("mask", self._mask)
+        self._mask.set_visibility(shown)
+
+    def draw_strokes(self) -> None:
+        """Show the strokes of the step, with the one that is being painted, or none of them."""
+        strokes: tuple[Stroke, ...] = ()
+        if self._session.opened is not None and self._show_strokes.value:
+            strokes = getattr(self._session.recipe, self._step).strokes
+            if self._line:
+                height, width = self._session.preview.size
+                points = tuple((x / width, y / height) for x, y in self._line)
+                strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
+            self._photo.set_content(drawing.strokes_svg(strokes, self._session.preview.size))
+
+    def _pointer(self, kind: str, x: float, y: float) -> None:
+        """A stroke begins, goes on, or ends."""
+        if self._step not in BRUSHES or self._session.opened is None:
+            return
+        if kind == "pointerdown":
+            self._line = [(x, y)]
+        elif not self._line:
+            return
+        elif kind == "pointermove":
+            self._line.append((x, y))
+        else:
+            line, self._line = self._line, []
+            self._session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
+            self._painted()
+        self.draw_strokes()
+
+    def _show(self, kind: str, element: ui.element) -> None:
+        self._frame += 1
+        address = f"/picture/{self._token}/{kind}?{self._frame}"
+        if isinstance(element, ui.interactive_image):
+            element.set_source(address)
+        else:
+            element.props(f'src="{address}"')
