@@ -56,14 +56,16 @@ def _ways(case: Case) -> dict[str, dict[str, Call]]:
     marks, pixels, batch = case.landmarks, case.pixels, case.batch
     numbers = torch.Generator(case.device).manual_seed(0)
 
-    def random(*shape: int) -> Tensor:
-        empty = torch.empty(batch, *shape, dtype=case.working_dtype, device=case.device)
+    def empty(*shape: int) -> Tensor:
         if case.device == "cpu":  # numpy asks the system for huge pages, in which a read is quicker
-            empty = torch.from_numpy(np.empty(empty.shape, str(case.working_dtype).removeprefix("torch.")))
-        return empty.uniform_(generator=numbers)
+            return torch.from_numpy(np.empty((batch, *shape), str(case.working_dtype).removeprefix("torch.")))
+        return torch.empty(batch, *shape, dtype=case.working_dtype, device=case.device)
+
+    def random(*shape: int) -> Tensor:
+        return empty(*shape).uniform_(generator=numbers)
 
     features, points = random(case.patch_size**2, pixels), random(marks, case.patch_size**2)
-    whitening, factor, result = random(marks, marks), random(marks, pixels), random(marks, pixels)
+    whitening, factor, result = random(marks, marks), random(marks, pixels), empty(marks, pixels)
     column, row, small = random(pixels, 1), random(1, marks), random(marks, marks)
     ways: dict[str, dict[str, Call]] = {
         "affinity": {"whole": lambda: torch.bmm(points, features, out=result)},

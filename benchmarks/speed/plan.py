@@ -53,7 +53,7 @@ class Plan:
     crops: tuple[int, int, int] = (16, 128, 64)
     dense_side: int = 256
     pictures: tuple[str, ...] = ("retina", "astronaut", "camera", "coffee", "hubble_deep_field")
-    seconds: float = 3.0
+    seconds: float = 2.0
     claimed_seconds: float = 20.0
     least: int = 3
     pause: float = 3.0

@@ -11,7 +11,7 @@ from torch.utils.benchmark import Measurement, TaskSpec, set_torch_threads, time
 
 Call = Callable[[], Any]
 
-UNCOUNTED = 2.0  # seconds; a call that takes more comes to its own memory and caches on its way
+UNCOUNTED = 3.0  # seconds; a call that takes more comes to its own memory and caches on its way
 SHORTEST = 0.01  # seconds; a call that takes less is repeated within one sample, or the clock would count, too
 LONG = 0.5  # seconds; a call that takes more is warm after one
 
