@@ -66,8 +66,8 @@ def _is_point(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(is_number(v) and abs(v) <= 2 for v in value)
 
 
-def cover(stroke: Stroke, size: tuple[int, int]) -> Tensor:
-    """The pixels that a stroke covers, (H, W) bool.
+def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
+    """The pixels that a stroke covers, (H, W) bool; or (h, W), those of some rows of a picture of that size.
 
     >>> cover(Stroke(((0.5, 0.5),), 0.1, "in"), (5, 5)).int()
     tensor([[0, 0, 0, 0, 0],
@@ -78,11 +78,13 @@ def cover(stroke: Stroke, size: tuple[int, int]) -> Tensor:
     """
     height, width = size
     radius = max(stroke.radius * min(size), SMALLEST)
-    covered = torch.zeros(size, dtype=torch.bool)
+    first = 0 if rows is None else rows.start
+    covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
     # Coordinates in which the centre of the first pixel is 0.
     points = [(x * width - 0.5, y * height - 0.5) for x, y in stroke.points]
     for (x0, y0), (x1, y1) in pairwise(points if len(points) > 1 else points * 2):
         top, bottom = _span(y0, y1, radius, height)
+        top, bottom = max(top, first), min(bottom, first + len(covered))
         left, right = _span(x0, x1, radius, width)
         if top >= bottom or left >= right:
             continue
@@ -90,7 +92,8 @@ def cover(stroke: Stroke, size: tuple[int, int]) -> Tensor:
         x = torch.arange(left, right, dtype=torch.float32) - x0
         dx, dy = x1 - x0, y1 - y0
         along = ((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12)).clamp(0, 1)  # nearest point of the line
-        covered[top:bottom, left:right] |= (x - along * dx).square() + (y - along * dy).square() <= radius * radius
+        near = (x - along * dx).square() + (y - along * dy).square() <= radius * radius
+        covered[top - first : bottom - first, left:right] |= near
     return covered
 
 
@@ -98,22 +101,27 @@ def _span(a: float, b: float, radius: float, length: int) -> tuple[int, int]:
     return max(0, int(min(a, b) - radius)), min(length, int(max(a, b) + radius) + 2)
 
 
-def mask_of(strokes: Iterable[Stroke], size: tuple[int, int]) -> Tensor:
-    """All pixels that strokes cover, (1, 1, H, W) float32 of zeros and ones."""
-    covered = torch.zeros(size, dtype=torch.bool)
+def mask_of(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> Tensor:
+    """All pixels that strokes cover, (1, 1, H, W) float32 of zeros and ones; of ``rows`` as :func:`cover`."""
+    covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
     for stroke in strokes:
-        covered |= cover(stroke, size)
+        covered |= cover(stroke, size, rows)
     return covered[None, None].float()
 
 
-def paint(strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def paint(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> tuple[Tensor, Tensor]:
     """Colours (1, 3, H, W) and mask (1, 1, H, W) of strokes of colour; later ones cover earlier ones."""
-    colours, painted = torch.zeros(3, *size), torch.zeros(size, dtype=torch.bool)
+    shape = _shape(size, rows)
+    colours, painted = torch.zeros(3, *shape), torch.zeros(shape, dtype=torch.bool)
     for stroke in strokes:
-        covered = cover(stroke, size)
+        covered = cover(stroke, size, rows)
         colours[:, covered] = colour_of(stroke.paint).unsqueeze(1)
         painted |= covered
     return colours[None], painted[None, None].float()
+
+
+def _shape(size: tuple[int, int], rows: slice | None) -> tuple[int, int]:
+    return size if rows is None else (rows.stop - rows.start, size[1])
 
 
 def colour_of(paint: str) -> Tensor:

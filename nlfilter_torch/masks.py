@@ -88,14 +88,24 @@ def diffusion_mask(
     mask = torch.exp(-exponents.clamp(max=FARTHEST))
     if negative is not None:
         others = region_weights(spectrum, negative, name="negative")
-        if others.shape[1] not in (1, weights.shape[1]):
-            raise ValueError(
-                f"negative must have 1 channel or the region's {weights.shape[1]}, got {others.shape[1]}; "
-                "give one for all regions or one for each"
-            )
+        check_negative(others.shape[1], weights.shape[1])
         margin = scale * _squared_distances(basis, others, spectrum.shard) - exponents
-        mask = mask * torch.sigmoid(margin.clamp(min=-20.0))
+        mask = mask * stay_away(margin)
     return mask.unflatten(2, spectrum.size).to(region.dtype)
+
+
+def check_negative(count: int, regions: int) -> None:
+    """Raise unless there is one ``negative`` for all regions, or one for each."""
+    if count not in (1, regions):
+        raise ValueError(
+            f"negative must have 1 channel or the region's {regions}, got {count}; give one for all regions or one for "
+            "each"
+        )
+
+
+def stay_away(margin: Tensor) -> Tensor:
+    """What ``negative`` leaves of a mask where it is so much farther away than the region; positive always."""
+    return torch.sigmoid(margin.clamp(min=-20.0))
 
 
 def _squared_distances(coordinates: Tensor, weights: Tensor, shard: Shard | None) -> Tensor:

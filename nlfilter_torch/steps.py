@@ -27,7 +27,7 @@ Valid = tuple[str, Callable[[Any], bool]]  # what an entry must be, in words and
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
 
 
-def _seeded() -> torch.Generator:
+def seeded() -> torch.Generator:
     """The randomness that the command line starts with."""
     return torch.Generator().manual_seed(0)
 
@@ -120,7 +120,7 @@ class Detail:
     def apply(self, image: Tensor) -> Tensor:
         """The edited image, from (1, C, H, W) in [0, 1]."""
         if not self.has_region():
-            return self.preset.apply(image, generator=_seeded())
+            return self.preset.apply(image, generator=seeded())
         inner, outer = self.regions((image.shape[-2], image.shape[-1]))
         mask = colour_masks(
             image,
@@ -129,10 +129,10 @@ class Detail:
             time=self.spread,
             num_landmarks=self.landmarks,
             spatial_bandwidth=self.spatial_bandwidth,
-            generator=_seeded(),
+            generator=seeded(),
         )
         options = self.preset.options()
-        operator = nonlocal_operator(reduce_channels(image, "luminance"), **options, generator=_seeded())
+        operator = nonlocal_operator(reduce_channels(image, "luminance"), **options, generator=seeded())
         order = len(self.alpha) - 1
         return edit_luminance(image, lambda y: self.blend(detail_layers(operator, y, order=order), mask))
 
@@ -160,7 +160,7 @@ class Colorize:
         """The edited image, from (1, C, H, W) in [0, 1]."""
         colours, painted = paint(self.strokes, (image.shape[-2], image.shape[-1]))
         grey = reduce_channels(image, "luminance")
-        return colorize(grey, colours, painted, strength=self.strength, generator=_seeded())
+        return colorize(grey, colours, painted, strength=self.strength, generator=seeded())
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Recolor:
             keep=keep if bool(keep.any()) else None,
             reach=self.reach,
             photometric_bandwidth=self.tolerance / 100,
-            generator=_seeded(),
+            generator=seeded(),
         )
 
 
@@ -225,7 +225,7 @@ class Defocus:
         """The edited image, from (1, C, H, W) in [0, 1]."""
         size = (image.shape[-2], image.shape[-1])
         radius = self.radius / 100 * min(size)
-        return defocus(image, mask_of(self.strokes, size), radius=radius, generator=_seeded())
+        return defocus(image, mask_of(self.strokes, size), radius=radius, generator=seeded())
 
 
 @dataclass(frozen=True)
@@ -268,5 +268,5 @@ class Abstract:
         """The edited image, from (1, C, H, W) in [0, 1]."""
         width = max(self.width / 1000 * min(image.shape[-2:]), 0.3)
         return abstract(
-            image, power=self.power, edges=self.edges, edge_width=width, tones=self.tones, generator=_seeded()
+            image, power=self.power, edges=self.edges, edge_width=width, tones=self.tones, generator=seeded()
         )

@@ -1,14 +1,18 @@
 """``nlfilter-torch apply``: a whole edit out of a file, on a photograph."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from torch import Tensor
 
 from nlfilter_torch.cli import editing, options
+from nlfilter_torch.cli.by_rows import Full, Job, Memory
 from nlfilter_torch.cli.detail import OutputDepth, Target
 from nlfilter_torch.files import Photograph
 from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.streaming.files import Rows
+from nlfilter_torch.streaming.whole_edit import edit_rows
 
 Edit = Annotated[
     str,
@@ -21,8 +25,17 @@ Edit = Annotated[
 ]
 
 
-def apply(source: options.Source, target: Target, preset: Edit, depth: OutputDepth = None) -> None:
+def apply(
+    source: options.Source,
+    target: Target,
+    preset: Edit,
+    depth: OutputDepth = None,
+    memory: Memory = None,
+    full: Full = False,
+) -> None:
     """Edit a photograph as another one was edited in the browser: sliders, strokes and all.
+
+    Photographs that fit no memory are worked out in tiles, unless a step is defocus or abstraction.
 
     Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
     """
@@ -31,4 +44,17 @@ def apply(source: options.Source, target: Target, preset: Edit, depth: OutputDep
     def work(photograph: Photograph) -> Tensor:
         return recipe.apply(photograph.pixels)
 
-    editing.edit_file(source, target, depth, work, landmarks=recipe.landmarks, factors=recipe.factors)
+    def by_rows(job: Job) -> Rows:
+        return edit_rows(job.passes(full), job.picture.rows, recipe, source, Path(target).parent)
+
+    editing.edit_file(
+        source,
+        target,
+        depth,
+        work,
+        landmarks=recipe.landmarks,
+        factors=recipe.factors,
+        memory=memory,
+        by_rows=by_rows,
+        coloured=recipe.colorize.changes(),
+    )

@@ -33,6 +33,7 @@ def stream_detail(
     alpha: Tensor,
     regions: RowSource | None = None,
     *,
+    negative: RowSource | None = None,
     residual: float | None = None,
     time: float = 1.0,
     width: float = 4.0,
@@ -60,6 +61,7 @@ def stream_detail(
             or (k+1,) for all.
         regions: rows (H, W, K), non-negative weights of the pixels of K regions: all that looks like them is edited,
             as by :func:`~nlfilter_torch.enhance`. None edits the whole picture.
+        negative: rows (H, W, 1 or K), weights of pixels whose likes are left out, likewise.
         residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since what the
             eigenvectors explain depends on pixels that no sample holds enough of.
         time: diffusion time of the masks that grow from the regions; larger reaches further.
@@ -94,6 +96,7 @@ def stream_detail(
         source,
         alpha,
         regions,
+        negative=negative,
         residual=residual,
         time=time,
         width=width,
@@ -109,6 +112,8 @@ def detail_rows(
     alpha: Tensor,
     regions: RowSource | None = None,
     *,
+    negative: RowSource | None = None,
+    outside: Tensor | None = None,
     residual: float | None = None,
     time: float = 1.0,
     width: float = 4.0,
@@ -118,7 +123,7 @@ def detail_rows(
 ) -> Rows:
     """The rows (h, W, S) of :func:`stream_detail`, from the first to the last, as they are asked for.
 
-    Errors call the source ``name``.
+    With sliders ``outside`` (k+1,) what resembles no region is edited by them. Errors call the source ``name``.
     """
     picture = Picture(source, name)
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
@@ -136,12 +141,14 @@ def detail_rows(
             )
         alpha = alpha.expand(regions.shape[-1], -1)
         own = {} if generator is None else {"generator": generator.clone_state()}  # as if each were made alone
-        masks = fit_masks(picture, regions, passes, time=time, width=width, **options | own)
+        masks = fit_masks(picture, regions, negative, passes, time=time, width=width, **options | own)
+    elif negative is not None:
+        raise ValueError("negative must come with regions, got it alone; select what is to be edited, too")
     exact = passes if residual is None else replace(passes, statistics="full")
     fitted = fit_picture(picture, alpha.shape[-1] - 1, exact, channels=channels, **options)
 
     def edit(tile: Tile) -> Tensor:
-        return _edit(tile, fitted, masks, alpha, residual, channels)
+        return _edit(tile, fitted, masks, alpha, outside, residual, channels)
 
     yield from passes.work_out(picture, edit, fitted.kernel.patch_weights.shape[0] // 2, rows)
 
@@ -151,6 +158,7 @@ def _edit(
     fitted: FittedFilter,
     masks: FittedMasks | None,
     alpha: Tensor,
+    outside: Tensor | None,
     residual: float | None,
     channels: Literal["luminance", "all"],
 ) -> Tensor:
@@ -161,7 +169,9 @@ def _edit(
         return fitted(image, sliders, tile.pixels, residual=residual, origin=tile.origin, halo=tile.halo, by_rows=True)
 
     def edit(inner: Tensor) -> Tensor:
-        return filtered(alpha) if masks is None else blend_regions(inner, masks(tile), alpha, filtered)
+        if masks is None:
+            return filtered(alpha)
+        return blend_regions(inner if outside is None else filtered(outside), masks(tile), alpha, filtered)
 
     return edit(tile.inner) if channels == "all" else edit_luminance(tile.inner, edit)
 

@@ -12,7 +12,7 @@ from nlfilter_torch.edits.enhance import MASK_BANDWIDTH, SHARED
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.masks import FARTHEST, squared_distances
+from nlfilter_torch.masks import FARTHEST, check_negative, squared_distances, stay_away
 from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
@@ -64,6 +64,7 @@ class FittedMasks:
         balancing: its moment t, (1, M, 1).
         core: (1, M, M), from a column of F to coordinates of the diffusion map.
         centres: of the regions in these coordinates, (1, K, M).
+        others: of pixels that the masks stay away from, (1, 1 or K, M), or None.
         scale: of squared distances: the number of pixels over the width.
     """
 
@@ -71,6 +72,7 @@ class FittedMasks:
     balancing: Tensor
     core: Tensor
     centres: Tensor
+    others: Tensor | None
     scale: float
 
     def __call__(self, tile: Tile) -> Tensor:
@@ -81,7 +83,11 @@ class FittedMasks:
         """Of pixels with features (1, D, n): (1, K, n)."""
         coordinates = self.core.to(features) @ _columns(self.kernel, features, self.balancing)
         exponents = self.scale * squared_distances(coordinates, self.centres.to(coordinates))
-        return torch.exp(-exponents.clamp(max=FARTHEST))
+        masks = torch.exp(-exponents.clamp(max=FARTHEST))
+        if self.others is None:
+            return masks
+        margin = self.scale * squared_distances(coordinates, self.others.to(coordinates)) - exponents
+        return masks * stay_away(margin)
 
 
 @torch.no_grad()
@@ -89,6 +95,7 @@ class FittedMasks:
 def fit_masks(
     picture: Picture,
     regions: RowSource,
+    negative: RowSource | None,
     passes: Passes,
     *,
     time: float,
@@ -100,20 +107,28 @@ def fit_masks(
     Raises:
         ValueError: if a region does not fit, is negative or empty.
     """
-    if tuple(regions.shape[:2]) != picture.size or len(regions.shape) != 3:
-        raise ValueError(
-            f"regions must have the shape {(*picture.size, 'K')}, the picture's and the number of regions, got "
-            f"{tuple(regions.shape)}; resize them"
-        )
+    for rows, name in ((regions, "regions"), (negative, "negative")):
+        if rows is not None and (tuple(rows.shape[:2]) != picture.size or len(rows.shape) != 3):
+            raise ValueError(
+                f"{name} must have the shape {(*picture.size, 'K')}, the picture's and the number of regions, got "
+                f"{tuple(rows.shape)}; resize them"
+            )
+    check_negative(1 if negative is None else negative.shape[2], regions.shape[2])
     shared = {name: value for name, value in options.items() if name in SHARED}
     shared |= {"photometric_bandwidth": MASK_BANDWIDTH, "guide_channels": "all"}
     kernel, balancing, sums = _gather(picture, lambda c: c, 1, for_masks(passes), spectral=True, **shared)
     core = RitzPairs.of_sums(sums.grams, sums.dtype).basis(lambda eigenvalues: eigenvalues.pow(time))
-    centres = core @ _region_means(picture, regions, kernel, balancing, passes.report)
-    return FittedMasks(kernel, balancing, core, centres.mT, picture.pixels / width)
+
+    def centres(rows: RowSource, name: str) -> Tensor:
+        return (core @ _region_means(picture, rows, name, kernel, balancing, passes.report)).mT
+
+    others = None if negative is None else centres(negative, "negative")
+    return FittedMasks(kernel, balancing, core, centres(regions, "regions"), others, picture.pixels / width)
 
 
-def _region_means(picture: Picture, regions: RowSource, kernel: Kernel, balancing: Tensor, report: Report) -> Tensor:
+def _region_means(
+    picture: Picture, regions: RowSource, name: str, kernel: Kernel, balancing: Tensor, report: Report
+) -> Tensor:
     """The mean column of F over each region, (1, M, K) in float64."""
     margin, rows = kernel.patch_weights.shape[0] // 2, picture.statistics_rows
     total = torch.zeros(1, balancing.shape[1], regions.shape[2], dtype=torch.float64)
@@ -123,7 +138,7 @@ def _region_means(picture: Picture, regions: RowSource, kernel: Kernel, balancin
         stop = min(start + rows, picture.size[0])
         weights = torch.from_numpy(np.array(regions[start:stop], np.float32)).flatten(0, 1)  # (n, K)
         if bool((weights < 0).any()) or not bool(torch.isfinite(weights).all()):
-            raise ValueError("regions must be non-negative and finite, got others; clamp them at 0")
+            raise ValueError(f"{name} must be non-negative and finite, got others; clamp them at 0")
         if not bool((weights > 0).any()):
             continue
         tile = picture.tile(start, stop, margin)
@@ -131,7 +146,7 @@ def _region_means(picture: Picture, regions: RowSource, kernel: Kernel, balancin
         total += (columns @ weights.to(columns)).double()
         weight += weights.double().sum(0)
     if not bool((weight > 0).all()):
-        raise ValueError("regions must each hold a pixel of positive weight, got an empty one; select some pixels")
+        raise ValueError(f"{name} must each hold a pixel of positive weight, got an empty one; select some pixels")
     return total / weight
 
 

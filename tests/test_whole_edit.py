@@ -1,0 +1,134 @@
+"""Whole edits on pictures that are read by rows: what they make of one in memory, and named errors."""
+
+import errno
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from nlfilter_torch.brush import Stroke, cover, mask_of, paint
+from nlfilter_torch.cli import main
+from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, Recolor
+from nlfilter_torch.streaming import stream_detail, whole_edit
+from nlfilter_torch.streaming.tiles import Passes
+from tests.problems import cat, difference
+
+LINE = ((0.25, 0.25), (0.5, 0.3))
+IN, OUT = Stroke(LINE, 0.06, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
+BLUE, KEEP = Stroke(LINE, 0.06, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
+FAR = Stroke(((1.8, 1.8),), 0.05, "out")  # covers no pixel
+ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
+DETAIL = Detail(ALPHA, INSIDE, 0.7, (IN, OUT), landmarks=40)
+RECOLOR = Recolor((BLUE, KEEP), 0.5, 20.0)
+
+
+def rows_of(image: torch.Tensor) -> NDArray[Any]:
+    return np.ascontiguousarray(image[0].permute(1, 2, 0).numpy())
+
+
+def by_rows(recipe: Recipe, source: NDArray[Any], folder: Path, **options: Any) -> NDArray[Any]:
+    passes = Passes("float32", "full", **options)
+    return np.concatenate([rows for _, rows in whole_edit.edit_rows(passes, source, recipe, "scan.tif", folder)])
+
+
+@pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(7, 48), slice(0, 48)])
+def test_strokes_cover_the_same_by_rows(rows: slice) -> None:
+    strokes, size = (BLUE, replace(BLUE, points=((-0.1, 0.9), (1.2, 0.1)), paint="#ff0000")), (48, 64)
+    assert torch.equal(cover(BLUE, size, rows), cover(BLUE, size)[rows])
+    assert torch.equal(mask_of(strokes, size, rows), mask_of(strokes, size)[..., rows, :])
+    for some, whole in zip(paint(strokes, size, rows), paint(strokes, size), strict=True):
+        assert torch.equal(some, whole[..., rows, :])
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        Recipe(),
+        Recipe(Detail((3.0, 1.0))),
+        Recipe(DETAIL),
+        Recipe(replace(DETAIL, strokes=(IN, FAR))),
+        Recipe(colorize=Colorize((BLUE,), 0.5)),
+        Recipe(recolor=RECOLOR),
+        Recipe(recolor=replace(RECOLOR, strokes=(BLUE, replace(FAR, paint="keep")))),
+        Recipe(DETAIL, Colorize((BLUE,), 0.5), RECOLOR),
+    ],
+)
+def test_an_edit_by_rows_is_the_one_in_memory(recipe: Recipe, tmp_path: Path) -> None:
+    image = cat()
+    edited = by_rows(recipe, rows_of(image), tmp_path, tile_rows=17)
+    wanted = rows_of(recipe.apply(image))
+    # In memory the balancing ends at 1e-5, and one step's error is the next one's input.
+    assert np.abs(edited - wanted).max() < (1e-4 if recipe.recolor.changes() else 2e-5)
+    assert not list(tmp_path.iterdir())
+
+
+def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
+    grey = cat()[:, :1]
+    source = np.concatenate([rows_of(grey), np.linspace(0, 1, 15000, dtype=np.float32).reshape(100, 150, 1)], axis=2)
+    recipe = Recipe(Detail((2.0, 1.0), landmarks=30), Colorize((BLUE,)))
+    edited = by_rows(recipe, source, tmp_path)
+    assert np.abs(edited[..., :3] - rows_of(recipe.apply(grey))).max() < 2e-5
+    np.testing.assert_allclose(edited[..., 3], source[..., 1], atol=1e-7)
+
+
+def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.streaming.sampling.PILOT", 4000)
+    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 6000)
+    photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
+    write_photograph(Photograph(cat(), "uint16"), photo)
+    preset.write_text(Recipe(DETAIL, recolor=RECOLOR).to_json())
+    names = [tmp_path / "whole.tif", tmp_path / "rows.tif"]
+    for name, options in zip(names, ([], ["--memory", "0.02", "--full"]), strict=True):
+        assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
+    whole, rows = (read_photograph(name).pixels for name in names)
+    # The second step's k-means may turn another way by the rounding of the first.
+    assert 0 < difference(whole, rows) < 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
+
+
+@pytest.mark.parametrize(("step", "name"), [(Defocus((IN,), 4.0), "defocus"), (Abstract(0.1), "abstract")])
+def test_a_step_that_takes_the_whole_photograph_is_named_before_any_work(
+    step: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_edit, "rows_of", None)
+    recipe = replace(Recipe(DETAIL), **{name: step})
+    with pytest.raises(ValueError, match=f"{name} takes the whole photograph at once, and scan.tif is too large"):
+        by_rows(recipe, rows_of(cat()), tmp_path)
+
+
+def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full:
+        """A file on a full disk."""
+
+        def __enter__(self) -> "Full":
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def write(self, _: bytes) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(whole_edit, "TemporaryFile", lambda **_: Full())
+    sentence = "No space left on device, where one step of the edit leaves 0.0 GB to the next"
+    with pytest.raises(OSError, match=sentence) as raised:
+        by_rows(Recipe(Detail((2.0, 1.0), landmarks=30), recolor=RECOLOR), rows_of(cat()), tmp_path)
+    assert raised.value.filename == str(tmp_path)
+
+
+def test_negative_regions_come_with_regions_of_their_number() -> None:
+    source = rows_of(cat())
+    edited, two, three = np.empty_like(source), np.ones((100, 150, 2), np.float32), np.ones((100, 150, 3), np.float32)
+    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), negative=two)
+    with pytest.raises(ValueError, match="negative must have 1 channel or the region's 2, got 3"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=three)
+    with pytest.raises(ValueError, match="negative must have the shape"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=two[1:])
+    with pytest.raises(ValueError, match="negative must each hold a pixel of positive weight"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=0 * two)
