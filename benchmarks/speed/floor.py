@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.cases import Case
-from benchmarks.speed.timing import Call, Timing, take_turns
+from benchmarks.speed.timing import Call, Timing, try_once
 
 READS = 10
 BLOCKS = (4080, 16368)  # an odd number of cache lines, see nlfilter_torch.blocks
@@ -33,8 +33,8 @@ def floor_calls(case: Case) -> dict[str, Call]:
     """The quickest way of every part, found by trying each once, warm; named ``part: way``."""
     ways = _ways(case)
     every = {f"{part}: {way}": call for part, choices in ways.items() for way, call in choices.items()}
-    tried = take_turns(every, threads=case.used_threads, seconds=0.0, least=1, most=1)
-    best = [min((name for name in every if name.startswith(part)), key=lambda n: tried[n].median) for part in PARTS]
+    tried = {name: try_once(call, threads=case.used_threads) for name, call in every.items()}
+    best = [min((name for name in every if name.startswith(part)), key=lambda n: tried[n]) for part in PARTS]
     return {name: every[name] for name in best}
 
 

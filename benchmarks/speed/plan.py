@@ -47,7 +47,7 @@ class Plan:
     sizes: tuple[tuple[int, int], ...] = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2048, 2048))
     doublings: tuple[tuple[int, int], ...] = ((512, 512), (512, 1024), (1024, 1024), (1024, 2048), (2048, 2048))
     counts: tuple[int, ...] = (25, 50, 100, 200, 400)
-    counts_side: int = 512
+    counts_side: int = 384
     growth: tuple[int, ...] = (50, 100, 200)
     patches: tuple[int, ...] = (1, 3, 5, 7, 11)
     crops: tuple[int, int, int] = (16, 128, 64)
@@ -57,7 +57,7 @@ class Plan:
     claimed_seconds: float = 20.0
     least: int = 3
     pause: float = 3.0
-    processes: int = 7
+    processes: int = 5
     probes: int = 5
     threads: tuple[int, ...] = ()
     device: str = "cpu"

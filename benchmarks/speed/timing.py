@@ -11,7 +11,7 @@ from torch.utils.benchmark import Measurement, TaskSpec, set_torch_threads, time
 
 Call = Callable[[], Any]
 
-UNCOUNTED = 3.0  # seconds; a call that takes more comes to its own memory and caches on its way
+UNCOUNTED = 5.0  # seconds; a call that takes more comes to its own memory and caches on its way
 SHORTEST = 0.01  # seconds; a call that takes less is repeated within one sample, or the clock would count, too
 LONG = 0.5  # seconds; a call that takes more is warm after one
 
@@ -81,6 +81,15 @@ def after_pauses(name: str, call: Call, *, threads: int, pause: float, count: in
             time.sleep(pause)
             times.append(_sample(call, 1))
     return _summary(name, times, 1, threads)
+
+
+def try_once(call: Call, *, threads: int) -> float:
+    """Seconds of a call, roughly: the second one, or the mean of a few short ones."""
+    with set_torch_threads(threads):
+        call()
+        seconds = _sample(call, 1)
+        count = math.ceil(SHORTEST / max(seconds, 1e-9))
+        return seconds if count == 1 else _sample(call, count) / count
 
 
 def _calls_per_sample(call: Call) -> int:
