@@ -23,6 +23,7 @@ from nlfilter_torch.thin import gather, spread
 PER_LANDMARK = (32, 160)  # pixels of the sample, least and most: its Jacobian is then within 18 or 8 % of the true one
 EXPLORED = 8192  # pixels that the first guess comes from, at most
 SHARE = 8  # the part of the pixels that either is, between these bounds
+LARGE = 64  # the part that the sample is at least: four times the pixels have rarer ones, and take no sweep more for it
 GUESSES = 3  # steps that it takes towards their fixed point; more gain nothing for the pixels that are not among them
 REFINEMENTS = 3  # steps of Newton's method on the sample; with two the inverse is that of a t still on its way
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly and on no period of the image
@@ -132,7 +133,7 @@ def solve(
     """Scaling (B, N), its moment (B, M, 1) and residual (B,), the sweeps, and an estimate of J^-1, (B, M, M)."""
     watched = factor.device.type == "cpu"
     least, most = (bound * factor.shape[1] // (1 if shard is None else len(shard.rows)) for bound in PER_LANDMARK)
-    count = max(min(factor.shape[2] // SHARE, most), least)  # of the sample, here
+    count = max(min(factor.shape[2] // SHARE, max(most, factor.shape[2] // LARGE)), least)  # of the sample, here
     scaling, found = _sweep(factor, diagonal, _guess(factor, diagonal, shard), shard)
     total = found
     worst, slow, gain = 1.0, 0, 1.0

@@ -134,7 +134,7 @@ def test_claims_are_ratios_of_medians():
 def test_calls_take_turns():
     order = []
     timings = take_turns(
-        {"a": lambda: order.append("a"), "b": lambda: order.append("b")}, threads=1, seconds=0.0, least=2, most=2
+        {"a": lambda: order.append("a"), "b": lambda: order.append("b")}, threads=1, seconds=0.0, least=2
     )
     assert {timing.samples for timing in timings.values()} == {2}
     rounds = [name for name, previous in zip(order, [None, *order], strict=False) if name != previous]

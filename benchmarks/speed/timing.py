@@ -13,6 +13,7 @@ Call = Callable[[], Any]
 
 UNCOUNTED = 5.0  # seconds; a call that takes more comes to its own memory and caches on its way
 SHORTEST = 0.01  # seconds; a call that takes less is repeated within one sample, or the clock would count, too
+MOST = 15  # rounds
 LONG = 0.5  # seconds; a call that takes more is warm after one
 
 
@@ -37,9 +38,7 @@ class Timing:
         return asdict(self)
 
 
-def take_turns(
-    calls: Mapping[str, Call], *, threads: int, seconds: float, least: int = 3, most: int = 15
-) -> dict[str, Timing]:
+def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least: int = 3) -> dict[str, Timing]:
     """Time several calls round after round, one sample of each per round.
 
     Each sample comes after a call that is not counted, so that memory and caches are the call's own, as in a loop over
@@ -50,7 +49,6 @@ def take_turns(
         threads: of torch.
         seconds: start no further round after so many, once there have been ``least``.
         least: rounds.
-        most: rounds.
 
     Returns:
         A timing by name. The first call of each, which pays for imports and memory, is not counted.
@@ -59,7 +57,7 @@ def take_turns(
     with set_torch_threads(threads):
         repeats = {name: _calls_per_sample(call) for name, call in calls.items()}
         start = time.perf_counter()
-        for done in range(1, most + 1):
+        for done in range(1, MOST + 1):
             for name, call in calls.items():
                 if not samples[name] or samples[name][-1] < UNCOUNTED:
                     call()
