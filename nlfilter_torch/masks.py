@@ -255,6 +255,17 @@ def filter_regions(
 
 def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
     """:func:`filter_regions`, where ``edit`` filters the image with sliders (B, k+1, H, W) for every pixel."""
+    inside, share = _within(masks, alpha)
+    return torch.lerp(image, edit(inside), share.to(image))
+
+
+def blend_sliders(masks: Tensor, alpha: Tensor, outside: Tensor) -> Tensor:
+    """Sliders (B, k+1, H, W) of all pixels: those of :func:`blend_regions`, and ``outside`` (k+1,) where no mask is."""
+    inside, share = _within(masks, alpha)
+    return torch.lerp(outside.to(inside).view(1, -1, 1, 1).expand_as(inside), inside, share)
+
+
+def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Sliders (B, k+1, H, W), of all regions in proportion to their masks, and how much they count, (B, 1, H, W)."""
     total = masks.sum(1, keepdim=True)
-    inside = compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha)
-    return torch.lerp(image, edit(inside), total.clamp(max=1.0).to(image))
+    return compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha), total.clamp(max=1.0)

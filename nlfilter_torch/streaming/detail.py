@@ -11,7 +11,7 @@ from nlfilter_torch.checks import check_alpha, check_choice, check_count, check_
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
-from nlfilter_torch.masks import blend_regions
+from nlfilter_torch.masks import blend_regions, blend_sliders
 from nlfilter_torch.streaming.fitting import FittedMasks, fit_masks, fit_picture, for_masks
 from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
 from nlfilter_torch.streaming.sampling import Report
@@ -171,7 +171,9 @@ def _edit(
     def edit(inner: Tensor) -> Tensor:
         if masks is None:
             return filtered(alpha)
-        return blend_regions(inner if outside is None else filtered(outside), masks(tile), alpha, filtered)
+        if outside is not None:
+            return filtered(blend_sliders(masks(tile), alpha, outside))
+        return blend_regions(inner, masks(tile), alpha, filtered)
 
     return edit(tile.inner) if channels == "all" else edit_luminance(tile.inner, edit)
 
