@@ -187,7 +187,7 @@ def report(results: Results) -> str:
         if records:
             parts += [f"## {title}", series_table(records, column, key)]
     parts += other_tables(results)
-    parts += [f"Cut short or left out for lack of time: {', '.join(results['cut'])}."] if results["cut"] else []
+    parts += [f"Time was up during or before: {', '.join(results['cut'])}."] if results["cut"] else []
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

@@ -95,7 +95,7 @@ def test_suites_that_come_too_late_are_named(tmp_path):
     results = json.loads(path.read_text())
     assert results["cut"] == ["threads"]
     assert results["results"] == []
-    assert "left out for lack of time: threads" in report.report(results)
+    assert "Time was up during or before: threads" in report.report(results)
 
 
 def test_a_suite_stops_between_two_cases_when_time_is_over(monkeypatch):

@@ -35,7 +35,7 @@ def run(plan: Plan, names: Sequence[str], minutes: float) -> dict[str, Any]:
         taken[name] = time.perf_counter() - begun
         if not is_time_left(start, minutes):
             cut.append(name)
-            print(f"{name} is cut short or left out: {minutes:g} minutes are over", flush=True)
+            print(f"{name}: {minutes:g} minutes were over during or before it", flush=True)
     return {
         "quick": plan == QUICK,
         "machine": machine,
