@@ -85,13 +85,12 @@ def diffusion_mask(
     basis = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
     scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(basis).reshape(-1, 1, 1)
     exponents = scale * _squared_distances(basis, weights, spectrum.shard)  # (B, K, N)
-    mask = torch.exp(-exponents.clamp(max=FARTHEST))
+    others = None
     if negative is not None:
-        others = region_weights(spectrum, negative, name="negative")
-        check_negative(others.shape[1], weights.shape[1])
-        margin = scale * _squared_distances(basis, others, spectrum.shard) - exponents
-        mask = mask * stay_away(margin)
-    return mask.unflatten(2, spectrum.size).to(region.dtype)
+        marked = region_weights(spectrum, negative, name="negative")
+        check_negative(marked.shape[1], weights.shape[1])
+        others = scale * _squared_distances(basis, marked, spectrum.shard)
+    return mask_of_exponents(exponents, others).unflatten(2, spectrum.size).to(region.dtype)
 
 
 def check_negative(count: int, regions: int) -> None:
@@ -103,9 +102,10 @@ def check_negative(count: int, regions: int) -> None:
         )
 
 
-def stay_away(margin: Tensor) -> Tensor:
-    """What ``negative`` leaves of a mask where it is so much farther away than the region; positive always."""
-    return torch.sigmoid(margin.clamp(min=-20.0))
+def mask_of_exponents(exponents: Tensor, others: Tensor | None) -> Tensor:
+    """Positive masks (B, K, N) from squared distances over their width: to the regions, and to what is left out."""
+    mask = torch.exp(-exponents.clamp(max=FARTHEST))
+    return mask if others is None else mask * torch.sigmoid((others - exponents).clamp(min=-20.0))
 
 
 def _squared_distances(coordinates: Tensor, weights: Tensor, shard: Shard | None) -> Tensor:

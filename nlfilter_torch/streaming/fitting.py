@@ -12,7 +12,7 @@ from nlfilter_torch.edits.enhance import MASK_BANDWIDTH, SHARED
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.masks import FARTHEST, check_negative, squared_distances, stay_away
+from nlfilter_torch.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.newton import scaling_from_moment
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
@@ -82,12 +82,11 @@ class FittedMasks:
     def masks(self, features: Tensor) -> Tensor:
         """Of pixels with features (1, D, n): (1, K, n)."""
         coordinates = self.core.to(features) @ _columns(self.kernel, features, self.balancing)
-        exponents = self.scale * squared_distances(coordinates, self.centres.to(coordinates))
-        masks = torch.exp(-exponents.clamp(max=FARTHEST))
-        if self.others is None:
-            return masks
-        margin = self.scale * squared_distances(coordinates, self.others.to(coordinates)) - exponents
-        return masks * stay_away(margin)
+
+        def exponents(centres: Tensor) -> Tensor:
+            return self.scale * squared_distances(coordinates, centres.to(coordinates))
+
+        return mask_of_exponents(exponents(self.centres), None if self.others is None else exponents(self.others))
 
 
 @torch.no_grad()
