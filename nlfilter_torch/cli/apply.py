@@ -11,7 +11,7 @@ from nlfilter_torch.cli.by_rows import Full, Job, Memory
 from nlfilter_torch.cli.detail import OutputDepth, Target
 from nlfilter_torch.files import Photograph
 from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.streaming.files import Rows
+from nlfilter_torch.streaming.rows import Rows
 from nlfilter_torch.streaming.whole_edit import edit_rows
 
 Edit = Annotated[

@@ -12,7 +12,6 @@ import typer
 from nlfilter_torch.cli.progress import stages
 from nlfilter_torch.files import Photograph, TooLarge, read_photograph
 from nlfilter_torch.streaming.files import (
-    Rows,
     StoredPicture,
     check_place,
     free_memory,
@@ -20,6 +19,7 @@ from nlfilter_torch.streaming.files import (
     open_picture,
     write_picture,
 )
+from nlfilter_torch.streaming.rows import Rows
 from nlfilter_torch.streaming.sampling import Report
 from nlfilter_torch.streaming.tiles import Passes
 

@@ -13,7 +13,7 @@ from nlfilter_torch.edits.colorize import colorize as edit
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.files import Photograph
 from nlfilter_torch.streaming.colorize import colorize_rows
-from nlfilter_torch.streaming.files import Rows
+from nlfilter_torch.streaming.rows import Rows
 
 
 class Method(StrEnum):

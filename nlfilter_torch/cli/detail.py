@@ -21,7 +21,7 @@ from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.masks import filter_regions
 from nlfilter_torch.presets import PRESETS, find_preset
 from nlfilter_torch.streaming.detail import detail_rows
-from nlfilter_torch.streaming.files import Rows
+from nlfilter_torch.streaming.rows import Rows
 
 
 class FileDepth(StrEnum):

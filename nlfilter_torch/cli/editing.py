@@ -14,7 +14,7 @@ from nlfilter_torch.cli.by_rows import Job, allowed_memory, edit_by_rows, read_i
 from nlfilter_torch.cli.detail import DEPTHS, FileDepth
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.files import Photograph, check_output, read_photograph, write_photograph
-from nlfilter_torch.streaming.files import Rows
+from nlfilter_torch.streaming.rows import Rows
 
 Bandwidth = Annotated[
     float | None,

@@ -10,8 +10,8 @@ from nlfilter_torch.cli.by_rows import Full, Job, Memory
 from nlfilter_torch.cli.detail import OutputDepth, Target
 from nlfilter_torch.edits.recolor import recolor as edit
 from nlfilter_torch.files import Photograph
-from nlfilter_torch.streaming.files import Rows
 from nlfilter_torch.streaming.recolor import recolor_rows
+from nlfilter_torch.streaming.rows import Rows
 
 Reach = Annotated[
     float,

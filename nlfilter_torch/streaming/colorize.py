@@ -16,12 +16,11 @@ from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.fitting import fit_spectrum
 from nlfilter_torch.streaming.painted import Guide, Painted, check_room, floats_of_painted, gather, read_strokes
-from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
+from nlfilter_torch.streaming.rows import Picture, Rows, RowSource, RowTarget, Tile
 from nlfilter_torch.streaming.sampling import Report, Sample
 from nlfilter_torch.streaming.tiles import (
     SAMPLE,
     Passes,
-    Rows,
     Statistics,
     check_target,
     fill,

@@ -13,12 +13,11 @@ from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.masks import blend_regions, blend_sliders
 from nlfilter_torch.streaming.fitting import FittedMasks, fit_masks, fit_picture, for_masks
-from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget, Tile
+from nlfilter_torch.streaming.rows import Picture, Rows, RowSource, RowTarget, Tile
 from nlfilter_torch.streaming.sampling import Report
 from nlfilter_torch.streaming.tiles import (
     SAMPLE,
     Passes,
-    Rows,
     Statistics,
     check_target,
     fill,

@@ -28,14 +28,12 @@ from nlfilter_torch.files import (
     open_beside,
     read_channels,
 )
-from nlfilter_torch.streaming.rows import RowSource
+from nlfilter_torch.streaming.rows import Rows, RowSource
 from nlfilter_torch.streaming.tiff_rows import TiffRows
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a zarr array that is made here
 CODED = 8  # times its bytes that a picture other than TIFF and zarr takes while it is decoded or encoded
-
-Rows = Iterator[tuple[slice, NDArray[Any]]]
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,11 @@ from nlfilter_torch.edits.recolor import colour_guide
 from nlfilter_torch.streaming.dye import Marked, fit_dye
 from nlfilter_torch.streaming.fitting import fit_spectrum
 from nlfilter_torch.streaming.painted import Guide, check_room, floats_of_painted, read_mask, read_strokes
-from nlfilter_torch.streaming.rows import Picture, RowSource, RowTarget
+from nlfilter_torch.streaming.rows import Picture, Rows, RowSource, RowTarget
 from nlfilter_torch.streaming.sampling import Report
 from nlfilter_torch.streaming.tiles import (
     SAMPLE,
     Passes,
-    Rows,
     Statistics,
     check_target,
     fill,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 WHITE = {"uint8": 255, "uint16": 65535}  # what integer channels hold for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
+Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their places in the picture
 STATISTICS_PIXELS = 1 << 17  # in a block of a pass; the same for every size of tile, so that sums are equal to the bit
 
 

@@ -1,25 +1,23 @@
 """What every edit by rows shares: how many rows fit the memory, and tile after tile from a source to a target."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_count
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.streaming import sampling
-from nlfilter_torch.streaming.rows import KINDS, Picture, RowSource, RowTarget, Tile, stored_as, transparency
+from nlfilter_torch.streaming.rows import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.streaming.sampling import Report
 
 SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
 Statistics = Literal["sample", "full"]
 Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
-Rows = Iterator[tuple[slice, NDArray[Any]]]
 
 
 def in_silence(stage: str, done: int, rows: int) -> None:
