@@ -66,6 +66,16 @@ def _is_point(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(is_number(v) and abs(v) <= 2 for v in value)
 
 
+def painted(strokes: Iterable[Stroke], word: str) -> tuple[Stroke, ...]:
+    """Those of the strokes whose paint is that word."""
+    return tuple(stroke for stroke in strokes if stroke.paint == word)
+
+
+def coloured(strokes: Iterable[Stroke]) -> tuple[Stroke, ...]:
+    """Those whose paint is a colour."""
+    return tuple(stroke for stroke in strokes if stroke.paint.startswith("#"))
+
+
 def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
     """The pixels that a stroke covers, (H, W) bool; or (h, W), those of some rows of a picture of that size.
 
@@ -83,9 +93,8 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
     # Coordinates in which the centre of the first pixel is 0.
     points = [(x * width - 0.5, y * height - 0.5) for x, y in stroke.points]
     for (x0, y0), (x1, y1) in pairwise(points if len(points) > 1 else points * 2):
-        top, bottom = _span(y0, y1, radius, height)
-        top, bottom = max(top, first), min(bottom, first + len(covered))
-        left, right = _span(x0, x1, radius, width)
+        top, bottom = _span(y0, y1, radius, first, first + len(covered))
+        left, right = _span(x0, x1, radius, 0, width)
         if top >= bottom or left >= right:
             continue
         y = torch.arange(top, bottom, dtype=torch.float32).unsqueeze(1) - y0
@@ -97,8 +106,9 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
     return covered
 
 
-def _span(a: float, b: float, radius: float, length: int) -> tuple[int, int]:
-    return max(0, int(min(a, b) - radius)), min(length, int(max(a, b) + radius) + 2)
+def _span(a: float, b: float, radius: float, first: int, last: int) -> tuple[int, int]:
+    """Where a line from a to b may cover pixels from ``first`` to before ``last``."""
+    return max(first, int(min(a, b) - radius)), min(last, int(max(a, b) + radius) + 2)
 
 
 def mask_of(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> Tensor:

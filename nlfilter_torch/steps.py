@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from nlfilter_torch.brush import Stroke, mask_of, paint
+from nlfilter_torch.brush import Stroke, coloured, mask_of, paint, painted
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.edits.abstract import abstract
 from nlfilter_torch.edits.colorize import colorize
@@ -99,7 +99,7 @@ class Detail:
 
     def has_region(self) -> bool:
         """Whether sliders of their own count somewhere."""
-        return any(stroke.paint == "in" for stroke in self.strokes)
+        return bool(painted(self.strokes, "in"))
 
     def changes(self) -> bool:
         """Whether it does anything."""
@@ -107,9 +107,7 @@ class Detail:
 
     def regions(self, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
         """What is painted as in and as out, (1, 1, H, W); None for nothing out."""
-        outs = [stroke for stroke in self.strokes if stroke.paint == "out"]
-        inner = mask_of((stroke for stroke in self.strokes if stroke.paint == "in"), size)
-        outer = mask_of(outs, size)
+        inner, outer = (mask_of(painted(self.strokes, word), size) for word in ("in", "out"))
         return inner, outer if bool(outer.any()) else None
 
     def blend(self, layers: Tensor, mask: Tensor | None) -> Tensor:
@@ -158,9 +156,9 @@ class Colorize:
 
     def apply(self, image: Tensor) -> Tensor:
         """The edited image, from (1, C, H, W) in [0, 1]."""
-        colours, painted = paint(self.strokes, (image.shape[-2], image.shape[-1]))
+        colours, mask = paint(self.strokes, (image.shape[-2], image.shape[-1]))
         grey = reduce_channels(image, "luminance")
-        return colorize(grey, colours, painted, strength=self.strength, generator=seeded())
+        return colorize(grey, colours, mask, strength=self.strength, generator=seeded())
 
 
 @dataclass(frozen=True)
@@ -182,19 +180,19 @@ class Recolor:
 
     def changes(self) -> bool:
         """Whether it does anything."""
-        return any(stroke.paint != "keep" for stroke in self.strokes)
+        return bool(coloured(self.strokes))
 
     def apply(self, image: Tensor) -> Tensor:
         """The edited image, from (1, C, H, W) in [0, 1]."""
         if image.shape[1] != 3:
             raise ValueError("recolor needs a colour photograph, got a grey one; use colorize, which colours grey ones")
         size = (image.shape[-2], image.shape[-1])
-        colours, painted = paint((s for s in self.strokes if s.paint != "keep"), size)
-        keep = mask_of((s for s in self.strokes if s.paint == "keep"), size)
+        colours, mask = paint(coloured(self.strokes), size)
+        keep = mask_of(painted(self.strokes, "keep"), size)
         return recolor(
             image,
             colours,
-            painted,
+            mask,
             keep=keep if bool(keep.any()) else None,
             reach=self.reach,
             photometric_bandwidth=self.tolerance / 100,

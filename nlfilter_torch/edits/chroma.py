@@ -43,8 +43,7 @@ def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tens
         numbers = torch.arange(int(labels.max()) + 1, device=labels.device)
         counts = numbers <= labels.amax(1, keepdim=True)  # (B, K)
         members = labels.unsqueeze(1) == torch.where(counts, numbers, 0).unsqueeze(2)  # (B, K, N)
-    regions = members * weights.flatten(2)
-    regions = regions.unflatten(2, chroma.shape[-2:])
+    regions = (members * weights.flatten(2)).unflatten(2, chroma.shape[-2:])
     return regions, region_means(chroma, regions), counts
 
 

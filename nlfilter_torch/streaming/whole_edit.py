@@ -1,9 +1,8 @@
 """A whole edit, as the editor saves it, on a picture that fits no memory: its steps one after the other, by rows."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import singledispatch
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -12,14 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.brush import Stroke, mask_of, paint
+from nlfilter_torch.brush import Stroke, coloured, mask_of, paint, painted
 from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, Recolor, Step, seeded
+from nlfilter_torch.steps import Colorize, Detail, Recolor, Step, seeded
 from nlfilter_torch.streaming.colorize import colorize_rows
 from nlfilter_torch.streaming.detail import detail_rows
 from nlfilter_torch.streaming.recolor import recolor_rows
-from nlfilter_torch.streaming.rows import Picture, RowSource
-from nlfilter_torch.streaming.tiles import TILE_PIXELS, Passes, Rows
+from nlfilter_torch.streaming.rows import Picture, Rows, RowSource
+from nlfilter_torch.streaming.tiles import TILE_PIXELS, Passes
 
 Floats = NDArray[np.float32]
 LOOKED_AT = 64  # rows at once
@@ -86,7 +85,7 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
     picture = Picture(source, name)
     steps = [step for step in recipe.steps if step.changes()]
     for step in steps:
-        if isinstance(step, Defocus | Abstract):
+        if type(step) not in BY_ROWS:
             raise ValueError(
                 f"{type(step).__name__.lower()} takes the whole photograph at once, and {name} is too large for that; "
                 "allow more memory, or leave that step out"
@@ -117,18 +116,17 @@ def _kept(rows: Rows, size: tuple[int, int], folder: Path) -> Iterator[RowSource
         yield np.memmap(file, np.float32, "r", shape=(*size, samples))
 
 
-@singledispatch
 def rows_of(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """The rows that a step makes of a picture."""
-    raise NotImplementedError(type(step).__name__)
+    rows: Rows = BY_ROWS[type(step)](step, passes, source, name)
+    return rows
 
 
-@rows_of.register
-def _(step: Detail, passes: Passes, source: RowSource, name: str) -> Rows:
+def _detail(step: Detail, passes: Passes, source: RowSource, name: str) -> Rows:
     sliders: dict[str, Any] = {"alpha": torch.tensor(step.alpha)}
     if step.has_region():
         size = Picture(source).size
-        inner, outer = (CoveredRows(tuple(s for s in step.strokes if s.paint == word), size) for word in ("in", "out"))
+        inner, outer = (CoveredRows(painted(step.strokes, word), size) for word in ("in", "out"))
         sliders = {
             "alpha": torch.tensor(step.inside),
             "outside": torch.tensor(step.alpha),
@@ -139,24 +137,25 @@ def _(step: Detail, passes: Passes, source: RowSource, name: str) -> Rows:
     return detail_rows(passes, source, **sliders, name=name, generator=seeded(), **step.preset.options())
 
 
-@rows_of.register
-def _(step: Colorize, passes: Passes, source: RowSource, name: str) -> Rows:
+def _colorize(step: Colorize, passes: Passes, source: RowSource, name: str) -> Rows:
     strokes = ColouredRows(step.strokes, Picture(source).size)
     return colorize_rows(passes, source, strokes, strength=step.strength, generator=seeded(), names=(name, "strokes"))
 
 
-@rows_of.register
-def _(step: Recolor, passes: Passes, source: RowSource, name: str) -> Rows:
+def _recolor(step: Recolor, passes: Passes, source: RowSource, name: str) -> Rows:
     size = Picture(source).size
-    keep = CoveredRows(tuple(s for s in step.strokes if s.paint == "keep"), size)
-    colours = tuple(stroke for stroke in step.strokes if stroke not in keep.strokes)
+    keep = CoveredRows(painted(step.strokes, "keep"), size)
     return recolor_rows(
         passes,
         source,
-        ColouredRows(colours, size),
+        ColouredRows(coloured(step.strokes), size),
         keep=keep if keep.any() else None,
         reach=step.reach,
         photometric_bandwidth=step.tolerance / 100,
         generator=seeded(),
         names=(name, "strokes"),
     )
+
+
+# The other steps take the whole picture at once.
+BY_ROWS: dict[type, Callable[..., Rows]] = {Detail: _detail, Colorize: _colorize, Recolor: _recolor}
