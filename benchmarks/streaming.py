@@ -128,11 +128,14 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
     luminance = 0.299 * image[:, :1] + 0.587 * image[:, 1:2] + 0.114 * image[:, 2:]
     started = time.process_time()
-    usual = polynomial_filter(nonlocal_operator(luminance), luminance, ALPHA)
+
+    def in_colour(filtered: torch.Tensor) -> NDArray[np.float32]:
+        return (image + filtered - luminance)[0].permute(1, 2, 0).numpy()
+
+    usual = in_colour(polynomial_filter(nonlocal_operator(luminance), luminance, ALPHA))
     in_memory = time.process_time() - started
     # Its own residual shows beside that of full passes.
-    filtered = polynomial_filter(nonlocal_operator(luminance, tolerance=1e-6), luminance, ALPHA)
-    whole = (image + filtered - luminance)[0].permute(1, 2, 0).numpy()
+    whole = in_colour(polynomial_filter(nonlocal_operator(luminance, tolerance=1e-6), luminance, ALPHA))
 
     def by_rows(**options: Any) -> NDArray[np.float32]:
         edited = np.empty_like(picture)
@@ -152,7 +155,7 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
     result["few_max"] = float(np.abs(few - whole).max())
     full = by_rows(statistics="full")
     result["full_max"] = float(np.abs(full - whole).max())
-    result["usual_max"] = float(np.abs(full - (image + usual - luminance)[0].permute(1, 2, 0).numpy()).max())
+    result["usual_max"] = float(np.abs(full - usual).max())
     return result | {"tiles_max": float(max(others)), "smallest_tile": tiles[0], "largest_tile": tiles[-1]}
 
 
