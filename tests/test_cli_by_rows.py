@@ -228,7 +228,9 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
     photo: Path, tmp_path: Path, number: signal.Signals, target: str
 ) -> None:
     program = (
-        "import sys, time\n"
+        "import signal, sys, time\n"
+        # A shell's background jobs, which these tests may be one of, ignore this signal, and so would their children.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from nlfilter_torch.streaming import detail, rows, tiles\n"
         "def slow(original):\n"
         "    def edit(*arguments):\n"
