@@ -32,9 +32,10 @@ chromium:
 demo: $(VENV)/.installed
 	$(BIN)/nlfilter-torch demo out
 
-# Everything that has to hold; pytest comes last, so that its count closes the output.
+# Everything that has to hold; pytest comes last, so that its count closes the output. A process for every core, of one
+# thread each: several threads in several processes would wait for each other. Tests of threads set their own number.
 test: lint types bench-quick chromium
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff format --check
