@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_count, check_image, check_same_size
+from nlfilter_torch.checks import check_alpha, check_count, check_image, check_same_size, check_shape
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.products import fold_batch, unfold_batch
 from nlfilter_torch.sharding import reduce_sum, replicate
 from nlfilter_torch.spectrum import Response, Spectrum
 
@@ -128,7 +127,14 @@ def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor) -> 
 
 
 @full_precision
-def spectral_filter(spectrum: Spectrum, image: Tensor, response: Response, *, residual: float | Tensor = 0.0) -> Tensor:
+def spectral_filter(
+    spectrum: Spectrum,
+    image: Tensor,
+    response: Response,
+    *,
+    residual: float | Tensor = 0.0,
+    coefficients: Tensor | None = None,
+) -> Tensor:
     """Filter an image with any response: ``V f(S) V^T y``, plus ``residual`` times what V does not explain.
 
     Paper: eq. (10), (13), and Sec. V-D, where f is a fractional power.
@@ -138,30 +144,39 @@ def spectral_filter(spectrum: Spectrum, image: Tensor, response: Response, *, re
         image: y, (B, C, H, W).
         response: f, an elementwise function of the eigenvalues (B, R), differentiable in torch; it may hold parameters.
         residual: weight of ``y - V V^T y``, a number or a tensor of shape () or the spectrum's (B,).
+        coefficients: of the image, kept from ``spectrum.coefficients(image)``; with them another response reads the
+            factor once, not twice. None works them out.
 
     Returns:
         (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
         ``response``, with a finite gradient where eigenvalues meet.
 
     Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
+        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size, or
+            ``coefficients`` are not as many as it has.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
         >>> image = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0))
         >>> spectrum = nonlocal_operator(image, num_landmarks=20).spectrum()
-        >>> spectral_filter(spectrum, image, lambda eigenvalues: eigenvalues**0.1, residual=1.0).shape
+        >>> held = spectrum.coefficients(image)
+        >>> for power in (0.1, 0.5, 2.0):
+        ...     filtered = spectral_filter(spectrum, image, lambda s: s**power, residual=1.0, coefficients=held)
+        >>> filtered.shape
         torch.Size([1, 1, 24, 24])
     """
-    check_image(image, "image")
-    check_same_size(image, spectrum.size, "image", "spectrum")
+    if coefficients is None:
+        coefficients = spectrum.coefficients(image)
+    else:
+        check_image(image, "image")
+        check_same_size(image, spectrum.size, "image", "spectrum")
+        batch, marks, _ = spectrum.factor.shape
+        shape = (max(batch, image.shape[0]), image.shape[1], marks)
+        check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
     rho = torch.as_tensor(replicate(residual, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
-    image_in = image.to(spectrum.factor)
-    planes = fold_batch(image_in, spectrum.factor.shape[0])
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still one pass down and one up.
-    spread = spectrum.apply(lambda eigenvalues: response(eigenvalues) - rho, planes)
-    filtered = unfold_batch(spread.unsqueeze(1), image.shape[0], spectrum.size)[:, 0]
-    return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image_in).to(image.dtype)
+    filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
+    return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered)).to(image.dtype)
 
 
 @full_precision

@@ -15,8 +15,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import buffered_blocks, strip_count, strips
+from nlfilter_torch.checks import check_image, check_same_size
 from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
+from nlfilter_torch.precision import full_precision
+from nlfilter_torch.products import fold_batch, unfold_batch
 from nlfilter_torch.sharding import Shard, reduce_sum
 from nlfilter_torch.thin import moment, spread
 
@@ -121,11 +124,34 @@ class Spectrum(RitzPairs):
         core = self.basis(response).to(self.factor)
         return (core @ self.factor) * self.scaling.unsqueeze(1)
 
-    def apply(self, response: Response, image: Tensor) -> Tensor:
-        """``V f(S) V^T y`` for images (B, C, N): one read of the factor for the coefficients, one for the result."""
-        scaling = self.scaling.unsqueeze(1)
-        total = moment(self.factor, scaling * image, self.shard)  # (B, M, C), float64
-        return scaling * spread((self.gain(response) @ total).mT.to(self.factor), self.factor)
+    @full_precision
+    def coefficients(self, image: Tensor) -> Tensor:
+        """``F y``, all that a response needs to know of an image: one read of the factor.
+
+        Whoever tries several responses on one image, or learns one, keeps them: see :func:`spectral_filter`.
+
+        Args:
+            image: y, (B, C, H, W).
+
+        Returns:
+            (B, C, M) in float64. Differentiable in image and operator.
+
+        Raises:
+            TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
+        """
+        check_image(image, "image")
+        check_same_size(image, self.size, "image", "spectrum")
+        planes = fold_batch(image.to(self.factor), self.factor.shape[0])
+        total = moment(self.factor, self.scaling.unsqueeze(1) * planes, self.shard)  # (B, M, C)
+        return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
+
+    def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
+        """``V f(S) V^T y``, (B, C, H, W), from the coefficients of y: another read of the factor."""
+        count = coefficients.shape[0]
+        total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
+        weighted = total @ self.gain(response).mT
+        planes = self.scaling.unsqueeze(1) * spread(weighted.to(self.factor), self.factor)
+        return unfold_batch(planes.unsqueeze(1), count, self.size)[:, 0]
 
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""

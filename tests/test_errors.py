@@ -70,6 +70,7 @@ TAKE_AN_IMAGE: dict[str, tuple[str, Callable[[torch.Tensor], object]]] = {
     "detail_layers": ("image", lambda x: detail_layers(OPERATOR, x)),
     "polynomial_filter": ("image", lambda x: polynomial_filter(OPERATOR, x, torch.ones(4))),
     "spectral_filter": ("image", lambda x: spectral_filter(SPECTRUM, x, torch.sqrt)),
+    "coefficients": ("image", SPECTRUM.coefficients),
     "captured_energy": ("image", lambda x: captured_energy(SPECTRUM, x)),
     "diffusion_mask": ("region", lambda x: diffusion_mask(SPECTRUM, x)),
     "segment_mask": ("regions", lambda x: segment_mask(SPECTRUM, x)),

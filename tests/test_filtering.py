@@ -253,6 +253,30 @@ def test_a_response_of_one_projects() -> None:
     torch.testing.assert_close(whole, image, atol=1e-8, rtol=0)
 
 
+@pytest.mark.parametrize(("guides", "images"), [(1, 1), (1, 3), (2, 2), (2, 1)])
+def test_coefficients_that_are_kept_change_nothing(guides: int, images: int) -> None:
+    noise = torch.Generator().manual_seed(0)
+    guide, image = (torch.rand(count, 3, 12, 15, dtype=torch.float64, generator=noise) for count in (guides, images))
+    spectrum = build(guide, photometric_bandwidth=0.3, num_landmarks=10).spectrum()
+    held = spectrum.coefficients(image)
+    assert held.shape == (max(guides, images), 3, 10)
+    for power in (0.1, 2.0):
+        found = spectral_filter(spectrum, image, lambda s, p=power: s**p, residual=0.7, coefficients=held)
+        assert torch.equal(found, spectral_filter(spectrum, image, lambda s, p=power: s**p, residual=0.7))
+
+
+def test_coefficients_of_another_image_are_refused() -> None:
+    image = picture("coffee", 12, 15)
+    spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=10).spectrum()
+    held = spectrum.coefficients(image.expand(1, 3, -1, -1))
+    with pytest.raises(
+        ValueError, match=r"coefficients must have shape \(1, 1, 10\), got \(1, 3, 10\); take spectrum.coe"
+    ):
+        spectral_filter(spectrum, image, torch.sqrt, coefficients=held)
+    with pytest.raises(TypeError, match=r"coefficients must be a torch\.Tensor, got list; take"):
+        spectral_filter(spectrum, image, torch.sqrt, coefficients=held.tolist())  # type: ignore[arg-type]
+
+
 def test_parameters_of_a_response_learn() -> None:
     image = picture("coffee", 12, 15)
     spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=10).spectrum()

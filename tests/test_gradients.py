@@ -100,6 +100,13 @@ def test_spectral_filter(completion: str) -> None:
     assert gradcheck(call, arguments)
 
 
+def test_coefficients() -> None:
+    def call(guide: Tensor, image: Tensor) -> Tensor:
+        return build(guide, "diagonal").spectrum().coefficients(image)
+
+    assert gradcheck(call, (small(), small(2, seed=1)))
+
+
 @pytest.mark.parametrize("completion", COMPLETIONS)
 def test_diffusion_mask(completion: str) -> None:
     region, negative = noise(1, 2, *SIZE, seed=1).requires_grad_(), noise(1, 1, *SIZE, seed=2).requires_grad_()

@@ -19,7 +19,6 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.thin import moment
 
 COMPARED = 1 << 27  # bytes of the largest factor that is made in float64, too; the main case always is
 
@@ -52,12 +51,10 @@ def main_case(plan: Plan) -> Iterator[Record]:
     operator = case.operator(image)
     spectrum, layers = operator.spectrum(), detail_layers(operator, image)
     sliders = PolynomialSliders(ALPHA).to(case.device)
-    scaling = operator.scaling.unsqueeze(1)
-    coefficients = moment(operator.factor, scaling * image.flatten(2))  # (B, M, 1)
+    held = spectrum.coefficients(image)
 
-    def response_of_coefficients() -> torch.Tensor:
-        gain = spectrum.gain(lambda eigenvalues: eigenvalues**0.1)
-        return scaling * ((gain @ coefficients).mT.to(scaling) @ operator.factor)
+    def power(eigenvalues: torch.Tensor) -> torch.Tensor:
+        return eigenvalues**0.1
 
     calls: dict[str, Call] = {
         "operator": discard(case.operator, image),
@@ -65,8 +62,8 @@ def main_case(plan: Plan) -> Iterator[Record]:
         "detail_layers": discard(detail_layers, operator, image),
         "new alpha, operator held": discard(polynomial_filter, operator, image, torch.tensor(ALPHA)),
         "slider, layers held": discard(sliders.combine, layers),
-        "response, spectrum held": discard(spectral_filter, spectrum, image, lambda eigenvalues: eigenvalues**0.1),
-        "response, coefficients held": discard(response_of_coefficients),
+        "response, spectrum held": discard(spectral_filter, spectrum, image, power),
+        "response, coefficients held": discard(spectral_filter, spectrum, image, power, coefficients=held),
     }
     others, missing = peers.prepare_all(peers.QUICK_PEERS, case)
     yield measured(

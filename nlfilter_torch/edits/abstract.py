@@ -95,10 +95,11 @@ def abstract(
     exponent = torch.as_tensor(power).to(spectrum.root).reshape(-1, 1)
     # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
     mean = pixels.mean((2, 3), keepdim=True)
-    explained = spectral_filter(spectrum, pixels - mean, torch.ones_like)
+    held = spectrum.coefficients(pixels - mean)
+    explained = spectral_filter(spectrum, pixels - mean, torch.ones_like, coefficients=held)
     alone = (operator.scaling.square() * operator.diagonal).clamp(LEAST, 1.0).unflatten(1, spectrum.size).unsqueeze(1)
     kept = alone ** (TIMES_UNEXPLAINED * exponent.to(alone)[..., None, None])  # (B, 1, H, W)
-    smoothed = spectral_filter(spectrum, pixels - mean, lambda eigenvalues: eigenvalues**exponent)
+    smoothed = spectral_filter(spectrum, pixels - mean, lambda eigenvalues: eigenvalues**exponent, coefficients=held)
     flat = mean + smoothed + kept * (pixels - mean - explained)
     if edges == 0 and tones is None:
         return flat.to(image.dtype)
