@@ -20,13 +20,19 @@ def spread(rows: Tensor, factor: Tensor) -> Tensor:
     """``rows @ factor``, (B, R, N), of rows (B, R, M) and a factor (B, M, N)."""
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
         return rows @ factor
+    if rows.shape[1] == 1:
+        return _spread_few(rows, factor).unsqueeze(0)
     found = []
     for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT):
-        parts = _parts(factor[:, :, block])  # (P, M, n / P)
         # The block is in the cache after the first few.
-        images = [torch.bmm(few.expand(len(parts), -1, -1), parts) for few in rows.split(FEW, dim=1)]
-        found.append(torch.cat(images, dim=1).transpose(0, 1).flatten(1))
+        found.append(torch.cat([_spread_few(few, factor[:, :, block]) for few in rows.split(FEW, dim=1)]))
     return torch.cat(found, dim=1).unsqueeze(0)
+
+
+def _spread_few(rows: Tensor, factor: Tensor) -> Tensor:
+    """``rows @ factor``, (R, n), of rows (1, R, M) and a factor (1, M, n): strip by strip."""
+    parts = _parts(factor)  # (P, M, n / P)
+    return torch.bmm(rows.expand(len(parts), -1, -1), parts).transpose(0, 1).flatten(1)
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
