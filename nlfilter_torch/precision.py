@@ -36,7 +36,8 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        device = next((a.device.type for a in args if isinstance(a, Tensor)), "cuda")
+        devices = [a.device.type for a in args if isinstance(a, Tensor)]  # Dynamo of PyTorch 2.8 knows no `next`
+        device = devices[0] if devices else "cuda"
         with torch.autocast("cpu", enabled=False), torch.autocast(device, enabled=False):
             if torch.cuda.is_available() and not torch.compiler.is_compiling():
                 with _no_tf32():
