@@ -62,7 +62,7 @@ class FittedFilter:
         Raises:
             TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
         """
-        return self._smoothed(image, guide, origin, halo)[0].to(image.dtype)
+        return self._planes(image, guide, origin, halo).to(image.dtype)
 
     @full_precision
     def __call__(
@@ -81,14 +81,14 @@ class FittedFilter:
         ``by_rows`` works out one row after the other: the rounding of a product depends on its shape, which is then the
         same for tiles of any height.
         """
-        layers, explained = self._smoothed(image, guide, origin, halo, by_rows=by_rows)
-        filtered = weigh_layers(layers, alpha)
+        planes = self._planes(image, guide, origin, halo, by_rows=by_rows, missed=residual is not None)
+        count = self.moments.shape[1] + 1
+        filtered = weigh_layers(planes[:, :count], alpha)
         if residual is not None:
-            missed = _without(image.to(filtered), halo) - explained
-            filtered = filtered + residual_change(alpha, residual, missed)
+            filtered = filtered + residual_change(alpha, residual, planes[:, count])
         return filtered.to(image.dtype)
 
-    def _smoothed(
+    def _planes(
         self,
         image: Tensor,
         guide: Tensor | None,
@@ -96,8 +96,9 @@ class FittedFilter:
         halo: tuple[int, int],
         *,
         by_rows: bool = False,
-    ) -> tuple[Tensor, Tensor]:
-        """Layers (B, k+1, C, H, W) and explained part (B, C, H, W), in the kernel's dtype."""
+        missed: bool = False,
+    ) -> Tensor:
+        """Layers (B, k+1, C, H, W) and, if asked for, what a residual weighs as one more, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
@@ -114,18 +115,22 @@ class FittedFilter:
         size = (image.shape[-2], image.shape[-1])
         step = size[1] if by_rows else features.shape[2]
         parts = zip(features.split(step, dim=2), image.to(features).flatten(2).split(step, dim=2), strict=True)
-        layers, explained = zip(*(self._smooth(kernel, *part) for part in parts), strict=True)
-        return torch.cat(layers, dim=-1).unflatten(-1, size), torch.cat(explained, dim=-1).unflatten(-1, size)
+        planes = [self._split(kernel, *part, missed=missed) for part in parts]
+        return torch.cat(planes, dim=-1).unflatten(-1, size)
 
-    def _smooth(self, kernel: Kernel, features: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Layers (B, k+1, C, n) and explained part (B, C, n) of pixels (B, C, n) with features (B, D, n)."""
+    def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
+        """The same (B, k+1 or k+2, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
         scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor)).unsqueeze(1)
         remainder = scaling.square() * diagonal.unsqueeze(1)
         smoothed = [image]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(scaling * spread(coefficients.mT, factor) + remainder * smoothed[-1])
-        return layers_between(torch.stack(smoothed, dim=1)), scaling * spread(self.explained.to(factor).mT, factor)
+        layers = layers_between(torch.stack(smoothed, dim=1))
+        if not missed:
+            return layers
+        explained = scaling * spread(self.explained.to(factor).mT, factor)
+        return torch.cat([layers, ((1 - remainder) * (image - explained)).unsqueeze(1)], dim=1)
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:

@@ -116,6 +116,12 @@ class NonlocalOperator:
         planes = apply_powers(self.factor, self.scaling, self.diagonal, folded, order, self.shard)
         return unfold_batch(planes, image.shape[0], self.size)
 
+    @property
+    def diagonal_share(self) -> Tensor:
+        """What W takes of a pixel's own value for want of pixels like it: r = d^2 c, (B, 1, H, W), in [0, 1]."""
+        share = self.scaling * (self.scaling * self.diagonal)  # in this order: without completion d^2 may overflow
+        return share.unflatten(1, self.size).unsqueeze(1)
+
     def row_sums(self) -> Tensor:
         """(B, 1, H, W), one everywhere to :attr:`residual`."""
         batch = self.factor.shape[0]
@@ -168,7 +174,6 @@ class NonlocalOperator:
         total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1), self.shard).to(self.factor)
         kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
         bandwidth = torch.as_tensor(self.kernel.photometric_bandwidth).reshape(-1).expand(self.factor.shape[0])
-        share = (self.scaling * (self.scaling * self.diagonal)).sum(1)
         return Diagnostics(
             pixels=spectrum.pixels,
             num_landmarks=self.factor.shape[1],
@@ -180,7 +185,7 @@ class NonlocalOperator:
             largest_eigenvalue=spectrum.largest.tolist(),
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(reduce_sum(flat @ flat.mT, self.shard) - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(reduce_sum(share, self.shard) / spectrum.pixels).tolist(),
+            diagonal_share=(reduce_sum(self.diagonal_share.sum((1, 2, 3)), self.shard) / spectrum.pixels).tolist(),
         )
 
 

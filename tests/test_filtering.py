@@ -153,12 +153,24 @@ def test_without_residual_it_is_eq_13_on_the_eigenvectors() -> None:
 def test_residual_is_the_weight_of_what_the_eigenvectors_miss(completion: str) -> None:
     image = picture("camera", 24, 30)
     operator = build(image, photometric_bandwidth=0.3, completion=completion, num_landmarks=30, landmarks="uniform")
-    missed = image - spectral_filter(operator.spectrum(), image, torch.ones_like)
+    missed = (1 - operator.diagonal_share) * (image - spectral_filter(operator.spectrum(), image, torch.ones_like))
     assert missed.abs().max() > 1e-3
+    assert bool((operator.diagonal_share > 1e-3).any()) == (completion == "diagonal")
     by_default = polynomial_filter(operator, image, double(ALPHA))
     for weight in (0.0, 1.0, ALPHA[0]):
         found = polynomial_filter(operator, image, double(ALPHA), residual=weight)
         torch.testing.assert_close(found, by_default + (weight - ALPHA[0]) * missed, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("residual", [None, 0.0, 1.0])
+def test_a_pixel_like_no_other_is_neither_lifted_nor_dropped(residual: float | None) -> None:
+    image = picture("camera", 24, 30) / 2
+    image[0, 0, 5, 7] = 1.0
+    operator = build(image, photometric_bandwidth=0.02, num_landmarks=10, landmarks="uniform", patch_size=1)
+    alike = operator.diagonal_share < 0.999
+    assert not alike[0, 0, 5, 7]
+    found = polynomial_filter(operator, image, double(ALPHA), residual=residual)
+    torch.testing.assert_close(found[~alike], ALPHA[-1] * image[~alike], atol=0.02, rtol=0)
 
 
 def test_residual_may_be_a_parameter() -> None:

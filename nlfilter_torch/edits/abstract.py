@@ -97,7 +97,7 @@ def abstract(
     mean = pixels.mean((2, 3), keepdim=True)
     held = spectrum.coefficients(pixels - mean)
     explained = spectral_filter(spectrum, pixels - mean, torch.ones_like, coefficients=held)
-    alone = (operator.scaling.square() * operator.diagonal).clamp(LEAST, 1.0).unflatten(1, spectrum.size).unsqueeze(1)
+    alone = operator.diagonal_share.clamp(LEAST, 1.0)
     kept = alone ** (TIMES_UNEXPLAINED * exponent.to(alone)[..., None, None])  # (B, 1, H, W)
     smoothed = spectral_filter(spectrum, pixels - mean, lambda eigenvalues: eigenvalues**exponent, coefficients=held)
     flat = mean + smoothed + kept * (pixels - mean - explained)

@@ -132,7 +132,7 @@ def _passed_noise(operator: NonlocalOperator) -> Tensor:
     Off the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.
     """
     inside = operator.spectrum().eigenvalues  # (B, R)
-    outside = operator.scaling.square() * operator.diagonal  # (B, N)
+    outside = operator.diagonal_share.flatten(1)  # (B, N)
     pixels = outside.shape[1]
     share = 1 - inside.shape[1] / pixels
 
