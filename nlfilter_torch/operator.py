@@ -118,7 +118,7 @@ class NonlocalOperator:
 
     @property
     def diagonal_share(self) -> Tensor:
-        """What W takes of a pixel's own value for want of pixels like it: r = d^2 c, (B, 1, H, W), in [0, 1]."""
+        """What W takes of a pixel's own value for want of pixels like it, r = d^2 c in [0, 1] as (B, 1, H, W)."""
         share = self.scaling * (self.scaling * self.diagonal)  # in this order: without completion d^2 may overflow
         return share.unflatten(1, self.size).unsqueeze(1)
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.sharding import Shard, reduce_sum
 
-FEW = 3  # rows that are quicker together than one by one, and than more
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
 MOST_GATHERED = 24
 
@@ -21,18 +20,17 @@ def spread(rows: Tensor, factor: Tensor) -> Tensor:
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
         return rows @ factor
     if rows.shape[1] == 1:
-        return _spread_few(rows, factor).unsqueeze(0)
-    found = []
-    for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT):
-        # The block is in the cache after the first few.
-        found.append(torch.cat([_spread_few(few, factor[:, :, block]) for few in rows.split(FEW, dim=1)]))
-    return torch.cat(found, dim=1).unsqueeze(0)
+        return _spread_one(rows, factor)
+    # One after the other is quicker than several together: a block is in the cache after the first.
+    blocks = [factor[:, :, block] for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT)]
+    pieces = [[_spread_one(row, block) for row in rows.split(1, dim=1)] for block in blocks]
+    return torch.cat([piece for row in zip(*pieces, strict=True) for piece in row], dim=2).view(*rows.shape[:2], -1)
 
 
-def _spread_few(rows: Tensor, factor: Tensor) -> Tensor:
-    """``rows @ factor``, (R, n), of rows (1, R, M) and a factor (1, M, n): strip by strip."""
+def _spread_one(row: Tensor, factor: Tensor) -> Tensor:
+    """``row @ factor``, (1, 1, n), of a row (1, 1, M) and a factor (1, M, n), strip by strip."""
     parts = _parts(factor)  # (P, M, n / P)
-    return torch.bmm(rows.expand(len(parts), -1, -1), parts).transpose(0, 1).flatten(1)
+    return torch.bmm(row.expand(len(parts), -1, -1), parts).view(1, 1, -1)
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
