@@ -41,9 +41,8 @@ def check_finite(tensor: Tensor, name: str) -> None:
     if tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor):
         return
     values = tensor.detach()
-    if bool(
-        values.sum().isfinite()
-    ):  # a tenth of the time of looking at every value; the sum of finite ones may overflow
+    # Their sum tells in a tenth of the time that looking at each would take, unless finite ones overflow it.
+    if bool(values.sum().isfinite()):
         return
     bad = int((~torch.isfinite(values)).sum())
     if bad > 0:

@@ -146,7 +146,7 @@ class Spectrum(RitzPairs):
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
-        """``V f(S) V^T y``, (B, C, H, W), from the coefficients of y: another read of the factor."""
+        """``V f(S) V^T y``, (B, C, H, W), for a response f and coefficients (B, C, M) of y: one read of the factor."""
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
         weighted = total @ self.gain(response).mT

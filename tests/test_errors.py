@@ -22,6 +22,7 @@ from nlfilter_torch import (
     segment_mask,
     spectral_filter,
 )
+from nlfilter_torch.checks import check_finite
 from tests.problems import noise
 
 GUIDE = noise(2, 1, 8, 9)
@@ -84,6 +85,12 @@ def test_bad_images(function: str, bad: str) -> None:
     name, call = TAKE_AN_IMAGE[function]
     value, error, message = BAD_IMAGES[bad]
     raises(lambda: call(value), error, f"{name} {message}")
+
+
+def test_values_whose_sum_overflows_are_finite() -> None:
+    image = torch.full((1, 1, 8, 9), 3e38)
+    assert not image.sum().isfinite()
+    check_finite(image, "image")
 
 
 @pytest.mark.parametrize("function", [name for name, (argument, _) in TAKE_AN_IMAGE.items() if argument != "guide"])

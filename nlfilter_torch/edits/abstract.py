@@ -95,12 +95,13 @@ def abstract(
     exponent = torch.as_tensor(power).to(spectrum.root).reshape(-1, 1)
     # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
     mean = pixels.mean((2, 3), keepdim=True)
-    held = spectrum.coefficients(pixels - mean)
-    explained = spectral_filter(spectrum, pixels - mean, torch.ones_like, coefficients=held)
+    centred = pixels - mean
+    held = spectrum.coefficients(centred)
+    explained = spectral_filter(spectrum, centred, torch.ones_like, coefficients=held)
     alone = operator.diagonal_share.clamp(LEAST, 1.0)
     kept = alone ** (TIMES_UNEXPLAINED * exponent.to(alone)[..., None, None])  # (B, 1, H, W)
-    smoothed = spectral_filter(spectrum, pixels - mean, lambda eigenvalues: eigenvalues**exponent, coefficients=held)
-    flat = mean + smoothed + kept * (pixels - mean - explained)
+    smoothed = spectral_filter(spectrum, centred, lambda eigenvalues: eigenvalues**exponent, coefficients=held)
+    flat = mean + smoothed + kept * (centred - explained)
     if edges == 0 and tones is None:
         return flat.to(image.dtype)
     luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))

@@ -118,8 +118,7 @@ def _kept(rows: Rows, size: tuple[int, int], folder: Path) -> Iterator[RowSource
 
 def rows_of(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """The rows that a step makes of a picture."""
-    rows: Rows = BY_ROWS[type(step)](step, passes, source, name)
-    return rows
+    return BY_ROWS[type(step)](step, passes, source, name)
 
 
 def _detail(step: Detail, passes: Passes, source: RowSource, name: str) -> Rows:
