@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.files import Photograph, write_photograph
+from nlfilter_torch.recipe import Recipe
 
 REPEATS = 20
 
@@ -62,13 +63,23 @@ def in_the_library(path: Path) -> None:
 
     report("first stroke to mask", [milliseconds(lambda: stroke(0.3))])
     report("stroke to mask", [milliseconds(lambda i=i: stroke(0.3 + i / 100)) for i in range(REPEATS)])
-    for step, paint in (("recolor", "#2040e0"), ("colorize", "#2040e0"), ("defocus", "in"), ("abstract", "")):
-        session.load(type(session.recipe)())
+    for step, paint, entry, values in (
+        ("recolor", "#2040e0", "reach", (0.5, 0.6, 0.7)),
+        ("colorize", "#2040e0", "strength", (0.5, 0.6, 0.7)),
+        ("defocus", "in", "radius", (2.0, 3.0, 4.0)),
+        ("abstract", "", "power", (0.05, 0.15, 0.2)),
+    ):
+        session.load(Recipe())
         if paint:
             session.add_stroke(step, [(0.4 * size[1], 0.4 * size[0]), (0.5 * size[1], 0.4 * size[0])], 0.02, paint)
         else:
             session.set(step, power=0.1)
         report(f"{step}", [milliseconds(session.render)])
+        times = []
+        for value in values:
+            session.set(step, **{entry: value})
+            times.append(milliseconds(session.render))
+        report(f"{step}, {entry} changed", times)
 
 
 def in_the_browser(path: Path) -> None:

@@ -5,13 +5,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from nlfilter_torch.blocks import CACHED, block_length
 from nlfilter_torch.checks import check_finite, check_image, check_positive, check_same_size, check_unit_range
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.landmarks import assign, cluster_means
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
+from nlfilter_torch.sharding import reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.thin import moment
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
 ITERATIONS = 20  # of k-means, which starts close to its end
@@ -81,16 +83,17 @@ def diffusion_mask(
     check_positive(width, "width")
     weights = region_weights(spectrum, region)  # (B, K, N)
     exponent = torch.as_tensor(replicate(time, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
+    others = None if negative is None else region_weights(spectrum, negative, name="negative")
+    if others is not None:
+        check_negative(others.shape[1], weights.shape[1])
+        weights = torch.cat([weights.expand(len(others), -1, -1), others.expand(len(weights), -1, -1)], dim=1)
     # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
-    basis = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
-    scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(basis).reshape(-1, 1, 1)
-    exponents = scale * _squared_distances(basis, weights, spectrum.shard)  # (B, K, N)
-    others = None
-    if negative is not None:
-        marked = region_weights(spectrum, negative, name="negative")
-        check_negative(marked.shape[1], weights.shape[1])
-        others = scale * _squared_distances(basis, marked, spectrum.shard)
-    return mask_of_exponents(exponents, others).unflatten(2, spectrum.size).to(region.dtype)
+    distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
+    scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
+    exponents = scale * distances
+    inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
+    mask = mask_of_exponents(inner, None if negative is None else outer)
+    return mask.unflatten(2, spectrum.size).to(region.dtype)
 
 
 def check_negative(count: int, regions: int) -> None:
@@ -108,9 +111,20 @@ def mask_of_exponents(exponents: Tensor, others: Tensor | None) -> Tensor:
     return mask if others is None else mask * torch.sigmoid((others - exponents).clamp(min=-20.0))
 
 
-def _squared_distances(coordinates: Tensor, weights: Tensor, shard: Shard | None) -> Tensor:
-    """Squared distances (B, K, N) of all pixels to the weighted means of regions (B, K, N), coordinates (B, M, N)."""
-    return squared_distances(coordinates, reduce_sum(weights @ coordinates.mT, shard))
+def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
+    """Squared distances (B, K, N) of all pixels to the means of K regions in the coordinates ``basis @ F``.
+
+    Args:
+        spectrum: whose F, the scaled factor, it is.
+        basis: (B, M, M), float64.
+        weights: of the regions, (B, K, N), each of unit sum.
+    """
+    factor, scaling = spectrum.factor, spectrum.scaling.unsqueeze(1)
+    centres = (basis @ moment(factor, scaling * weights, spectrum.shard)).mT.to(factor)  # (B, K, M)
+    core, step = basis.to(factor), block_length(len(factor), factor.device, CACHED)
+    blocks = zip(factor.split(step, dim=2), scaling.split(step, dim=2), strict=True)
+    # All coordinates would take as much memory as the factor.
+    return torch.cat([squared_distances((core @ columns) * scales, centres) for columns, scales in blocks], dim=2)
 
 
 def squared_distances(coordinates: Tensor, centres: Tensor) -> Tensor:

@@ -44,10 +44,8 @@ class Recipe:
 
     @property
     def factors(self) -> int:
-        """Arrays as large as a factor that the hungriest step holds at once."""
-        if self.defocus.changes() or self.recolor.changes():
-            return 3
-        return 2 if self.detail.has_region() or self.colorize.changes() else 1
+        """Arrays as large as a factor that the hungriest step holds at once; patches in colour count as one."""
+        return 2 if self.detail.has_region() else 1
 
     def apply(self, image: Tensor) -> Tensor:
         """Edit a photograph.

@@ -3,8 +3,10 @@
 Each is a value: nothing in it depends on the photograph, so that one that was made on a preview holds for the original.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -12,11 +14,11 @@ from torch import Tensor
 
 from nlfilter_torch.brush import Stroke, coloured, mask_of, paint, painted
 from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.edits.abstract import abstract
-from nlfilter_torch.edits.colorize import colorize
-from nlfilter_torch.edits.defocus import defocus
+from nlfilter_torch.edits.abstract import Abstraction
+from nlfilter_torch.edits.colorize import Colorization
+from nlfilter_torch.edits.defocus import Defocusing
 from nlfilter_torch.edits.enhance import colour_masks
-from nlfilter_torch.edits.recolor import recolor
+from nlfilter_torch.edits.recolor import Recoloring
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import detail_layers, weigh_layers
 from nlfilter_torch.operator import nonlocal_operator
@@ -54,6 +56,22 @@ class Step(Protocol):
     def apply(self, image: Tensor) -> Tensor:
         """The edited image, from (1, C, H, W) in [0, 1]."""
         ...
+
+
+class FilterStep(Step):
+    """A step whose filter serves any other of its kind as well, as long as they :meth:`share` it."""
+
+    def share(self) -> tuple[object, ...]:
+        """The settings, if any, that the filter depends on beside the image."""
+        return ()
+
+    @abstractmethod
+    def hold(self, image: Tensor) -> Callable[[Any], Tensor]:
+        """What steps that share the filter make of an image (1, C, H, W); the first of them makes it."""
+
+    def apply(self, image: Tensor) -> Tensor:
+        """The edited image, from (1, C, H, W) in [0, 1]."""
+        return self.hold(image)(self)
 
 
 @dataclass(frozen=True)
@@ -136,7 +154,7 @@ class Detail:
 
 
 @dataclass(frozen=True)
-class Colorize:
+class Colorize(FilterStep):
     """Colours for a grey photograph; a coloured one is taken for grey.
 
     Attributes:
@@ -154,15 +172,19 @@ class Colorize:
         """Whether it does anything."""
         return bool(self.strokes)
 
+    def hold(self, image: Tensor, *, both: bool = True) -> Callable[["Colorize"], Tensor]:
+        """Colours from any strokes for the image; its two filters are there together, or one after the other."""
+        held = Colorization(reduce_channels(image, "luminance"), generator=seeded(), hold=both)
+        size = (image.shape[-2], image.shape[-1])
+        return lambda step: held(*paint(step.strokes, size), strength=step.strength)
+
     def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
-        colours, mask = paint(self.strokes, (image.shape[-2], image.shape[-1]))
-        grey = reduce_channels(image, "luminance")
-        return colorize(grey, colours, mask, strength=self.strength, generator=seeded())
+        """The edited image, from (1, C, H, W) in [0, 1]; in the memory of one filter."""
+        return self.hold(image, both=False)(self)
 
 
 @dataclass(frozen=True)
-class Recolor:
+class Recolor(FilterStep):
     """New colours for what looks like the strokes.
 
     Attributes:
@@ -182,26 +204,27 @@ class Recolor:
         """Whether it does anything."""
         return bool(coloured(self.strokes))
 
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
+    def share(self) -> tuple[object, ...]:
+        """The tolerance."""
+        return (self.tolerance,)
+
+    def hold(self, image: Tensor) -> Callable[["Recolor"], Tensor]:
+        """The image under any strokes."""
         if image.shape[1] != 3:
             raise ValueError("recolor needs a colour photograph, got a grey one; use colorize, which colours grey ones")
+        held = Recoloring(image, photometric_bandwidth=self.tolerance / 100, generator=seeded())
         size = (image.shape[-2], image.shape[-1])
-        colours, mask = paint(coloured(self.strokes), size)
-        keep = mask_of(painted(self.strokes, "keep"), size)
-        return recolor(
-            image,
-            colours,
-            mask,
-            keep=keep if bool(keep.any()) else None,
-            reach=self.reach,
-            photometric_bandwidth=self.tolerance / 100,
-            generator=seeded(),
-        )
+
+        def edit(step: Recolor) -> Tensor:
+            keep = mask_of(painted(step.strokes, "keep"), size)
+            strokes = paint(coloured(step.strokes), size)
+            return held(*strokes, keep=keep if bool(keep.any()) else None, reach=step.reach)
+
+        return edit
 
 
 @dataclass(frozen=True)
-class Defocus:
+class Defocus(FilterStep):
     """A blur of all but what looks like the strokes, and is near them.
 
     Attributes:
@@ -219,15 +242,16 @@ class Defocus:
         """Whether it does anything."""
         return bool(self.strokes)
 
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
+    def hold(self, image: Tensor) -> Callable[["Defocus"], Tensor]:
+        """The image with any strokes in focus."""
+        held = Defocusing(image, generator=seeded())
         size = (image.shape[-2], image.shape[-1])
-        radius = self.radius / 100 * min(size)
-        return defocus(image, mask_of(self.strokes, size), radius=radius, generator=seeded())
+        focus = lru_cache(1)(lambda strokes: held.focus(mask_of(strokes, size)))
+        return lambda step: held.blur(focus(step.strokes), step.radius / 100 * min(size))
 
 
 @dataclass(frozen=True)
-class Abstract:
+class Abstract(FilterStep):
     """A painting of the photograph: flat areas, lines along edges, few tones.
 
     Attributes:
@@ -262,9 +286,12 @@ class Abstract:
         """Whether it does anything."""
         return self.power > 0 or self.edges > 0 or self.tones is not None
 
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
-        width = max(self.width / 1000 * min(image.shape[-2:]), 0.3)
-        return abstract(
-            image, power=self.power, edges=self.edges, edge_width=width, tones=self.tones, generator=seeded()
-        )
+    def hold(self, image: Tensor) -> Callable[["Abstract"], Tensor]:
+        """A painting of the image, of any kind."""
+        held, short = Abstraction(image, generator=seeded()), min(image.shape[-2:])
+
+        def edit(step: Abstract) -> Tensor:
+            width = max(step.width / 1000 * short, 0.3)
+            return held(power=step.power, edges=step.edges, edge_width=width, tones=step.tones)
+
+        return edit

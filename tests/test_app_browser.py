@@ -188,8 +188,9 @@ def test_other_steps_change_the_picture(opened: Tab, step: str, control: str) ->
         opened.paint((0.4, 0.4), (0.45, 0.4))
         opened.wait_for_picture(before)
         before = opened.source()
-    opened.drag(opened.slider(control), 0.5, 0.7)
-    opened.wait_for_picture(before)
+    opened.drag(opened.slider(control), 0.5, 0.7, release=False)
+    opened.wait_for_picture(before)  # while the button is held
+    page.mouse.up()
     page.wait_for_timeout(500)
     assert difference(shown(opened), cat()) > 5
 

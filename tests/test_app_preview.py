@@ -1,5 +1,8 @@
 """The editor's preview: what it shows is what is saved, and what does not change is not worked out again."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -10,7 +13,7 @@ from nlfilter_torch.app.session import Session
 from nlfilter_torch.brush import Stroke
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Abstract, Defocus, Detail
+from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, FilterStep, Recolor
 from tests.problems import cat, difference
 
 
@@ -35,19 +38,92 @@ def test_what_is_shown_is_what_is_saved(colour: bool) -> None:
         assert difference(preview.render(recipe), recipe.apply(image)) < 1
 
 
-def test_steps_are_held_until_one_before_them_changes(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    work = Abstract.apply
-    monkeypatch.setattr(Abstract, "apply", lambda step, image: calls.append(step) or work(step, image))
+def counted(monkeypatch: pytest.MonkeyPatch, kind: type) -> list[str]:
+    """What happens to a step from now on: ``filter`` for each one made, ``edit`` for each picture drawn."""
+    events = []
+    hold = kind.hold  # type: ignore[attr-defined]
+
+    def spied(step: FilterStep, image: torch.Tensor) -> Callable[[FilterStep], torch.Tensor]:
+        events.append("filter")
+        edit = hold(step, image)
+        return lambda other: events.append("edit") or edit(other)  # type: ignore[func-returns-value,no-any-return]
+
+    monkeypatch.setattr(kind, "hold", spied)
+    return events
+
+
+def test_pictures_are_held_until_a_step_before_them_changes(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    events = counted(monkeypatch, Abstract)
     session.set("abstract", power=0.1)
     first = session.render()
     assert torch.equal(session.render(), first)
-    assert len(calls) == 1
+    assert events == ["filter", "edit"]
     session.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))
     assert not torch.equal(session.render(), first)
-    assert len(calls) == 2
+    assert events == ["filter", "edit"] * 2
     assert torch.equal(session.render("detail"), Preview(cat()).render(Recipe(session.recipe.detail)))
-    assert len(calls) == 2
+    assert events == ["filter", "edit"] * 2
+
+
+HERE, THERE = ((0.2, 0.2), (0.3, 0.2)), ((0.7, 0.6), (0.8, 0.7))
+EDITS = {
+    "recolor": (
+        Recolor((Stroke(HERE, 0.04, "#2040e0"),)),
+        Recolor((Stroke(HERE, 0.04, "#20e040"), Stroke(THERE, 0.04, "keep")), reach=0.5),
+    ),
+    "colorize": (
+        Colorize((Stroke(HERE, 0.04, "#2040e0"),)),
+        Colorize((Stroke(HERE, 0.04, "#2040e0"), Stroke(THERE, 0.04, "#c02010")), strength=0.3),
+    ),
+    "defocus": (Defocus((Stroke(HERE, 0.04, "in"),)), Defocus((Stroke(THERE, 0.04, "in"),), radius=4.0)),
+    "abstract": (Abstract(power=0.1), Abstract(power=0.05, edges=1.0, width=4.0, tones=5)),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_more_strokes_need_no_other_filter(name: str, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = EDITS[name]
+    wanted = second.apply(session.preview.pixels).clamp(0, 1)
+    session.set(name, **vars(first))
+    session.render()
+    monkeypatch.setattr(f"nlfilter_torch.edits.{name}.nonlocal_operator", None)
+    session.set(name, **vars(second))
+    assert torch.equal(session.render(), wanted)
+
+
+def test_another_tolerance_or_picture_needs_another_filter(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    events = counted(monkeypatch, Recolor)
+    session.set("recolor", **vars(EDITS["recolor"][0]))
+    session.render()
+    for step, change in (
+        ("recolor", {"tolerance": 20.0}),
+        ("detail", {"alpha": (3.0, 1.0, 1.0, 1.0)}),
+        ("colorize", vars(EDITS["colorize"][0])),
+    ):
+        session.set(step, **change)
+        assert difference(session.render(), session.recipe.apply(cat())) < 1
+    assert events == ["filter", "edit"] * 7  # the preview's and those of the whole edits
+
+
+def test_the_filter_held_is_that_of_the_step_at_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    early, late = counted(monkeypatch, Recolor), counted(monkeypatch, Abstract)
+    session.set("abstract", power=0.1)
+    for reach in (0.3, 0.5, 0.8):
+        session.set("recolor", **vars(replace(EDITS["recolor"][0], reach=reach)))
+        session.render()
+    assert early == ["filter", "edit", "edit", "edit"]
+    assert late == ["filter", "edit"] * 3  # of another picture each time
+    for power in (0.05, 0.02):
+        session.set("abstract", power=power)
+        session.render()
+    assert early == ["filter", "edit", "edit", "edit"]
+    assert late == ["filter", "edit"] * 4 + ["edit"]
+
+
+def test_strokes_beside_the_photograph_are_refused(session: Session) -> None:
+    session.set("recolor", strokes=(Stroke(((1.8, 1.8),), 0.04, "#2040e0"),))
+    with pytest.raises(ValueError, match="stroke_mask must hold a painted pixel"):
+        session.render()
 
 
 def test_a_slider_moves_without_the_operator(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -274,6 +274,20 @@ def test_regions_are_filtered_each_by_its_own_sliders(residual: float | None) ->
         layer(single, mask=masks[:, :1].float())
 
 
+def test_masks_are_worked_out_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    guide, weights = noise(2, 1, 20, 30).requires_grad_(), noise(2, 3, 20, 30, seed=1)
+
+    def mask_and_slope() -> tuple[torch.Tensor, torch.Tensor]:
+        spectrum = nonlocal_operator(guide, num_landmarks=12, photometric_bandwidth=0.3).spectrum()
+        mask = diffusion_mask(spectrum, weights[:, :2], negative=weights[:, 2:])
+        return mask, torch.autograd.grad((mask * weights[:, :2]).sum(), guide)[0]
+
+    whole = mask_and_slope()
+    monkeypatch.setattr("nlfilter_torch.masks.CACHED", 1)  # of 256 pixels
+    for found, wanted in zip(mask_and_slope(), whole, strict=True):
+        torch.testing.assert_close(found, wanted, atol=1e-10, rtol=1e-8)
+
+
 def test_overlapping_masks_share_a_pixel() -> None:
     alpha = compose_alpha(torch.ones(1, 2, 1, 1), torch.tensor([[3.0, 1.0], [5.0, 2.0]]))
     torch.testing.assert_close(alpha.flatten(), torch.tensor([4.0, 1.5]))

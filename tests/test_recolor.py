@@ -8,7 +8,7 @@ from skimage.measure import label
 from nlfilter_torch import nonlocal_operator, recolor
 from nlfilter_torch.edits.chroma import group_colours, region_means, split_luminance
 from nlfilter_torch.edits.recolor import colour_guide
-from nlfilter_torch.edits.spots import MAX_SPOTS, find_spots, label_spots
+from nlfilter_torch.edits.spots import MAX_SPOTS, Pixels, find_spots, label_spots, unit_vectors
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
 
 
@@ -131,10 +131,10 @@ def test_spots_beyond_the_last_that_is_kept_apart_are_taken_together() -> None:
     spectrum = nonlocal_operator(image, num_landmarks=40, photometric_bandwidth=0.2, guide_channels="all").spectrum()
     dots = torch.zeros(1, 2, 64, 64)
     dots[:, 0, 1::4, 1::4], dots[:, 1, 3::16, 3::16] = 0.5, 1.0  # 256 and 16
-    (spots,) = find_spots(spectrum, dots, 0.5)
+    ((spots, pixels),) = find_spots(spectrum, dots, 0.5)
     assert spots.owners.sum(0).tolist() == [MAX_SPOTS, 16]
     torch.testing.assert_close(spots.between.diagonal(), torch.ones(MAX_SPOTS + 16), atol=1e-4, rtol=0)
-    each = spots.mix(torch.eye(MAX_SPOTS + 16))
+    each = pixels.along(spots.means)
     assert each.abs().max() <= 1 + 1e-3
     single = dots[0, 1].flatten() > 0  # a dot correlates with itself fully
     torch.testing.assert_close(each[MAX_SPOTS:, single].diagonal(), torch.ones(16), atol=1e-3, rtol=0)
@@ -154,3 +154,15 @@ def test_spots_are_what_is_connected(monkeypatch: pytest.MonkeyPatch) -> None:
             wanted = torch.cat([torch.from_numpy(p[p > 0]) + o for p, o in zip(parts, offsets, strict=True)])
             assert torch.equal(spots, wanted)
             assert torch.equal(owners, torch.arange(3).repeat_interleave(counts))
+
+
+def test_products_along_directions_are_those_of_unit_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Block by block, gradients too."""
+    monkeypatch.setattr("nlfilter_torch.edits.spots.CACHED", 1)  # blocks of 256 pixels
+    basis, factor, directions = (noise(*shape).requires_grad_() for shape in ((5, 5), (5, 700), (3, 5)))
+    found = Pixels.of(basis, factor).along(directions)
+    wanted = directions @ unit_vectors(basis, factor)
+    torch.testing.assert_close(found, wanted, atol=1e-12, rtol=0)
+    slopes = [torch.autograd.grad((y * noise(3, 700)).sum(), [basis, factor, directions]) for y in (found, wanted)]
+    for a, b in zip(*slopes, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-9, rtol=0)

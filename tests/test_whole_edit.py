@@ -84,7 +84,7 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     write_photograph(Photograph(cat(), "uint16"), photo)
     preset.write_text(Recipe(DETAIL, recolor=RECOLOR).to_json())
     names = [tmp_path / "whole.tif", tmp_path / "rows.tif"]
-    for name, options in zip(names, ([], ["--memory", "0.02", "--full"]), strict=True):
+    for name, options in zip(names, ([], ["--memory", "0.01", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
     # The second step's k-means may turn another way by the rounding of the first.

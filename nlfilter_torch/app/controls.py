@@ -38,7 +38,7 @@ class Control:
     help: str
     unit: str = ""
     index: int | None = None
-    live: bool = False
+    live: bool = True
     none: float | None = None
 
     def read(self, recipe: Recipe) -> float:
@@ -82,16 +82,14 @@ def detail_sliders(entry: str, count: int) -> tuple[Control, ...]:
     """A slider for each layer of the details; ``entry`` is ``alpha`` or ``inside``."""
     names = LAYERS if count == 4 else tuple((f"Layer {i + 1}", "Fine to coarse.") for i in range(count - 1))
     finer = [
-        Control("detail", entry, name, 0, 5, 0.05, text + " 1 leaves it, 0 takes it away.", "\u00d7", i, True)
+        Control("detail", entry, name, 0, 5, 0.05, text + " 1 leaves it, 0 takes it away.", "\u00d7", i)
         for i, (name, text) in enumerate(names)
     ]
     shading = "The smooth rest: brightness and contrast as a whole. 1 leaves it."
-    return (*finer, Control("detail", entry, "Shading", 0.7, 1.3, 0.01, shading, "\u00d7", count - 1, True))
+    return (*finer, Control("detail", entry, "Shading", 0.7, 1.3, 0.01, shading, "\u00d7", count - 1))
 
 
-SPREAD = Control(
-    "detail", "spread", "Reach of the region", 0.1, 5, 0.1, "How far it spreads to what is less alike.", live=True
-)
+SPREAD = Control("detail", "spread", "Reach of the region", 0.1, 5, 0.1, "How far it spreads to what is less alike.")
 REACH = Control("recolor", "reach", "Reach", 0, 0.95, 0.05, "How far a colour spreads to what is less alike.")
 TOLERANCE = Control(
     "recolor",
@@ -101,6 +99,7 @@ TOLERANCE = Control(
     40,
     1,
     "How different colours may be and still count as alike, in units of CIE Lab.",
+    live=False,  # it takes another filter
 )
 STRENGTH = Control("colorize", "strength", "Fill", 0, 1, 0.05, "How much colour goes to what resembles no stroke.")
 RADIUS = Control(

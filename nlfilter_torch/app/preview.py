@@ -5,10 +5,11 @@ differ by more. The preview therefore takes every n-th patch of the photograph i
 by how alike those are. Against the reduced result of the whole photograph, that halves the error of the other way.
 
 Whatever is slow is held here, each with the settings that it came from: the layers that the sliders weigh, the spectrum
-that masks come from, and the picture after each further step.
+that masks come from, the filter of the step that is being worked on, and the picture after each step.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +27,9 @@ from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.recipe import Recipe
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.steps import Detail, Step
+from nlfilter_torch.steps import Detail, FilterStep
+
+Key = tuple[object, ...]  # the settings that something was worked out from
 
 PIXELS = 1_000_000  # of a preview, at most
 MASK_BANDWIDTH = 25 / 255  # of the masks of nlfilter_torch.edits.enhance
@@ -93,7 +96,7 @@ def sampled_operator(
 class Layers:
     """What the detail sliders weigh: layers (1, k+1, 1, h, w) of the luminance, and the filter's eigenvalues (R,)."""
 
-    key: tuple[object, ...]
+    key: Key
     layers: Tensor
     eigenvalues: Tensor
 
@@ -105,7 +108,7 @@ class MaskMaker:
     held, a new region costs one product of the factor with a vector.
     """
 
-    def __init__(self, spectrum: Spectrum, key: tuple[object, ...]) -> None:
+    def __init__(self, spectrum: Spectrum, key: Key) -> None:
         self.key = key
         self._spectrum = spectrum
         self._time: float | None = None
@@ -157,8 +160,9 @@ class Preview:
         self.pixels = reduce(photograph.float(), self.stride)
         self._layers: Layers | None = None
         self._masks: MaskMaker | None = None
-        self._mask: tuple[tuple[object, ...], Tensor] | None = None
-        self._steps: dict[int, tuple[object, Tensor]] = {}
+        self._mask: tuple[Key, Tensor] | None = None
+        self._filter: tuple[Key, Callable[[FilterStep], Tensor]] | None = None
+        self._pictures: dict[str, tuple[Key, Tensor]] = {}
 
     @property
     def size(self) -> tuple[int, int]:
@@ -211,24 +215,37 @@ class Preview:
             recipe: the edit.
             upto: name of the last step that counts; None is all of them.
         """
-        result = self.pixels
-        key: tuple[object, ...] = ()
-        for number, (name, step) in enumerate(zip(recipe.names, recipe.steps, strict=True)):
+        result, drawn = self.pixels, False
+        key: Key = ()
+        for name, step in zip(recipe.names, recipe.steps, strict=True):
             if step.changes():
-                result, key = self._after(number, step, result, key)
+                before, key = key, (*key, step)
+                if isinstance(step, Detail):
+                    result = self._blend(step, result)
+                elif isinstance(step, FilterStep):
+                    held = self._pictures.get(name)
+                    if held is None or held[0] != key:
+                        # The first picture to be drawn anew is that of the step someone works on: its filter is held.
+                        edit = self._filter_of(step, result, before, keep=not drawn)
+                        held = self._pictures[name] = (key, edit(step))
+                        drawn = True
+                    result = held[1]
             if name == upto:
                 break
         return result.clamp(0, 1)
 
-    def _after(
-        self, number: int, step: Step, image: Tensor, key: tuple[object, ...]
-    ) -> tuple[Tensor, tuple[object, ...]]:
-        """The picture after a step, from the picture before it and the key of that."""
-        key = (*key, step)
-        if isinstance(step, Detail):
-            layers, mask = self.layers(step).layers, self.mask(step)
-            return edit_luminance(image, lambda _: step.blend(layers, mask)), key
-        held = self._steps.get(number)
-        if held is None or held[0] != key:
-            held = self._steps[number] = (key, step.apply(image.clamp(0, 1)))
-        return held[1], key
+    def _blend(self, detail: Detail, image: Tensor) -> Tensor:
+        layers, mask = self.layers(detail).layers, self.mask(detail)
+        return edit_luminance(image, lambda _: detail.blend(layers, mask))
+
+    def _filter_of(self, step: FilterStep, image: Tensor, before: Key, *, keep: bool) -> Callable[[FilterStep], Tensor]:
+        """What the filter of a step makes of the picture before it; slow, unless it is held."""
+        key = (*before, type(step), *step.share())
+        if self._filter is not None and self._filter[0] == key:
+            return self._filter[1]
+        if keep:
+            self._filter = None  # two of them would take twice the memory
+        edit = step.hold(image.clamp(0, 1))
+        if keep:
+            self._filter = (key, edit)
+        return edit

@@ -55,4 +55,4 @@ def defocus(
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)
         return edit(photograph.pixels, focus, radius=radius, aperture=aperture.value, **shared)
 
-    editing.edit_file(source, target, depth, work, landmarks=landmarks, factors=3)
+    editing.edit_file(source, target, depth, work, landmarks=landmarks)

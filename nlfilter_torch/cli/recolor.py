@@ -73,4 +73,4 @@ def recolor(
             **shared,
         )
 
-    editing.edit_file(source, target, depth, work, landmarks=landmarks, factors=3, memory=memory, by_rows=by_rows)
+    editing.edit_file(source, target, depth, work, landmarks=landmarks, memory=memory, by_rows=by_rows)

@@ -4,6 +4,8 @@ Edges and tones after Winnemoeller, Olsen and Gooch, "Real-Time Video Abstractio
 """
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -11,10 +13,11 @@ from torch import Tensor
 
 from nlfilter_torch.checks import check_image, check_positive
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
-from nlfilter_torch.filtering import spectral_filter
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.spectrum import Spectrum
 
+PATCH_SIZE, LANDMARKS = 3, 200  # by default
 LOCALITY = 0.15  # default spatial bandwidth as a share of the short side
 # What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel
 # has likes, there where it is like no other, such as on a border, and back everywhere as the power goes to 0.
@@ -36,8 +39,8 @@ def abstract(
     tones: int | None = None,
     photometric_bandwidth: float | Tensor | str = "auto",
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = 3,
-    num_landmarks: int = 200,
+    patch_size: int = PATCH_SIZE,
+    num_landmarks: int = LANDMARKS,
     **options: Any,
 ) -> Tensor:
     """Take the small detail out of a photograph and keep its outlines: ``W^k y`` with a fractional k.
@@ -70,44 +73,113 @@ def abstract(
         >>> bool((abstract(image, power=0.0, num_landmarks=50) - image).abs().max() < 1e-5)
         True
     """
-    check_image(image, "image")
-    _check_power(power)
-    if not 0 <= edges <= 1:
-        raise ValueError(f"edges must be in [0, 1], got {edges}; 0 draws no lines")
-    check_positive(edge_width, "edge_width")
-    if tones is not None and tones < 2:
-        raise ValueError(f"tones must be at least 2, got {tones}; None leaves luminance continuous")
-    if (edges > 0 or tones is not None) and image.shape[1] not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {image.shape[1]}; select some")
-
-    pixels = image.to(working_dtype(image))
-    count = pixels.shape[-2] * pixels.shape[-1]
-    operator = nonlocal_operator(
-        pixels,
-        photometric_bandwidth=photometric_bandwidth,  # type: ignore[arg-type]  # checked there
-        spatial_bandwidth=LOCALITY * min(pixels.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth,
+    held = Abstraction(
+        image,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
-        num_landmarks=min(num_landmarks, count),
-        guide_channels="all",
+        num_landmarks=num_landmarks,
         **options,
     )
-    spectrum = operator.spectrum()
-    exponent = torch.as_tensor(power).to(spectrum.root).reshape(-1, 1)
-    # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
-    mean = pixels.mean((2, 3), keepdim=True)
-    centred = pixels - mean
-    held = spectrum.coefficients(centred)
-    explained = spectral_filter(spectrum, centred, torch.ones_like, coefficients=held)
-    alone = operator.diagonal_share.clamp(LEAST, 1.0)
-    kept = alone ** (TIMES_UNEXPLAINED * exponent.to(alone)[..., None, None])  # (B, 1, H, W)
-    smoothed = spectral_filter(spectrum, centred, lambda eigenvalues: eigenvalues**exponent, coefficients=held)
-    flat = mean + smoothed + kept * (centred - explained)
-    if edges == 0 and tones is None:
-        return flat.to(image.dtype)
-    luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
-    toned = luminance if tones is None else quantize(luminance, tones)
-    toned = toned * (1 - edges * (1 - edge_lines(luminance, edge_width)))
-    return (merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned).to(image.dtype)
+    return held(power=power, edges=edges, edge_width=edge_width, tones=tones)
+
+
+class Abstraction:
+    """An image, held with its filter, so that another power, other lines and other tones need no other filter.
+
+    Args:
+        image: of :func:`abstract`.
+        photometric_bandwidth: likewise, and so are the others.
+        spatial_bandwidth: h_x.
+        patch_size: p.
+        num_landmarks: M.
+        **options: of :func:`nonlocal_operator`.
+
+    Raises:
+        TypeError, ValueError: if ``image`` is not a finite floating-point tensor.
+    """
+
+    def __init__(
+        self,
+        image: Tensor,
+        *,
+        photometric_bandwidth: float | Tensor | str = "auto",
+        spatial_bandwidth: float | Tensor | None = None,
+        patch_size: int = PATCH_SIZE,
+        num_landmarks: int = LANDMARKS,
+        **options: Any,
+    ) -> None:
+        check_image(image, "image")
+        self._image = image
+        size = image.shape[-2:]
+        self._options = {
+            **options,
+            "photometric_bandwidth": photometric_bandwidth,
+            "spatial_bandwidth": LOCALITY * min(size) if spatial_bandwidth is None else spatial_bandwidth,
+            "patch_size": patch_size,
+            "num_landmarks": min(num_landmarks, size.numel()),
+        }
+
+    @cached_property
+    def _parted(self) -> "_Parted":
+        """What the filter makes of the image, worked out when the settings have passed their checks."""
+        pixels = self._image.to(working_dtype(self._image))
+        operator = nonlocal_operator(pixels, guide_channels="all", **self._options)
+        spectrum = operator.spectrum()
+        # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
+        mean = pixels.mean((2, 3), keepdim=True)
+        coefficients = spectrum.coefficients(pixels - mean)
+        unexplained = pixels - mean - spectrum.synthesize(torch.ones_like, coefficients)
+        return _Parted(spectrum, mean, coefficients, unexplained, operator.diagonal_share.clamp(LEAST, 1.0))
+
+    @full_precision
+    def __call__(
+        self, *, power: float | Tensor = 0.1, edges: float = 0.0, edge_width: float = 1.0, tones: int | None = None
+    ) -> Tensor:
+        """The abstract image (B, C, H, W); arguments and errors are those of :func:`abstract`."""
+        image = self._image
+        _check_power(power)
+        if not 0 <= edges <= 1:
+            raise ValueError(f"edges must be in [0, 1], got {edges}; 0 draws no lines")
+        check_positive(edge_width, "edge_width")
+        if tones is not None and tones < 2:
+            raise ValueError(f"tones must be at least 2, got {tones}; None leaves luminance continuous")
+        if (edges > 0 or tones is not None) and image.shape[1] not in (1, 3):
+            raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {image.shape[1]}; select some")
+
+        flat = self._parted.flatten(power)
+        if edges == 0 and tones is None:
+            return flat.to(image.dtype)
+        luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
+        toned = luminance if tones is None else quantize(luminance, tones)
+        toned = toned * (1 - edges * (1 - edge_lines(luminance, edge_width)))
+        return (merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned).to(image.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parted:
+    """An image as its filter parts it.
+
+    Attributes:
+        spectrum: of the filter.
+        mean: of each channel, (B, C, 1, 1).
+        coefficients: of the image without it, (B, C, M).
+        unexplained: what the eigenvectors leave of that, (B, C, H, W).
+        alone: r, the filter's diagonal part, (B, 1, H, W), above 0.
+    """
+
+    spectrum: Spectrum
+    mean: Tensor
+    coefficients: Tensor
+    unexplained: Tensor
+    alone: Tensor
+
+    def flatten(self, power: float | Tensor) -> Tensor:
+        """``W^k y``, (B, C, H, W), for k = ``power``."""
+        exponent = torch.as_tensor(power).to(self.spectrum.root).reshape(-1, 1)
+        kept = self.alone ** (TIMES_UNEXPLAINED * exponent.to(self.alone)[..., None, None])  # (B, 1, H, W)
+        smoothed = self.spectrum.synthesize(lambda eigenvalues: eigenvalues**exponent, self.coefficients)
+        return self.mean + smoothed + kept * self.unexplained
 
 
 def edge_lines(luminance: Tensor, width: float) -> Tensor:

@@ -58,16 +58,15 @@ def region_means(image: Tensor, regions: Tensor) -> Tensor:
 
 def _label(chroma: Tensor, painted: Tensor) -> Tensor:
     """Number (N,) of the colour of every painted pixel of chroma (3, N), -1 for the others."""
-    labels = torch.full_like(painted, -1, dtype=torch.long)
-    open_pixels = painted.clone()
+    paint = chroma[:, painted]  # (3, n)
+    numbers = torch.full_like(paint[0], -1, dtype=torch.long)
     leaders: list[Tensor] = []
-    while bool(open_pixels.any()) and len(leaders) < MAX_COLOURS:
-        leader = chroma[:, open_pixels.nonzero()[0]]  # (3, 1)
-        near = open_pixels & ((chroma - leader).norm(dim=0) < ALIKE)
-        labels[near] = len(leaders)
-        open_pixels &= ~near
+    while len(leaders) < MAX_COLOURS and bool((numbers < 0).any()):
+        leader = paint[:, (numbers < 0).nonzero()[0]]  # (3, 1)
+        numbers[(numbers < 0) & ((paint - leader).norm(dim=0) < ALIKE)] = len(leaders)
         leaders.append(leader)
-    if bool(open_pixels.any()):
-        distance = (chroma[:, open_pixels].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
-        labels[open_pixels] = distance.argmin(1)
-    return labels
+    left = numbers < 0
+    if bool(left.any()):
+        distance = (paint[:, left].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
+        numbers[left] = distance.argmin(1)
+    return torch.full_like(painted, -1, dtype=torch.long).masked_scatter(painted, numbers)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import torch
@@ -14,6 +15,8 @@ from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.strokes import check_painted, check_share, propagate_strokes
+
+Method = Literal["regression", "kmeans"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Stage:
     smoothness: float
 
 
+SIMILAR, PATCH_SIZE, LANDMARKS = 40 / 255, 5, 100  # photometric bandwidth, size of patches and M by default
 # Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
 # than 0.3 dB.
 LOCALITY = 0.5625  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
@@ -47,13 +51,13 @@ def colorize(
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
-    method: Literal["regression", "kmeans"] = "regression",
+    method: Method = "regression",
     strength: float | Tensor = 1.0,
     time: float | Tensor = 1.0,
-    photometric_bandwidth: float | Tensor = 40 / 255,
+    photometric_bandwidth: float | Tensor = SIMILAR,
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = 5,
-    num_landmarks: int = 100,
+    patch_size: int = PATCH_SIZE,
+    num_landmarks: int = LANDMARKS,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Colour a grey image from strokes; its luminance stays as it is.
@@ -95,36 +99,88 @@ def colorize(
     """
     check_image(grey, "grey", channels=1)
     check_choice(method, "method", ("regression", "kmeans"))
-    batch, size = grey.shape[0], (grey.shape[-2], grey.shape[-1])
-    for tensor, name, channels in ((strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)):
-        check_image(tensor, name, channels=channels, batch=batch)
-        check_same_size(tensor, size, name, "grey image")
-    check_painted(stroke_mask)
-    check_share(strength, "strength")
+    once = Colorization(
+        grey,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        generator=generator,
+        hold=False,
+    )
+    return once(strokes, stroke_mask, method=method, strength=strength, time=time)
 
-    luminance = grey.to(working_dtype(grey))
-    bandwidth = LOCALITY * min(size) if spatial_bandwidth is None else spatial_bandwidth
 
-    def spectrum(stage: Stage) -> Spectrum:
-        return nonlocal_operator(
-            luminance,
-            patch_size=int(min(patch_size, stage.patch_size)),
-            photometric_bandwidth=stage.photometric * photometric_bandwidth,
-            spatial_bandwidth=stage.spatial * bandwidth,
-            num_landmarks=min(num_landmarks, luminance[0].numel()),
-            generator=generator,
-        ).spectrum()
+class Colorization:
+    """A grey image, held with the filters that find likes in it, so that more strokes need no other filters.
 
-    painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)
-    wanted = split_luminance(strokes.to(luminance).expand(batch, -1, -1, -1))[1]
-    if method == "kmeans":
-        regions, colours, _ = group_colours(wanted, painted)
-        pieces = segment_mask(spectrum(FAR), regions, time=time)
-        chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
-    else:
-        chroma = torch.zeros_like(wanted)
-        for stage in (FAR, NEAR):
-            part = strength if stage is FAR else 0.0
-            given = {"strength": part, "reach": stage.reach, "smoothness": stage.smoothness}
-            chroma = chroma + propagate_strokes(spectrum(stage), wanted - chroma, painted, **given)
-    return merge_luminance(luminance, chroma).to(grey.dtype)
+    Args:
+        grey: of :func:`colorize`.
+        photometric_bandwidth: likewise, and so are the others.
+        spatial_bandwidth: h_x.
+        patch_size: p.
+        num_landmarks: M.
+        generator: of the landmarks.
+        hold: both filters; without, one at a time takes memory, and each call makes them anew.
+    """
+
+    def __init__(
+        self,
+        grey: Tensor,
+        *,
+        photometric_bandwidth: float | Tensor = SIMILAR,
+        spatial_bandwidth: float | Tensor | None = None,
+        patch_size: int = PATCH_SIZE,
+        num_landmarks: int = LANDMARKS,
+        generator: torch.Generator | None = None,
+        hold: bool = True,
+    ) -> None:
+        self._grey = grey
+        bandwidth = LOCALITY * min(grey.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth
+
+        def spectrum(stage: Stage) -> Spectrum:
+            luminance = grey.to(working_dtype(grey))
+            return nonlocal_operator(
+                luminance,
+                patch_size=int(min(patch_size, stage.patch_size)),
+                photometric_bandwidth=stage.photometric * photometric_bandwidth,
+                spatial_bandwidth=stage.spatial * bandwidth,
+                num_landmarks=min(num_landmarks, luminance[0].numel()),
+                generator=generator,
+            ).spectrum()
+
+        self._spectrum = cache(spectrum) if hold else spectrum
+
+    @full_precision
+    def __call__(
+        self,
+        strokes: Tensor,
+        stroke_mask: Tensor,
+        *,
+        method: Method = "regression",
+        strength: float | Tensor = 1.0,
+        time: float | Tensor = 1.0,
+    ) -> Tensor:
+        """The image in colour, (B, 3, H, W); arguments and errors are those of :func:`colorize`."""
+        grey = self._grey
+        batch, size = grey.shape[0], (grey.shape[-2], grey.shape[-1])
+        for tensor, name, channels in ((strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)):
+            check_image(tensor, name, channels=channels, batch=batch)
+            check_same_size(tensor, size, name, "grey image")
+        check_painted(stroke_mask)
+        check_share(strength, "strength")
+
+        luminance = grey.to(working_dtype(grey))
+        painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)
+        wanted = split_luminance(strokes.to(luminance).expand(batch, -1, -1, -1))[1]
+        if method == "kmeans":
+            regions, colours, _ = group_colours(wanted, painted)
+            pieces = segment_mask(self._spectrum(FAR), regions, time=time)
+            chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
+        else:
+            chroma = torch.zeros_like(wanted)
+            for stage in (FAR, NEAR):
+                part = strength if stage is FAR else 0.0
+                given = {"strength": part, "reach": stage.reach, "smoothness": stage.smoothness}
+                chroma = chroma + propagate_strokes(self._spectrum(stage), wanted - chroma, painted, **given)
+        return merge_luminance(luminance, chroma).to(grey.dtype)

@@ -1,6 +1,7 @@
 """A photograph as if taken with a wide aperture: sharp where one chooses, blurred elsewhere. Paper: Sec. V-C."""
 
 import math
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -8,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_image, check_positive, check_same_size
-from nlfilter_torch.edits.spots import Spots, find_spots
+from nlfilter_torch.edits.spots import Pixels, Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
@@ -16,10 +17,12 @@ from nlfilter_torch.strokes import check_painted
 
 Aperture = Literal["disc", "gaussian"]
 
+SIMILAR, PATCH_SIZE = 25 / 255, 3  # photometric bandwidth and size of patches by default
 RADIUS = 0.025  # default radius of the blur as a share of the short side
 LOCALITY = 0.2  # default spatial bandwidth, likewise
 REACH = 0.7  # of the correlations with the spots of the focus region
 CLOSING, SMOOTHING = 0.015, 0.04  # sizes, as shares of the short side, of the gaps in a focus map that are filled
+GUIDED = 12  # radius of the smoothing, in pixels, from twice of which on it takes every other one and fewer
 BLURRED, SHARP = 0.15, 0.45  # likeness below BLURRED gets the whole blur, above SHARP none
 STEPS = (0.1, 0.25, 0.5, 1.0)  # blurs that others are mixed from, as shares of the radius
 
@@ -31,9 +34,9 @@ def defocus(
     *,
     radius: float | None = None,
     aperture: Aperture = "disc",
-    photometric_bandwidth: float | Tensor = 25 / 255,
+    photometric_bandwidth: float | Tensor = SIMILAR,
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = 3,
+    patch_size: int = PATCH_SIZE,
     **options: Any,
 ) -> Tensor:
     """Blur what is unlike, or far from, a region that stays in focus.
@@ -74,25 +77,68 @@ def defocus(
     check_image(image, "image")
     if image.shape[1] not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
-    check_image(focus_region, "focus_region", channels=1, batch=image.shape[0])
-    check_same_size(focus_region, (image.shape[-2], image.shape[-1]), "focus_region", "image")
-    check_painted(focus_region, "focus_region")
     check_choice(aperture, "aperture", ("disc", "gaussian"))
-    short = min(image.shape[-2:])
-    reach = RADIUS * short if radius is None else radius
+    reach = RADIUS * min(image.shape[-2:]) if radius is None else radius
     check_positive(reach, "radius")
-
-    pixels = image.to(working_dtype(image))
-    spectrum = nonlocal_operator(
-        pixels,
+    held = Defocusing(
+        image,
         photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=LOCALITY * short if spatial_bandwidth is None else spatial_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
-        guide_channels="all",
         **options,
-    ).spectrum()
-    focus = focus_map(spectrum, pixels, focus_region.to(pixels))
-    return blur_by(pixels, 1 - focus, float(reach), aperture).to(image.dtype)
+    )
+    return held.blur(held.focus(focus_region), float(reach), aperture)
+
+
+class Defocusing:
+    """An image, held with the filter that finds likes in it, so that another region or blur needs no other filter.
+
+    Args:
+        image: of :func:`defocus`.
+        photometric_bandwidth: likewise, and so are the others.
+        spatial_bandwidth: h_x.
+        patch_size: p.
+        **options: of :func:`nonlocal_operator`.
+    """
+
+    def __init__(
+        self,
+        image: Tensor,
+        *,
+        photometric_bandwidth: float | Tensor = SIMILAR,
+        spatial_bandwidth: float | Tensor | None = None,
+        patch_size: int = PATCH_SIZE,
+        **options: Any,
+    ) -> None:
+        self._image = image
+        self._options = {
+            **options,
+            "photometric_bandwidth": photometric_bandwidth,
+            "spatial_bandwidth": LOCALITY * min(image.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth,
+            "patch_size": patch_size,
+        }
+
+    @cached_property
+    def _spectrum(self) -> Spectrum:
+        """Of the filter, which is made when a region has passed its checks."""
+        guide = self._image.to(working_dtype(self._image))
+        return nonlocal_operator(guide, guide_channels="all", **self._options).spectrum()
+
+    @full_precision
+    def focus(self, focus_region: Tensor) -> Tensor:
+        """How much every pixel is in focus, (B, 1, H, W) in [0, 1]; errors are those of :func:`defocus`."""
+        image = self._image
+        check_image(focus_region, "focus_region", channels=1, batch=image.shape[0])
+        check_same_size(focus_region, (image.shape[-2], image.shape[-1]), "focus_region", "image")
+        check_painted(focus_region, "focus_region")
+        pixels = image.to(working_dtype(image))
+        return focus_map(self._spectrum, pixels, focus_region.to(pixels))
+
+    @full_precision
+    def blur(self, focus: Tensor, radius: float, aperture: Aperture = "disc") -> Tensor:
+        """The image (B, C, H, W), blurred by ``radius`` where it is not in ``focus``."""
+        pixels = self._image.to(working_dtype(self._image))
+        return blur_by(pixels, 1 - focus, radius, aperture).to(self._image.dtype)
 
 
 def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor:
@@ -103,25 +149,31 @@ def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor
     from kornia.filters import guided_blur  # kornia takes half a second to import: only who needs it waits
 
     painted = focus_region.to(spectrum.factor).expand(image.shape[0], -1, -1, -1)
-    best = [_best(spots) for spots in find_spots(spectrum, painted, REACH)]  # B times (N,)
+    best = [_best(*found) for found in find_spots(spectrum, painted, REACH)]  # B times (N,)
     likeness = torch.stack(best).unflatten(1, spectrum.size).unsqueeze(1).to(focus_region)
     share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
     focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
     short = min(image.shape[-2:])
-    gap = 2 * math.ceil(CLOSING * short) + 1
-    grown = F.max_pool2d(focus, gap, stride=1, padding=gap // 2)
+    reach = math.ceil(CLOSING * short)
     # One pixel less back than forth: a patch across a border is like neither side, and would cost the subject its rim.
-    closed = -F.max_pool2d(-grown, gap - 2, stride=1, padding=gap // 2 - 1)
-    window = 2 * math.ceil(SMOOTHING * short) + 1
-    if window // 2 < short:  # reflection needs as many pixels
-        closed = guided_blur(image, closed, window, eps=1e-4, separable=True)
+    closed = -largest_within(-largest_within(focus, reach), reach - 1)
+    reach = math.ceil(SMOOTHING * short)
+    if reach < short:  # reflection needs as many pixels
+        every = max(1, reach // GUIDED)
+        window = 2 * (reach // every) * every + 1
+        closed = guided_blur(image, closed, window, eps=1e-4, subsample=every, separable=True)
     return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
 
 
-def _best(spots: Spots) -> Tensor:
+def largest_within(planes: Tensor, reach: int) -> Tensor:
+    """The largest value (B, 1, H, W) within ``reach`` pixels along both axes."""
+    rows = F.max_pool2d(planes, (1, 2 * reach + 1), stride=1, padding=(0, reach))
+    return F.max_pool2d(rows, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
+
+
+def _best(spots: Spots, pixels: Pixels) -> Tensor:
     """Largest correlation (N,) of every pixel with a spot, few spots at a time."""
-    few = torch.eye(len(spots.between)).to(spots.between).split(8)
-    return torch.stack([spots.mix(weights).amax(0) for weights in few]).amax(0)
+    return torch.stack([pixels.along(few).amax(0) for few in spots.means.split(8)]).amax(0)
 
 
 def blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:

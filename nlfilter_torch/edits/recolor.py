@@ -1,6 +1,7 @@
 """Strokes of colour that reach everything of the same colour. Paper: Sec. V-A, Figs. 14, 15."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_m
 from nlfilter_torch.edits.spots import Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.strokes import check_painted, check_share
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
@@ -19,6 +21,7 @@ FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FU
 DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: two colours on one thing are no error
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
+PATCH_SIZE = 3
 
 CONVERTED = 8192  # pixels that one thread converts at once
 VECTOR = 64  # a multiple of the floats that a processor works on at once
@@ -33,7 +36,7 @@ def recolor(
     keep: Tensor | None = None,
     reach: float | Tensor = 0.8,
     photometric_bandwidth: float | Tensor = 0.12,
-    patch_size: int = 3,
+    patch_size: int = PATCH_SIZE,
     **options: Any,
 ) -> Tensor:
     """Give the colour of strokes to everything that looks like the spots they are painted on.
@@ -73,32 +76,54 @@ def recolor(
         (True, True)
     """
     check_image(image, "image", channels=3)
-    batch, size = image.shape[0], (image.shape[-2], image.shape[-1])
-    named = [(strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)]
-    for tensor, name, channels in [*named, *([(keep, "keep", 1)] if keep is not None else [])]:
-        check_image(tensor, name, channels=channels, batch=batch)
-        check_same_size(tensor, size, name, "image")
-    check_painted(stroke_mask)
-    check_share(reach, "reach", below=True)
+    held = Recoloring(image, photometric_bandwidth=photometric_bandwidth, patch_size=patch_size, **options)
+    return held(strokes, stroke_mask, keep=keep, reach=reach)
 
-    pixels = image.to(working_dtype(image))
-    spectrum = nonlocal_operator(
-        colour_guide(pixels),
-        photometric_bandwidth=photometric_bandwidth,
-        patch_size=patch_size,
-        guide_channels="all",
-        **options,
-    ).spectrum()
-    painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
-    wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
-    regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
-    own = regions * counts[..., None, None]
-    held = None if keep is None else keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
-    marked = own if held is None else torch.cat([own, held], dim=1)
-    found = [spots.mix(divide(spots)) for spots in find_spots(spectrum, marked, reach)]
-    likeness = torch.stack(found).unflatten(2, spectrum.size)
-    old = region_means(split_luminance(pixels)[1], regions)
-    return Dye(colours, old)(pixels, likeness, marked).to(image.dtype)
+
+class Recoloring:
+    """An image, held with the filter that finds likes in it, so that more strokes need no other filter.
+
+    Args:
+        image: of :func:`recolor`.
+        patch_size: likewise.
+        **options: of :func:`nonlocal_operator`.
+    """
+
+    def __init__(self, image: Tensor, *, patch_size: int = PATCH_SIZE, **options: Any) -> None:
+        self._image = image
+        self._options = {**options, "patch_size": patch_size}
+
+    @cached_property
+    def _spectrum(self) -> Spectrum:
+        """Of the filter, which is made when strokes have passed their checks."""
+        guide = colour_guide(self._image.to(working_dtype(self._image)))
+        return nonlocal_operator(guide, guide_channels="all", **self._options).spectrum()
+
+    @full_precision
+    def __call__(
+        self, strokes: Tensor, stroke_mask: Tensor, *, keep: Tensor | None = None, reach: float | Tensor = 0.8
+    ) -> Tensor:
+        """The image (B, 3, H, W) under strokes; arguments and errors are those of :func:`recolor`."""
+        image = self._image
+        batch, size = image.shape[0], (image.shape[-2], image.shape[-1])
+        named = [(strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)]
+        for tensor, name, channels in [*named, *([(keep, "keep", 1)] if keep is not None else [])]:
+            check_image(tensor, name, channels=channels, batch=batch)
+            check_same_size(tensor, size, name, "image")
+        check_painted(stroke_mask)
+        check_share(reach, "reach", below=True)
+
+        pixels = image.to(working_dtype(image))
+        painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
+        wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
+        regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
+        own = regions * counts[..., None, None]
+        held = None if keep is None else keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
+        marked = own if held is None else torch.cat([own, held], dim=1)
+        found = [pixels.along(divide(spots)) for spots, pixels in find_spots(self._spectrum, marked, reach)]
+        likeness = torch.stack(found).unflatten(2, size)
+        old = region_means(split_luminance(pixels)[1], regions)
+        return Dye(colours, old)(pixels, likeness, marked).to(image.dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +166,14 @@ class Dye:
 
 
 def divide(spots: Spots) -> Tensor:
-    """Weights (K, J) of a pixel's correlations that say how much it resembles one region rather than the others.
+    """The vectors (K, M) whose products with a pixel's say how much it resembles one region rather than the others.
 
     The spots share a pixel, about 0 to 1, by the best linear estimate of its region from its correlations with them, so
     that a region painted on what resembles another one takes from it what is its own.
     """
     doubtful = spots.between.double() + DOUBT * torch.eye(len(spots.between)).to(spots.between)
     solved = torch.cholesky_solve(spots.owners.double(), torch.linalg.cholesky_ex(doubtful).L)
-    return solved.mT.to(spots.between)
+    return solved.mT.to(spots.means) @ spots.means
 
 
 def colour_guide(image: Tensor) -> Tensor:

@@ -11,42 +11,66 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.blocks import CACHED, block_length
 from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.strokes import walk_basis
+from nlfilter_torch.thin import spread
 
 MAX_SPOTS = 64  # of one region; further ones are taken together
 TINY = 1e-6  # variance below which a pixel correlates with nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Spots:
-    """The J spots of one image, and what it takes to compare pixels with them.
+class Pixels:
+    """All pixels of an image as :func:`unit_vectors`, which take as much memory as the factor and are not kept.
 
     Attributes:
-        between: correlations of the spots with each other, (J, J), within [-1, 1].
-        owners: the region that each spot belongs to, (J, K) of zeros and ones.
-        means: of the spots' pixels as unit vectors, of unit length themselves, (J, M).
-        pixels: that are compared, as unit vectors (M, N), whose products are their correlations.
+        basis: of :func:`walk_basis`, (M, M).
+        factor: (M, N).
+        scale: one over the lengths of ``basis @ factor``, (N,).
     """
 
-    between: Tensor
-    owners: Tensor
-    means: Tensor
-    pixels: Tensor
+    basis: Tensor
+    factor: Tensor
+    scale: Tensor
 
     @staticmethod
-    def of_means(means: Tensor, owners: Tensor, pixels: Tensor) -> "Spots":
-        """From the mean unit vectors (J, M) of the spots' pixels."""
-        means = means * means.square().sum(1, keepdim=True).clamp(min=TINY).rsqrt()
-        return Spots(means @ means.mT, owners, means, pixels)
+    def of(basis: Tensor, factor: Tensor) -> "Pixels":
+        """From the columns (M, N) of the factor, block by block."""
+        blocks = factor.split(block_length(1, factor.device, CACHED), dim=1)
+        squares = torch.cat([(basis @ block).square().sum(0) for block in blocks])
+        return Pixels(basis, factor, squares.clamp(min=TINY).rsqrt())
 
-    def mix(self, weights: Tensor) -> Tensor:
-        """Weighted sums (L, N), with weights (L, J), of the correlations of every pixel with the spots."""
-        return (weights @ self.means) @ self.pixels
+    def along(self, directions: Tensor) -> Tensor:
+        """Products (L, N) of all unit vectors with others, (L, M)."""
+        return spread((directions @ self.basis)[None], self.factor[None])[0] * self.scale
 
 
-def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Iterator[Spots]:
-    """The spots of every image.
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """The J spots of one image.
+
+    Attributes:
+        means: of their pixels' unit vectors, of unit length themselves, (J, M).
+        owners: the region that each spot belongs to, (J, K) of zeros and ones.
+    """
+
+    means: Tensor
+    owners: Tensor
+
+    @staticmethod
+    def of_means(means: Tensor, owners: Tensor) -> "Spots":
+        """From means (J, M) of any length."""
+        return Spots(means * means.square().sum(1, keepdim=True).clamp(min=TINY).rsqrt(), owners)
+
+    @property
+    def between(self) -> Tensor:
+        """Correlations of the spots with each other, (J, J), within [-1, 1]."""
+        return self.means @ self.means.mT
+
+
+def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> Iterator[tuple[Spots, Pixels]]:
+    """The spots of every image, and its pixels.
 
     Args:
         spectrum: of the operator.
@@ -54,15 +78,16 @@ def find_spots(spectrum: Spectrum, regions: Tensor, reach: float | Tensor) -> It
         reach: s in [0, 1), a number or a tensor of shape () or (B,).
 
     Yields:
-        The spots of an image after the other. Differentiable in operator, weights and reach.
+        Those of an image after the other. Differentiable in operator, weights and reach.
     """
     basis = walk_basis(spectrum, reach).to(spectrum.factor)
     for b, region in enumerate(regions.flatten(2)):
         numbers, places = (region.detach() > 0).nonzero().unbind(1)
         spots, owners = label_spots(places, numbers, spectrum.size)
-        pixels = unit_vectors(basis[b], spectrum.factor[b])
-        sums, weight = spot_sums(pixels[:, places], region[numbers, places], spots, len(owners))
-        yield Spots.of_means((sums / weight).to(pixels), F.one_hot(owners, len(region)).to(region), pixels)
+        few = unit_vectors(basis[b], spectrum.factor[b, :, places])
+        sums, weight = spot_sums(few, region[numbers, places], spots, len(owners))
+        found = Spots.of_means((sums / weight).to(basis), F.one_hot(owners, len(region)).to(region))
+        yield found, Pixels.of(basis[b], spectrum.factor[b])
 
 
 def unit_vectors(basis: Tensor, factor: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.edits.chroma import group_colours, split_luminance
 from nlfilter_torch.edits.recolor import Dye, divide
-from nlfilter_torch.edits.spots import Spots, label_spots, spot_sums, unit_vectors
+from nlfilter_torch.edits.spots import Pixels, Spots, label_spots, spot_sums, unit_vectors
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
@@ -71,7 +71,7 @@ class FittedDye:
         kernel: of the operator.
         marked: what is painted.
         basis: of the unit vectors that pixels are compared by, (M, M).
-        division: (K', M), from a unit vector to its likeness to each region.
+        division: (K', M), of :func:`divide`.
         dye: what becomes of the colours.
     """
 
@@ -90,7 +90,7 @@ class FittedDye:
 
     def likeness(self, features: Tensor) -> Tensor:
         """How much pixels with features (1, D, n) resemble each region, (1, K', n)."""
-        return (self.division @ unit_vectors(self.basis, self.kernel.factor(features)[0][0]))[None]
+        return Pixels.of(self.basis, self.kernel.factor(features)[0][0]).along(self.division)[None]
 
 
 @torch.no_grad()
@@ -106,7 +106,7 @@ def fit_dye(
     spots = _find_spots(found, marked, kernel, basis, picture.size)
     sums, weights = spot_sums(found.image[0], marked.weights, marked.regions, marked.count)  # of the chroma, (K', 3)
     old = (sums / weights)[: len(marked.colours)].to(basis)
-    return FittedDye(guide, kernel, marked, basis, divide(spots) @ spots.means, Dye(marked.colours[None], old[None]))
+    return FittedDye(guide, kernel, marked, basis, divide(spots), Dye(marked.colours[None], old[None]))
 
 
 def _find_spots(found: Sample, marked: Marked, kernel: Kernel, basis: Tensor, size: tuple[int, int]) -> Spots:
@@ -119,4 +119,4 @@ def _find_spots(found: Sample, marked: Marked, kernel: Kernel, basis: Tensor, si
         part = numbers[done : done + block.weights.shape[1]]
         more = spot_sums(unit_vectors(basis, block.factor[0]), block.weights[0], part, len(owners))
         sums, weights, done = sums + more[0], weights + more[1], done + len(part)
-    return Spots.of_means((sums / weights).to(basis), F.one_hot(owners, marked.count).to(basis), basis[:, :0])
+    return Spots.of_means((sums / weights).to(basis), F.one_hot(owners, marked.count).to(basis))
