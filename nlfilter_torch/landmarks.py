@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.sharding import Shard, from_first, gather_columns, reduce_sum
+from nlfilter_torch.sharding import Shard, from_first, gather_columns
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
@@ -73,7 +73,7 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shar
     few = points[:, :, : STARTED_FROM * count]  # candidates come in random order
     start = from_first(_pivots(few, count, generator), shard).unsqueeze(1)  # (B, 1, M)
     assignment = from_first(_lloyd(points, points.gather(2, start.expand(-1, points.shape[1], -1))), shard)
-    return cluster_means(subset, assignment, subset.gather(2, start.expand(-1, subset.shape[1], -1)))
+    return _cluster_means(subset, assignment, subset.gather(2, start.expand(-1, subset.shape[1], -1)))
 
 
 def _grid(size: tuple[int, int], count: int) -> Tensor:
@@ -149,17 +149,10 @@ def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
     return extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)  # (B, S, M)
 
 
-def assign(points: Tensor, centres: Tensor) -> Tensor:
-    """Index (B, S) of the centre (B, D, K) nearest to each of the points (B, D, S)."""
-    score = torch.baddbmm(-0.5 * centres.square().sum(1).unsqueeze(1), points.mT, centres)  # (B, S, K)
-    return score.max(dim=2).indices
-
-
-def cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor, shard: Shard | None = None) -> Tensor:
-    """Mean (B, D, K) of the points (B, D, S) of every cluster; an empty one takes its column of ``fallback``."""
+def _cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
+    """Mean (B, D, M) of the points (B, D, S) of every cluster; an empty one takes its column of ``fallback``."""
     members = points.new_zeros(points.shape[0], fallback.shape[2], points.shape[2])
     members.scatter_(1, assignment.unsqueeze(1), 1.0)
-    sizes = reduce_sum(members.sum(2).unsqueeze(1), shard)  # (B, 1, K)
-    sums = reduce_sum(points @ members.mT, shard)  # a product, not an index_add: deterministic on every device
-    means = sums / sizes.clamp(min=1.0)
+    sizes = members.sum(2).unsqueeze(1)  # (B, 1, M)
+    means = points @ members.mT / sizes.clamp(min=1.0)  # not an index_add: deterministic on every device
     return torch.where(sizes > 0, means, fallback)

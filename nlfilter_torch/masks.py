@@ -8,12 +8,11 @@ from torch import Tensor
 from nlfilter_torch.blocks import CACHED, block_length
 from nlfilter_torch.checks import check_finite, check_image, check_positive, check_same_size, check_unit_range
 from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.landmarks import assign, cluster_means
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.thin import moment
+from nlfilter_torch.thin import moment, spread
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
 ITERATIONS = 20  # of k-means, which starts close to its end
@@ -120,7 +119,7 @@ def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> T
         weights: of the regions, (B, K, N), each of unit sum.
     """
     factor, scaling = spectrum.factor, spectrum.scaling.unsqueeze(1)
-    centres = (basis @ moment(factor, scaling * weights, spectrum.shard)).mT.to(factor)  # (B, K, M)
+    centres = _sums(spectrum, basis, weights).mT.to(factor)  # (B, K, M)
     core, step = basis.to(factor), block_length(len(factor), factor.device, CACHED)
     blocks = zip(factor.split(step, dim=2), scaling.split(step, dim=2), strict=True)
     # All coordinates would take as much memory as the factor.
@@ -170,18 +169,31 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions")  # (B, K, N)
-        coordinates = spectrum.diffusion_basis(lambda eigenvalues: eigenvalues.pow(exponent))  # (B, M, N)
-        centres = reduce_sum(weights @ coordinates.mT, spectrum.shard).mT  # (B, M, K)
-        assignment = assign(coordinates, centres)
+        basis = spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent))  # to coordinates, (B, M, M)
+        centres = _sums(spectrum, basis, weights)
+        assignment = _nearest(spectrum, basis, centres)
         for _ in range(ITERATIONS):
-            centres = cluster_means(coordinates, assignment, centres, spectrum.shard)
-            previous, assignment = assignment, assign(coordinates, centres)
-            if coordinates.device.type != "cpu":  # a look would be a wait
+            members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
+            sizes = reduce_sum(members.sum(2, dtype=torch.float64), spectrum.shard).unsqueeze(1)  # (B, 1, K)
+            centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
+            previous, assignment = assignment, _nearest(spectrum, basis, centres)
+            if members.device.type != "cpu":  # a look would be a wait
                 continue
-            if not reduce_max((previous != assignment).any().to(coordinates), spectrum.shard):
+            if not reduce_max((previous != assignment).any().to(members), spectrum.shard):
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
     return mask.unflatten(2, spectrum.size).to(regions.dtype)
+
+
+def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
+    """Weighted sums (B, M, K) of the coordinates ``basis @ F`` of all pixels, with weights (B, K, N); float64."""
+    return basis @ moment(spectrum.factor, spectrum.scaling.unsqueeze(1) * weights, spectrum.shard)
+
+
+def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:
+    """Number (B, N) of the centre (B, M, K) nearest to every pixel in the coordinates ``basis @ F``."""
+    inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor) * spectrum.scaling.unsqueeze(1)
+    return (inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)).max(1).indices  # ten times as quick as argmax
 
 
 def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:

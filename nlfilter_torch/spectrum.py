@@ -119,11 +119,6 @@ class Spectrum(RitzPairs):
         basis = (self.root @ vectors).mT.to(self.factor) @ self.factor  # (B, R, N)
         return (basis * self.scaling.unsqueeze(1)).unflatten(2, self.size)
 
-    def diffusion_basis(self, response: Response) -> Tensor:
-        """Rows (B, M, N) of ``f(T) G^(-1/2) F``: ``f(S) V^T`` up to a rotation that leaves distances alone."""
-        core = self.basis(response).to(self.factor)
-        return (core @ self.factor) * self.scaling.unsqueeze(1)
-
     @full_precision
     def coefficients(self, image: Tensor) -> Tensor:
         """``F y``, all that a response needs to know of an image: one read of the factor.

@@ -158,8 +158,8 @@ def test_gradient_of_repeated_eigenvalues_is_finite() -> None:
 
 
 @given(st.integers(0, 99))
-def test_diffusion_basis_keeps_distances(seed: int) -> None:
+def test_basis_keeps_distances(seed: int) -> None:
     spectrum = build(noise(1, 1, 8, 9, seed=seed), photometric_bandwidth=0.4, num_landmarks=12).spectrum()
-    rows = spectrum.diffusion_basis(lambda s: s**1.5)
+    rows = spectrum.basis(lambda s: s**1.5) @ (spectrum.factor * spectrum.scaling.unsqueeze(1))
     expected = spectrum.eigenvalues.pow(1.5).unsqueeze(2) * spectrum.eigenvectors.flatten(2)
     torch.testing.assert_close(rows.mT @ rows, expected.mT @ expected, atol=1e-8, rtol=0)
