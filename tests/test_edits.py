@@ -108,6 +108,12 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
         ),
         (defocus, RGB, {"focus_region": 0 * SPOT}, "focus_region must hold a painted pixel"),
         (defocus, RGB, {"focus_region": SPOT, "radius": 0.0}, "radius must be positive"),
+        (
+            defocus,
+            RGB,
+            {"focus_region": SPOT, "radius": 1e4},
+            "radius must be at most half the short side",
+        ),
         (defocus, RGB, {"focus_region": SPOT, "aperture": "square"}, "aperture must be one of 'disc', 'gaussian'"),
         (defocus, RGB[:, :2], {"focus_region": SPOT}, "image must have 1 or 3 channels, got 2"),
         (defocus, RGB, {"focus_region": SPOT[..., :9]}, "focus_region must have the height and width of the image"),

@@ -48,7 +48,7 @@ def defocus(
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp; several spots may differ
             in colour, and each stands for what most of it covers.
-        radius: of the strongest blur, in pixels; None is 2.5 % of the short side.
+        radius: of the strongest blur, in pixels, at most half the short side; None is 2.5 % of it.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
             variance.
         photometric_bandwidth: h_y of eq. (18), in units of the image.
@@ -78,8 +78,14 @@ def defocus(
     if image.shape[1] not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
     check_choice(aperture, "aperture", ("disc", "gaussian"))
-    reach = RADIUS * min(image.shape[-2:]) if radius is None else radius
+    short = min(image.shape[-2:])
+    reach = RADIUS * short if radius is None else radius
     check_positive(reach, "radius")
+    if reach > short / 2:
+        raise ValueError(
+            f"radius must be at most half the short side of the image, {short / 2:g} pixels, got {reach:g}; more would "
+            "blur all to one colour"
+        )
     held = Defocusing(
         image,
         photometric_bandwidth=photometric_bandwidth,
