@@ -100,6 +100,15 @@ def check_positive(value: float | Tensor, name: str) -> None:
         raise ValueError(f"{name} must be positive and finite, got {value}; pass a positive number")
 
 
+def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
+    """Raise unless a blur by ``value`` pixels, at least 0, stays within an image of ``size``: time and memory grow."""
+    most = max(min(size) / 2, 2.0)  # a default for large images is none too large for tiny ones
+    if not value <= most:
+        raise ValueError(
+            f"{name} must be at most half the short side of the image, {most:g} pixels, got {value:g}; lower it"
+        )
+
+
 def check_bandwidth(value: float | Tensor, name: str, batch: int) -> None:
     """Raise unless ``value`` is one positive bandwidth, or one for every image of the batch."""
     check_positive(value, name)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_positive
+from nlfilter_torch.checks import check_image, check_positive, check_reach
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -52,7 +52,7 @@ def abstract(
         image: (B, C, H, W) in [0, 1]; lines and tones want C = 1 or 3.
         power: k >= 0, a number or a tensor of shape () or (B,). At 0 the image comes back.
         edges: darkness of the lines, 0 for none, 1 for black ones.
-        edge_width: of the lines, in pixels.
+        edge_width: of the lines, in pixels, at most half the short side.
         tones: number of tones of luminance, at least 2; None leaves it continuous.
         photometric_bandwidth: h_y; larger makes larger flat areas.
         spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
@@ -142,6 +142,7 @@ class Abstraction:
         if not 0 <= edges <= 1:
             raise ValueError(f"edges must be in [0, 1], got {edges}; 0 draws no lines")
         check_positive(edge_width, "edge_width")
+        check_reach(edge_width, "edge_width", (image.shape[-2], image.shape[-1]))
         if tones is not None and tones < 2:
             raise ValueError(f"tones must be at least 2, got {tones}; None leaves luminance continuous")
         if (edges > 0 or tones is not None) and image.shape[1] not in (1, 3):

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_image, check_positive, check_same_size
+from nlfilter_torch.checks import check_choice, check_image, check_positive, check_reach, check_same_size
 from nlfilter_torch.edits.spots import Pixels, Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -78,14 +78,9 @@ def defocus(
     if image.shape[1] not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
     check_choice(aperture, "aperture", ("disc", "gaussian"))
-    short = min(image.shape[-2:])
-    reach = RADIUS * short if radius is None else radius
+    reach = RADIUS * min(image.shape[-2:]) if radius is None else radius
     check_positive(reach, "radius")
-    if reach > short / 2:
-        raise ValueError(
-            f"radius must be at most half the short side of the image, {short / 2:g} pixels, got {reach:g}; more would "
-            "blur all to one colour"
-        )
+    check_reach(reach, "radius", (image.shape[-2], image.shape[-1]))
     held = Defocusing(
         image,
         photometric_bandwidth=photometric_bandwidth,

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image
+from nlfilter_torch.checks import check_image, check_reach
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.edits.denoise import soften
 from nlfilter_torch.features import reduce_channels
@@ -35,7 +35,7 @@ def sharpen(
         image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
         amount: sliders alpha_2 and alpha_3, a number or a tensor of shape () or (B,); 1 changes nothing, 4 is visible,
             8 is strong.
-        guide_blur: standard deviation in pixels of the blur of the guide, 0 for none.
+        guide_blur: standard deviation in pixels of the blur of the guide, at most half the short side, 0 for none.
         photometric_bandwidth: h_y of the blurred guide.
         **options: further ones of :func:`nonlocal_operator`.
 
@@ -54,6 +54,7 @@ def sharpen(
     check_image(image, "image")
     if not guide_blur >= 0:
         raise ValueError(f"guide_blur must be at least 0, got {guide_blur}; 0 leaves the guide as it is")
+    check_reach(guide_blur, "guide_blur", (image.shape[-2], image.shape[-1]))
     pixels = image.to(working_dtype(image))
     guide = reduce_channels(pixels, "luminance")
     operator = nonlocal_operator(
