@@ -14,10 +14,15 @@ from torch import Tensor
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
+def check_tensor(value: object, name: str, remedy: str = "convert it with torch.tensor") -> None:
+    """Raise unless ``value`` is a tensor."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; {remedy}")
+
+
 def check_image(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
     """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with at least one pixel."""
-    if not isinstance(image, Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(image).__name__}; convert it with torch.as_tensor")
+    check_tensor(image, name, "convert it with torch.as_tensor")
     if image.dtype not in FLOATING:
         raise TypeError(
             f"{name} must be of a floating-point dtype with values in [0, 1], got {image.dtype}; "
@@ -128,16 +133,14 @@ def check_count(value: int, name: str) -> None:
 
 def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) -> None:
     """Raise unless ``tensor`` is one of that shape."""
-    if not isinstance(tensor, Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(tensor).__name__}; {remedy}")
+    check_tensor(tensor, name, remedy)
     if tensor.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}; {remedy}")
 
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
     """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, where allowed, (B, k+1, H, W)."""
-    if not isinstance(alpha, Tensor):
-        raise TypeError(f"alpha must be a torch.Tensor, got {type(alpha).__name__}; convert it with torch.tensor")
+    check_tensor(alpha, "alpha")
     if alpha.dtype not in FLOATING:
         raise TypeError(f"alpha must be of a floating-point dtype, got {alpha.dtype}; write 1.0 instead of 1")
     if alpha.ndim not in dimensions:

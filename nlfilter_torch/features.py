@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.blocks import large_empty
-from nlfilter_torch.checks import check_finite, check_patch_size
+from nlfilter_torch.checks import check_finite, check_patch_size, check_tensor
 from nlfilter_torch.differentiation import Gradients, once_differentiable
 
 GuideChannels = Literal["luminance", "all"]
@@ -31,6 +31,7 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
     if patch_weights is None:
         check_patch_size(patch_size)
         return patch_window(patch_size)
+    check_tensor(patch_weights, "patch_weights")
     if patch_weights.ndim != 2 or patch_weights.shape[0] != patch_weights.shape[1] or patch_weights.shape[0] % 2 == 0:
         raise ValueError(
             f"patch_weights must have shape (p, p) with odd p, got {tuple(patch_weights.shape)}; crop or pad them"

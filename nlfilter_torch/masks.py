@@ -6,7 +6,14 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import CACHED, block_length
-from nlfilter_torch.checks import check_finite, check_image, check_positive, check_same_size, check_unit_range
+from nlfilter_torch.checks import (
+    check_finite,
+    check_image,
+    check_positive,
+    check_same_size,
+    check_tensor,
+    check_unit_range,
+)
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
@@ -63,7 +70,8 @@ def diffusion_mask(
             is as close to them as to the region, and falls further where it is closer to them. None is no such region.
 
     Returns:
-        (B, K, H, W) in (0, 1], in the region's dtype; without ``negative`` it grows with time at every pixel.
+        (B, K, H, W) in (0, 1], in the region's dtype (float16 rounds the least to 0); without ``negative`` it grows
+        with time at every pixel.
         Differentiable in operator, regions, time and width, also where eigenvalues meet.
 
     Raises:
@@ -85,7 +93,8 @@ def diffusion_mask(
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
     if others is not None:
         check_negative(others.shape[1], weights.shape[1])
-        weights = torch.cat([weights.expand(len(others), -1, -1), others.expand(len(weights), -1, -1)], dim=1)
+        images = max(len(weights), len(others))
+        weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
     # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
@@ -168,7 +177,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
     check_positive(time, "time")
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
     with torch.no_grad():
-        weights = region_weights(spectrum, regions, name="regions")  # (B, K, N)
+        weights = region_weights(spectrum, regions, name="regions").expand(len(spectrum.factor), -1, -1)  # (B, K, N)
         basis = spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent))  # to coordinates, (B, M, M)
         centres = _sums(spectrum, basis, weights)
         assignment = _nearest(spectrum, basis, centres)
@@ -222,8 +231,7 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
     """
     check_image(masks, "masks")
     check_unit_range(masks, "masks")
-    if not isinstance(alpha, Tensor):
-        raise TypeError(f"alpha must be a torch.Tensor, got {type(alpha).__name__}; convert it with torch.tensor")
+    check_tensor(alpha, "alpha")
     if alpha.ndim not in (2, 3) or alpha.shape[-2] != masks.shape[1] or alpha.shape[-1] < 2:
         raise ValueError(
             f"alpha must have shape ({masks.shape[1]}, k+1) or (B, {masks.shape[1]}, k+1), a row of sliders for every "

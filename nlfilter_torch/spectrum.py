@@ -101,7 +101,7 @@ class Spectrum(RitzPairs):
         """N, of the whole image."""
         return self.scaling.shape[1] if self.shard is None else self.shard.pixels
 
-    @cached_property
+    @property
     def eigenvectors(self) -> Tensor:
         """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero where those are padding.
 
@@ -110,9 +110,20 @@ class Spectrum(RitzPairs):
         limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the
         choice of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
         """
-        vectors = self.ritz.vectors
-        if self.ritz.matrix.requires_grad and torch.is_grad_enabled():
-            vectors = torch.linalg.eigh(self.ritz.matrix).eigenvectors.flip(-1)
+        return self._recorded if torch.is_grad_enabled() and self.ritz.matrix.requires_grad else self._constant
+
+    @cached_property
+    def _recorded(self) -> Tensor:
+        return self._form(torch.linalg.eigh(self.ritz.matrix).eigenvectors.flip(-1))
+
+    @cached_property
+    @torch.no_grad()
+    def _constant(self) -> Tensor:
+        """Kept apart: who looks at the eigenvectors without a gradient must not take it from who needs it."""
+        return self._form(self.ritz.vectors)
+
+    def _form(self, vectors: Tensor) -> Tensor:
+        """The eigenvectors (B, R, H, W) from those of T, (B, M, M)."""
         rank = self.eigenvalues.shape[1]
         vectors = (vectors * self.support.unsqueeze(1))[:, :, :rank]
         vectors = self._constant_first(vectors)
@@ -176,7 +187,9 @@ def compute_spectrum(
     """Spectrum of ``W``; ``diagonal`` is None where W has no diagonal part."""
     remainder = None if diagonal is None else scaling.square() * diagonal
     # F F^T and F diag(r) F^T, (B, J, M, M)
-    grams = reduce_sum(_Grams.apply(factor, scaling, remainder), shard)  # type: ignore[no-untyped-call]
+    recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
+    sums = _Grams.apply if recorded else _sum_grams  # transforms of torch.func know no such class
+    grams = reduce_sum(sums(factor, scaling, remainder), shard)
     pairs = RitzPairs.of_sums(grams, factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
@@ -203,26 +216,31 @@ def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tens
     return root, (projected + projected.mT) / 2, kept.sum(1)
 
 
-class _Grams(torch.autograd.Function):
+def _sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None) -> Tensor:
     """``F F^T`` and, given r, ``F diag(r) F^T`` for F = factor diag(d), block by block.
 
     F is formed before it is squared: without completion d alone may be too large, and the factor alone too small.
     """
+    batch, marks, pixels = factor.shape
+    count = strip_count(batch, pixels, factor.device)
+    factor, scaling = strips(factor, count), strips(scaling.unsqueeze(1), count)
+    remainder = None if remainder is None else strips(remainder.unsqueeze(1), count)
+    total = factor.new_zeros(len(factor), 1 if remainder is None else 2, marks, marks, dtype=torch.float64)
+    for block, (rows, weighted) in buffered_blocks(factor, 2):
+        torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
+        total[:, 0] += rows @ rows.mT
+        if remainder is not None:
+            total[:, 1] += torch.mul(rows, remainder[:, :, block], out=weighted) @ rows.mT
+    return total.sum(0, keepdim=True) if count > 1 else total
+
+
+class _Grams(torch.autograd.Function):
+    """:func:`_sum_grams` with a gradient that keeps none of its blocks."""
 
     @staticmethod
     def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None) -> Tensor:
-        batch, marks, pixels = factor.shape
         ctx.save_for_backward(factor, scaling, remainder)
-        count = strip_count(batch, pixels, factor.device)
-        factor, scaling = strips(factor, count), strips(scaling.unsqueeze(1), count)
-        remainder = None if remainder is None else strips(remainder.unsqueeze(1), count)
-        total = factor.new_zeros(len(factor), 1 if remainder is None else 2, marks, marks, dtype=torch.float64)
-        for block, (rows, weighted) in buffered_blocks(factor, 2):
-            torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
-            total[:, 0] += rows @ rows.mT
-            if remainder is not None:
-                total[:, 1] += torch.mul(rows, remainder[:, :, block], out=weighted) @ rows.mT
-        return total.sum(0, keepdim=True) if count > 1 else total
+        return _sum_grams(factor, scaling, remainder)
 
     @staticmethod
     @once_differentiable

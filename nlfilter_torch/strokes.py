@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_positive, check_same_size, check_unit_range
+from nlfilter_torch.checks import check_image, check_positive, check_same_size, check_tensor, check_unit_range
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import RitzPairs, Spectrum
@@ -68,7 +68,9 @@ def propagate_strokes(
     """
     shard = spectrum.shard
     batch = spectrum.factor.shape[0]
-    images = max(batch, strokes.shape[0], stroke_mask.shape[0])
+    check_tensor(strokes, "strokes")
+    check_tensor(stroke_mask, "stroke_mask")
+    images = batch if batch > 1 else max(strokes.shape[0], stroke_mask.shape[0])
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum")
@@ -227,6 +229,8 @@ def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shar
 
 def check_share(value: float | Tensor, name: str, *, below: bool = False) -> None:
     """Raise unless ``value`` (a number, or a tensor on the CPU) is in [0, 1], or in [0, 1) where ``below``."""
+    if not isinstance(value, Tensor | float | int):
+        raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number in [0, 1]")
     values = torch.as_tensor(value).detach()
     if values.device.type != "cpu":
         return

@@ -40,3 +40,12 @@ def test_tones_and_lines() -> None:
     torch.testing.assert_close(abstract(image, edges=0.5) + 0, (plain + lined) / 2, atol=0.1, rtol=0)
     grey = abstract(luminance(image), tones=4, edges=1.0)
     assert grey.shape == (1, 1, 48, 72)
+
+
+def test_flat_images_leave_the_gradient_of_a_batch_alone() -> None:
+    image = torch.cat([colour("chelsea", 16, 16), torch.full((1, 3, 16, 16), 0.5)])
+    power = torch.tensor(0.1, requires_grad=True)
+    abstract(image, power=power, tones=4, num_landmarks=20).sum().backward()
+    assert power.grad is not None
+    assert power.grad.isfinite()
+    assert power.grad != 0

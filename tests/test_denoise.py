@@ -35,3 +35,10 @@ def test_noise_is_estimated() -> None:
     ramp = torch.linspace(0, 1, 80).expand(1, 1, 80, 80) + torch.linspace(0, 1, 80).unsqueeze(1)
     assert estimate_noise(ramp).item() < 1e-6
     assert estimate_noise(torch.rand(1, 1, 2, 2, generator=torch.Generator().manual_seed(0))).item() == 0
+
+
+def test_images_of_a_batch_that_differ_in_rank_are_denoised_as_alone() -> None:
+    images = torch.cat([colour("rocket", 32, 32), colour("astronaut", 32, 32)]).double()
+    both = denoise(images, noise_level=4 / 255)
+    for i in range(2):
+        torch.testing.assert_close(both[i : i + 1], denoise(images[i : i + 1], noise_level=4 / 255), atol=1e-6, rtol=0)

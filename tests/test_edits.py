@@ -95,6 +95,7 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
             "strokes must have the height and width of the image",
         ),
         (recolor, RGB, {**STROKES, "keep": torch.ones(1, 1, 9, 9)}, "keep must have the height and width of the image"),
+        (recolor, RGB, {**STROKES, "keep": 3 * SPOT}, r"keep must be in \[0, 1\], got values from 0 to 3"),
         (recolor, RGB, {**STROKES, "reach": 1.0}, r"reach must be in \[0, 1\)"),
         (colorize, RGB, STROKES, r"grey must have 1 channel\(s\), got 3; select or convert the channels"),
         (colorize, GREY, {**STROKES, "stroke_mask": 0 * SPOT}, "stroke_mask must hold a painted pixel"),
@@ -126,4 +127,21 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
 )
 def test_bad_input(edit: Callable[..., torch.Tensor], image: torch.Tensor, arguments: dict, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
+        edit(image, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("edit", "image", "arguments", "sentence"),
+    [
+        (enhance, RGB, {"alpha": [1.0, 1.0]}, "alpha must be a torch.Tensor, got list; convert it"),
+        (enhance, RGB, {"alpha": torch.ones(2), "regions": [1]}, "regions must be a torch.Tensor, got list"),
+        (colorize, GREY, {**STROKES, "strength": None}, "strength must be a number or a tensor, got NoneType"),
+        (colorize, GREY, {**STROKES, "photometric_bandwidth": "auto"}, "photometric_bandwidth must be a number or a"),
+        (colorize, GREY, {**STROKES, "num_landmarks": "a"}, "num_landmarks must be an int, got str"),
+        (abstract, RGB, {"num_landmarks": "a"}, "num_landmarks must be an int, got str"),
+        (denoise, RGB, {"num_landmarks": "a"}, "num_landmarks must be an int, got str"),
+    ],
+)
+def test_wrong_types(edit: Callable[..., torch.Tensor], image: torch.Tensor, arguments: dict, sentence: str) -> None:
+    with pytest.raises(TypeError, match=sentence):
         edit(image, **arguments)

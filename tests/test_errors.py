@@ -19,6 +19,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     polynomial_filter,
     polynomial_response,
+    propagate_strokes,
     segment_mask,
     spectral_filter,
 )
@@ -72,6 +73,7 @@ TAKE_AN_IMAGE: dict[str, tuple[str, Callable[[torch.Tensor], object]]] = {
     "polynomial_filter": ("image", lambda x: polynomial_filter(OPERATOR, x, torch.ones(4))),
     "spectral_filter": ("image", lambda x: spectral_filter(SPECTRUM, x, torch.sqrt)),
     "coefficients": ("image", SPECTRUM.coefficients),
+    "propagate_strokes": ("strokes", lambda x: propagate_strokes(SPECTRUM, x, PAINTED)),
     "captured_energy": ("image", lambda x: captured_energy(SPECTRUM, x)),
     "diffusion_mask": ("region", lambda x: diffusion_mask(SPECTRUM, x)),
     "segment_mask": ("regions", lambda x: segment_mask(SPECTRUM, x)),
@@ -132,6 +134,7 @@ BAD_OPTIONS: list[tuple[str, Any, type[Exception], str]] = [
     ("completion", None, ValueError, "must be one of 'diagonal', 'none', got None"),
     ("guide_channels", "rgb", ValueError, "must be one of 'luminance', 'all', got 'rgb'"),
     ("tolerance", 0.0, ValueError, f"{POSITIVE} 0.0"),
+    ("patch_weights", [[1.0]], TypeError, "must be a torch.Tensor, got list; convert it"),
     ("patch_weights", torch.ones(3, 5), ValueError, f"{SQUARE} (3, 5)"),
     ("patch_weights", torch.ones(4, 4), ValueError, f"{SQUARE} (4, 4)"),
     ("patch_weights", torch.ones(9), ValueError, f"{SQUARE} (9,)"),

@@ -288,6 +288,17 @@ def test_masks_are_worked_out_block_by_block(monkeypatch: pytest.MonkeyPatch) ->
         torch.testing.assert_close(found, wanted, atol=1e-10, rtol=1e-8)
 
 
+def test_one_set_of_regions_serves_every_image() -> None:
+    spectrum = build(noise(2, 1, SIDE, SIDE), num_landmarks=20).spectrum()
+    region, negative = regions(2), regions(2).flip(3)
+    both = region.expand(2, -1, -1, -1), negative.expand(2, -1, -1, -1)
+    wanted = diffusion_mask(spectrum, both[0], negative=both[1])
+    torch.testing.assert_close(diffusion_mask(spectrum, region, negative=both[1]), wanted)
+    torch.testing.assert_close(diffusion_mask(spectrum, both[0], negative=negative), wanted)
+    torch.testing.assert_close(diffusion_mask(spectrum, region, negative=negative), wanted)
+    assert torch.equal(segment_mask(spectrum, region), segment_mask(spectrum, both[0]))
+
+
 def test_overlapping_masks_share_a_pixel() -> None:
     alpha = compose_alpha(torch.ones(1, 2, 1, 1), torch.tensor([[3.0, 1.0], [5.0, 2.0]]))
     torch.testing.assert_close(alpha.flatten(), torch.tensor([4.0, 1.5]))

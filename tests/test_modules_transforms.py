@@ -113,6 +113,7 @@ def test_vmap_over_images_and_over_sliders_of_a_fitted_operator() -> None:
     alpha, picture = torch.tensor(ALPHA), image(batch=1)
     cases: list[tuple[Callable[[Tensor], Tensor], Tensor]] = [
         (lambda y: polynomial_filter(operator, y, alpha), images),
+        (lambda y: polynomial_filter(operator, y, alpha, residual=0.5), images),
         (lambda a: polynomial_filter(operator, picture, a), alphas),
         (lambda y: detail_layers(operator, y), images),
         (lambda y: operator @ y, images),

@@ -163,3 +163,20 @@ def test_basis_keeps_distances(seed: int) -> None:
     rows = spectrum.basis(lambda s: s**1.5) @ (spectrum.factor * spectrum.scaling.unsqueeze(1))
     expected = spectrum.eigenvalues.pow(1.5).unsqueeze(2) * spectrum.eigenvectors.flatten(2)
     torch.testing.assert_close(rows.mT @ rows, expected.mT @ expected, atol=1e-8, rtol=0)
+
+
+def test_a_look_at_the_eigenvectors_takes_no_gradient_away() -> None:
+    guide = noise(1, 1, 8, 9).requires_grad_()
+    weights = noise(1, 6, 8, 9, seed=1)
+
+    def slope(look: bool) -> torch.Tensor:
+        spectrum = build(guide, photometric_bandwidth=0.4, num_landmarks=12).spectrum(6)
+        if look:
+            with torch.no_grad():
+                assert not spectrum.eigenvectors.requires_grad
+        return torch.autograd.grad((spectrum.eigenvectors.abs() * weights).sum(), guide)[0]
+
+    torch.testing.assert_close(slope(look=True), slope(look=False))
+    with torch.no_grad():
+        constant = build(guide, photometric_bandwidth=0.4, num_landmarks=12).spectrum()
+    assert not constant.eigenvectors.requires_grad

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_positive, check_reach
+from nlfilter_torch.checks import check_count, check_image, check_positive, check_reach
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -26,6 +26,7 @@ LEAST = 1e-4  # of r
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones where the image is flat, and where it has an edge
+FLAT = 1e-12  # of squared gradients; keeps the derivative of their root finite
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, at which a step is crisp
 
 
@@ -110,6 +111,7 @@ class Abstraction:
         **options: Any,
     ) -> None:
         check_image(image, "image")
+        check_count(num_landmarks, "num_landmarks")
         self._image = image
         size = image.shape[-2:]
         self._options = {
@@ -196,7 +198,7 @@ def quantize(luminance: Tensor, tones: int) -> Tensor:
 
     step = 1 / (tones - 1)
     nearest = (luminance / step).round() * step
-    gradient = 100 * spatial_gradient(luminance, mode="diff").square().sum(2).sqrt()
+    gradient = 100 * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=FLAT).sqrt()
     steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
     # Steepness is per tone, so that the transition looks alike for any number of them.
     return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_image, check_same_size
+from nlfilter_torch.checks import check_choice, check_count, check_image, check_positive, check_same_size
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
 from nlfilter_torch.masks import segment_mask
 from nlfilter_torch.operator import nonlocal_operator
@@ -85,7 +85,7 @@ def colorize(
         in image, strokes, mask and bandwidths under ``"regression"``, in the strokes only under ``"kmeans"``.
 
     Raises:
-        TypeError, ValueError: if a tensor has another size, leaves its range, or nothing is painted.
+        TypeError, ValueError: if a tensor has another size, the mask leaves [0, 1], or nothing is painted.
 
     Example:
         >>> grey = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.1
@@ -99,6 +99,10 @@ def colorize(
     """
     check_image(grey, "grey", channels=1)
     check_choice(method, "method", ("regression", "kmeans"))
+    check_positive(photometric_bandwidth, "photometric_bandwidth")
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth")
+    check_count(num_landmarks, "num_landmarks")
     once = Colorization(
         grey,
         photometric_bandwidth=photometric_bandwidth,

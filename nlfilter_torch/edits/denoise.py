@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image
+from nlfilter_torch.checks import check_count, check_image
 from nlfilter_torch.features import pad_border
 from nlfilter_torch.filtering import detail_layers, weigh_layers
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
@@ -61,6 +61,7 @@ def denoise(
         (0.1, True)
     """
     check_image(image, "image")
+    check_count(num_landmarks, "num_landmarks")
     pixels = image.to(working_dtype(image))
     level = estimate_noise(pixels) if noise_level is None else torch.as_tensor(noise_level).to(pixels).reshape(-1)
     if level.device.type == "cpu" and not bool(((level >= 0) & torch.isfinite(level)).all()):
@@ -131,13 +132,15 @@ def _passed_noise(operator: NonlocalOperator) -> Tensor:
 
     Off the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.
     """
-    inside = operator.spectrum().eigenvalues  # (B, R)
+    spectrum = operator.spectrum()
+    inside = spectrum.eigenvalues  # (B, R)
+    counted = spectrum.support[:, : inside.shape[1]]  # the others are padding, in a batch of different ranks
     outside = operator.diagonal_share.flatten(1)  # (B, N)
     pixels = outside.shape[1]
-    share = 1 - inside.shape[1] / pixels
+    share = 1 - counted.sum(1) / pixels  # (B,)
 
     def gain(eigenvalues: Tensor, order: int) -> Tensor:
         return (eigenvalues**order * (1 - eigenvalues)).square()
 
-    traces = [gain(inside, i).sum(1) / pixels + share * gain(outside, i).mean(1) for i in range(ORDER)]
+    traces = [(gain(inside, i) * counted).sum(1) / pixels + share * gain(outside, i).mean(1) for i in range(ORDER)]
     return torch.stack(traces, dim=1)

@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image
+from nlfilter_torch.checks import check_image, check_tensor
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import polynomial_filter
@@ -61,8 +61,10 @@ def enhance(
         torch.Size([1, 3, 24, 24])
     """
     check_image(image, "image")
+    check_tensor(alpha, "alpha")
     pixels = image.to(working_dtype(image))
     if regions is not None:
+        check_tensor(regions, "regions")
         shared = {name: value for name, value in options.items() if name in SHARED}
         masks = colour_masks(
             pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_same_size
+from nlfilter_torch.checks import check_image, check_same_size, check_unit_range
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.spots import Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
@@ -64,7 +64,7 @@ def recolor(
         in image, strokes, mask and parameters, with the grouping of colours held.
 
     Raises:
-        TypeError, ValueError: if a tensor has another size, leaves its range, or nothing is painted.
+        TypeError, ValueError: if a tensor has another size, a mask leaves [0, 1], or nothing is painted.
 
     Example:
         >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2
@@ -111,6 +111,8 @@ class Recoloring:
             check_image(tensor, name, channels=channels, batch=batch)
             check_same_size(tensor, size, name, "image")
         check_painted(stroke_mask)
+        if keep is not None:
+            check_unit_range(keep, "keep")
         check_share(reach, "reach", below=True)
 
         pixels = image.to(working_dtype(image))

@@ -29,7 +29,8 @@ class NonlocalAffinity(nn.Module):
             neither pickled nor copied.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive.
+        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive; other options are checked
+            with the first guide.
     """
 
     def __init__(

@@ -29,7 +29,8 @@ class NonlocalFilter(nn.Module):
         **options: of :func:`nonlocal_operator`.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or an option is out of its range.
+        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive; other options are checked
+            with the first image.
 
     Example:
         >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), photometric_bandwidth=0.1, num_landmarks=30)
@@ -75,7 +76,7 @@ class NonlocalFilter(nn.Module):
         """
         operator = self.affinity(image if guide is None else guide)
         if mask is not None:
-            check_image(mask, "mask", batch=image.shape[0])
+            check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]))
             check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
         rows = self.sliders.alpha if alpha is None else alpha
         own_rows = alpha is None and rows.ndim == 2
