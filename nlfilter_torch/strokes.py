@@ -138,12 +138,11 @@ def fit_strokes(
         shard: of the image, where other ranks have the rest of it.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T
-    spot = SPOT * pixels
-    dots = Dots.of(painted, half, spot, shard) if spot > 1 else None
+    heed = Heed.of(painted, half, SPOT * pixels, shard)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for factor, weights, values in painted():
-        heeded = weights if dots is None else dots.raised(factor, weights)
+        heeded = heed(factor, weights)
         images = max(len(factor), len(heeded), len(values))
         known = torch.cat([values, torch.ones_like(values[:, :1])], dim=1).expand(images, -1, -1)
         gram = gram + moment(factor * heeded, factor)  # (B, M, M)
@@ -153,10 +152,7 @@ def fit_strokes(
 
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
     inner = half.mT @ gram @ half
-    trace = inner.diagonal(dim1=1, dim2=2).sum(1)
-    noise = NOISE * spot * trace / sums[:, -1]  # the trace over the weights is the variance of a painted pixel
-    noise = _per_image(smoothness, gram) * noise.reshape(-1, 1, 1)
-    noise = noise.clamp(min=torch.finfo(torch.float64).tiny)
+    noise = _per_image(smoothness, gram) * heed.spot * heed.noise  # of a pixel, many of which make a dab
     identity = torch.eye(inner.shape[1]).to(inner)
     lower = torch.linalg.cholesky_ex(inner + noise * identity).L
     solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
@@ -181,39 +177,54 @@ def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Dots:
-    """How few others a painted pixel resembles, so that small dots may count like a whole spot.
+class Heed:
+    """How much a painted pixel counts.
 
-    A dot that someone sets with care must not drown among broad strokes, nor in a large photograph.
+    A dot that someone sets with care must not drown among broad strokes, nor in a large photograph: pixels that
+    resemble few others that are painted count for up to a whole dab. And what a pixel has of its own, which the
+    landmarks miss, tells nothing about others: values of pixels like no other are left to themselves.
 
     Attributes:
         core: X, (B, M, M).
-        gram: ``X G X / v`` with G the sum over the painted pixels and v their mean variance, (B, M, M).
+        gram: ``X G X / v`` with G the sum over the painted pixels and v their mean explained variance, (B, M, M).
         spot: pixels that a dab of a brush covers.
+        noise: variance of the values of a dab, (B, 1, 1).
     """
 
     core: Tensor
     gram: Tensor
     spot: float
+    noise: Tensor
 
     @staticmethod
-    def of(painted: Painted, half: Tensor, spot: float, shard: Shard | None) -> "Dots":
+    def of(painted: Painted, half: Tensor, spot: float, shard: Shard | None) -> "Heed":
         """From a pass over the painted pixels."""
-        gram, total = torch.zeros(()), torch.zeros(())
+        gram, missed, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
+            missed = missed + (weights * unexplained(factor)).double().sum((1, 2))
             total = total + weights.double().sum((1, 2))
-        gram, total = reduce_sum(gram, shard), reduce_sum(total, shard)
+        gram, missed, total = (reduce_sum(part, shard) for part in (gram, missed, total))
         core = half @ half.mT
-        typical = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
-        return Dots(core, core @ gram @ core / typical.reshape(-1, 1, 1), spot)
+        variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
+        noise = NOISE * (variance + missed / total).reshape(-1, 1, 1)
+        return Heed(core, core @ gram @ core / variance.reshape(-1, 1, 1), spot, noise)
 
-    def raised(self, factor: Tensor, weights: Tensor) -> Tensor:
-        """The weights (B, 1, n), larger where columns (B, M, n) are like few others."""
+    def __call__(self, factor: Tensor, weights: Tensor) -> Tensor:
+        """The weights (B, 1, n) of columns (B, M, n)."""
+        noise, own = self.noise.to(weights), unexplained(factor) / min(self.spot, 1.0)
+        weights = weights * noise / (noise + own)
+        if self.spot <= 1:
+            return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
         # The sum of squared correlations with what is painted.
         likes = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
         return weights * (self.spot / likes.clamp(min=1.0)).clamp(min=1.0)
+
+
+def unexplained(factor: Tensor) -> Tensor:
+    """What columns (B, M, n) lack of the kernel's unit diagonal, (B, 1, n): 1 for a pixel like no landmark."""
+    return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 
 
 def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shard | None = None) -> None:

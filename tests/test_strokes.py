@@ -43,8 +43,10 @@ def kriging(
     covariance = basis @ walks @ basis.T / np.outer(scaling, scaling)
     painted = weights > 0
     inner = covariance[np.ix_(painted, painted)]
-    variance = (np.diag(inner) * weights[painted]).sum() / weights[painted].sum()
-    noisy = inner + np.diag(smoothness * NOISE * SPOT * factor.shape[1] * variance / weights[painted])
+    own = 1 - np.square(factor[:, painted]).sum(0)  # of the kernel's unit diagonal
+    variance = ((np.diag(inner) + own) * weights[painted]).sum() / weights[painted].sum()
+    spot = SPOT * factor.shape[1]  # less than a pixel here
+    noisy = inner + np.diag(smoothness * (spot * NOISE * variance + own) / weights[painted])
     ones = np.ones(painted.sum())
     solved, of_ones = np.linalg.solve(noisy, strokes[painted]), np.linalg.solve(noisy, ones)
     mean = (ones @ solved) / (ones @ of_ones)
@@ -67,6 +69,21 @@ def test_it_is_the_best_linear_estimate(spectrum: Spectrum, strength: float, rea
             spectrum, strokes[0, channel].flatten().numpy(), mask.flatten().numpy(), strength, reach, smoothness
         )
         np.testing.assert_allclose(found[0, channel].flatten(), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bandwidth", [0.001, 0.02, 0.05, 0.1])
+def test_pixels_that_the_landmarks_miss_do_not_run_away(bandwidth: float, dtype: torch.dtype) -> None:
+    """Their few millionths in common with others would have to be scaled up to reach what is painted on them."""
+    image, mask = noise(1, 1, 32, 32, dtype=dtype), spots((8, 8), (20, 20), height=32, width=32).to(dtype)
+    strokes = torch.zeros_like(mask)
+    strokes[..., 20:22, 20:22] = 1
+    spectrum = nonlocal_operator(image, photometric_bandwidth=bandwidth).spectrum()
+    found = propagate_strokes(spectrum, strokes, mask)
+    assert found.min() > -0.5
+    assert found.max() < 1.5
+    constant = torch.full_like(mask, 0.7)
+    torch.testing.assert_close(propagate_strokes(spectrum, constant, mask), constant, atol=1e-5, rtol=0)
 
 
 @given(guides(), options, st.data())
