@@ -23,6 +23,8 @@ Loss = Callable[[Tensor, Tensor], Tensor]
 
 # Mixtures of layers of unit norm whose squared norm is below this are rounding of the operator's dtype.
 CUT = {torch.float32: 1e-10, torch.float64: 1e-14}
+ROUNDING = {torch.float32: 1e-13, torch.float64: 1e-30}  # power of a layer's rounding, as a share of the image's
+IDLE = 1e-20  # squared length of a move of the sliders that is the rounding of none, as a share of the longest
 # A layer whose power is this small beside that of the image is what balancing left of a constant one.
 VANISHED = {torch.float32: 1e-9, torch.float64: 1e-22}
 DESCENT_STEPS = 200
@@ -164,7 +166,7 @@ class _Problem:
         batch = 1 if self.shared else self.layers.shape[0]
         start = self.layers.new_zeros(batch, self.layers.shape[1])
         if self.dead_zone is None:
-            return self._step(start)
+            return self._least(self._step(start))
         with torch.no_grad():
             change = replace(self, dead_zone=None)._step(start)
             for _ in range(NEWTON_STEPS):
@@ -175,7 +177,20 @@ class _Problem:
                 change = change + step
                 if bool((step.abs() < SETTLED).all()):
                     break
-        return change + self._step(change)  # a last step for the gradient
+        return self._least(change + self._step(change))  # a last step for the gradient
+
+    def _least(self, change: Tensor) -> Tensor:
+        """The smallest change (B, k+1) that does the same: a layer that is a small multiple of another one rests."""
+        products = reduce_sum((self.layers * self.weights.unsqueeze(1)) @ self.layers.mT, self.shard)
+        scale, matrix, counted = self._scaled(self._pool(products))
+        idle = matrix.apply(torch.ones_like, ~counted)  # a projector, (B, k+1, k+1)
+        moves = scale.unsqueeze(2) * idle  # mixtures of sliders that change nothing
+        inner = SymmetricMatrix.of(moves.mT @ moves)
+        # Less is rounding, beside the longest of the moves or where there is none.
+        least = torch.maximum(CUT[torch.float64] * inner.eigenvalues[:, :1], IDLE * scale.amax(1, True).square())
+        real = inner.eigenvalues > least
+        inverse = inner.apply(torch.reciprocal, real)
+        return change - (moves @ (inverse @ (moves.mT @ change.unsqueeze(2)))).squeeze(2)
 
     def _errors(self, change: Tensor) -> Tensor:
         """What of the edit (B, P) is left unexplained."""
@@ -201,13 +216,25 @@ class _Problem:
 
     def _inverse(self, products: Tensor) -> tuple[Tensor, Tensor]:
         """Scales (B, k+1) of the layers, and the pseudo-inverse (B, k+1, k+1) of their products so scaled."""
+        scale, matrix, counted = self._scaled(products)
+        return scale, matrix.apply(torch.reciprocal, counted)
+
+    def _scaled(self, products: Tensor) -> tuple[Tensor, SymmetricMatrix, Tensor]:
+        """Scales (B, k+1) of the layers, their products so scaled, and which eigenvalues of these are no rounding.
+
+        The scales give unit norm, or 0 to a layer that is rounding itself.
+        """
         products = products + self.ridge * torch.eye(products.shape[1]).to(products)
         power = products.diagonal(dim1=1, dim2=2)
         # The layers sum to the image, so the largest of them is of its size.
-        present = power > VANISHED[self.precision] * power.amax(1, keepdim=True)
+        share = power / power.amax(1, keepdim=True).clamp(min=torch.finfo(power.dtype).tiny)
+        present = share > VANISHED[self.precision]
         scale = torch.where(present, power, torch.ones_like(power)).rsqrt() * present
         matrix = SymmetricMatrix.of(scale.unsqueeze(2) * products * scale.unsqueeze(1))
-        return scale, matrix.apply(torch.reciprocal, matrix.eigenvalues > CUT[self.precision])
+        # Scaling raises the rounding of small layers as well.
+        rounding = ROUNDING[self.precision] / torch.where(present, share, torch.ones_like(share)).detach()
+        floor = (matrix.vectors.square() * rounding.unsqueeze(2)).sum(1).clamp(min=CUT[self.precision])
+        return scale, matrix, matrix.eigenvalues > floor
 
     @torch.no_grad()
     def descend(self, start: Tensor, loss: Loss, target: Tensor, mask: Tensor | None) -> Tensor:

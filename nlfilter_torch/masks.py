@@ -13,6 +13,8 @@ from nlfilter_torch.checks import (
     check_same_size,
     check_tensor,
     check_unit_range,
+    is_transformed,
+    warn,
 )
 from nlfilter_torch.filtering import polynomial_filter
 from nlfilter_torch.operator import NonlocalOperator
@@ -22,6 +24,8 @@ from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.thin import moment, spread
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
+EXPLAINED = 0.005  # share of a region's kernel below which its place in the diffusion map is nearly the origin
+LOOKED_AT = 4096  # of a region's pixels
 ITERATIONS = 20  # of k-means, which starts close to its end
 
 
@@ -89,6 +93,7 @@ def diffusion_mask(
     check_positive(time, "time")
     check_positive(width, "width")
     weights = region_weights(spectrum, region)  # (B, K, N)
+    _warn_of_unlike(spectrum, weights)
     exponent = torch.as_tensor(replicate(time, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
     if others is not None:
@@ -102,6 +107,22 @@ def diffusion_mask(
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = mask_of_exponents(inner, None if negative is None else outer)
     return mask.unflatten(2, spectrum.size).to(region.dtype)
+
+
+@torch.no_grad()
+def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
+    """Warn of a region (B, K, N) like no landmark: all pixels that the landmarks miss have the coordinates 0."""
+    if weights.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(weights):
+        return
+    for columns, regions in zip(spectrum.factor, weights.expand(len(spectrum.factor), -1, -1), strict=True):
+        for number, region in enumerate(regions):
+            places = region.nonzero().squeeze(1)
+            few = places[:: 1 + len(places) // LOOKED_AT]
+            if len(few) > 0 and columns[:, few].square().sum(0).mean() < EXPLAINED:
+                warn(
+                    f"region {number} is like no landmark, so its mask may take in whatever else is like none; "
+                    "raise num_landmarks or photometric_bandwidth"
+                )
 
 
 def check_negative(count: int, regions: int) -> None:

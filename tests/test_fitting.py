@@ -231,3 +231,19 @@ def test_bad_input_is_one_clear_sentence(changes: dict[str, object], error: type
     operator = nonlocal_operator(image, num_landmarks=10)
     with pytest.raises(error, match=message):
         fit_alpha(operator, arguments.pop("image"), arguments.pop("target"), **arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("level", "bandwidth"), [(0.5, "auto"), (-5.0, 1000.0)])
+def test_layers_that_are_tiny_multiples_of_others_rest(
+    level: float, bandwidth: float | str, dtype: torch.dtype
+) -> None:
+    """Under a constant guide the second layer of any image is some billionths of its first."""
+    operator = nonlocal_operator(
+        torch.full((1, 1, 13, 9), level, dtype=dtype), photometric_bandwidth=bandwidth, num_landmarks=40
+    )
+    image = noise(1, 3, 13, 9, seed=7, dtype=dtype)
+    target = polynomial_filter(operator, image, torch.tensor([1.5, 1.2, 0.8, 1.1], dtype=dtype))
+    found = fit_alpha(operator, image, target)
+    torch.testing.assert_close(found, torch.tensor([[1.5, 1.0, 1.0, 1.1]], dtype=dtype), atol=1e-3, rtol=0)
+    assert (polynomial_filter(operator, image, found[0]) - target).abs().max() < 1e-5

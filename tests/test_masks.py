@@ -299,6 +299,19 @@ def test_one_set_of_regions_serves_every_image() -> None:
     assert torch.equal(segment_mask(spectrum, region), segment_mask(spectrum, both[0]))
 
 
+def test_a_region_like_no_landmark_is_worth_a_warning() -> None:
+    image, region = noise(1, 1, 32, 32), torch.zeros(1, 2, 32, 32)
+    few = nonlocal_operator(image, photometric_bandwidth=0.03).spectrum()
+    best = few.factor[0].square().sum(0).argmax()
+    region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel like none
+    with pytest.warns(UserWarning, match="region 1 is like no landmark, so its mask may take in"):
+        mask = diffusion_mask(few, region)
+    assert (mask > 0.5).double().mean((2, 3))[0, 0] < 0.01
+    assert (mask > 0.5).double().mean((2, 3))[0, 1] > 0.9
+    every = nonlocal_operator(image, photometric_bandwidth=0.03, num_landmarks=1024).spectrum()
+    assert (diffusion_mask(every, region) > 0.5).double().mean() < 0.01
+
+
 def test_overlapping_masks_share_a_pixel() -> None:
     alpha = compose_alpha(torch.ones(1, 2, 1, 1), torch.tensor([[3.0, 1.0], [5.0, 2.0]]))
     torch.testing.assert_close(alpha.flatten(), torch.tensor([4.0, 1.5]))

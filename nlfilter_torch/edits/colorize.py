@@ -42,7 +42,7 @@ SIMILAR, PATCH_SIZE, LANDMARKS = 40 / 255, 5, 100  # photometric bandwidth, size
 # Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
 # than 0.3 dB.
 LOCALITY = 0.5625  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
-FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 2.0), Stage(2 / 9, 3.0, 3, 0.5, 4.0)
+FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 2.0), Stage(2 / 9, 3.0, 3, 0.5, 2.0)
 
 
 @full_precision
