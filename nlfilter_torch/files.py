@@ -235,9 +235,9 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
         beside.replace(path)
     except OSError as error:
-        if error.filename is not None or error.errno is None:
+        if error.filename not in (None, str(beside)) or error.errno is None:
             raise
-        # A full disk or a quota: the system says what, but not where.
+        # A full disk, a quota, or no right to make files: the system says what, but not where.
         raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
         beside.unlink(missing_ok=True)
@@ -253,9 +253,12 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
     needed = width * height * bytes_per_pixel
     free = psutil.virtual_memory().available if memory is None else memory
     if needed > free:
+        limit = (
+            f"{free / 1e6:.0f} MB is free; " if memory is None else f"{free / 1e6:.0f} MB may be used; allow more, or "
+        )
         raise TooLarge(
-            f"{path} has {width}x{height} pixels and needs about {needed / 1e9:.1f} GB of memory, "
-            f"but {free / 1e9:.1f} GB is free; use fewer landmarks or a smaller picture"
+            f"{path} has {width}x{height} pixels and needs about {needed / 1e6:.0f} MB of memory, but {limit}"
+            "use fewer landmarks, smaller patches or a smaller picture"
         )
 
 

@@ -51,9 +51,12 @@ def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
 def show_eigenvectors(
     spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50), *, side: int = SIDE
 ) -> Figure:
-    """Eigenvectors by their number from 1, as in the paper's Fig. 1; numbers beyond the last are left out."""
+    """Eigenvectors by their number from 1, as in the paper's Fig. 1; numbers beyond the last are left out.
+
+    Of a flat picture, whose only eigenvector is the constant one, that is shown.
+    """
     vectors = spectrum.eigenvectors[0].numpy(force=True)
-    shown = [number for number in numbers if number <= len(vectors)]
+    shown = [number for number in numbers if number <= len(vectors)] or [1]
     figure, axes = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))), side=side)
     for axis, number in zip(axes, shown, strict=True):
         vector = vectors[number - 1]

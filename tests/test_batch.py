@@ -265,9 +265,10 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         raise KeyboardInterrupt
 
     monkeypatch.setattr("nlfilter_torch.cli.batch.edit_folder", interrupt)
-    assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 1
+    assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 130
     captured = capsys.readouterr()
-    assert captured.err == "nlfilter-torch: interrupted; the same command does the rest\n"
+    told = "nlfilter-torch: the same command does the rest\nnlfilter-torch: interrupted; no file is half written\n"
+    assert captured.err == told
     assert captured.out == f"1 edited, 0 there already, 0 failed, 1 not begun, in {tmp_path / 'out'}\n"
 
 

@@ -242,7 +242,7 @@ def test_too_large_for_memory(
     free = psutil.virtual_memory()._replace(available=60 * 90 * 4 * (100 + 2 * 25 + 40) - 1)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     sentence = refused(capsys, "tone", photo, tmp_path / "out.png")
-    assert "has 90x60 pixels and needs about 0.0 GB of memory, but 0.0 GB is free; use fewer landmarks" in sentence
+    assert "has 90x60 pixels and needs about 4 MB of memory, but 4 MB is free; use fewer landmarks, smaller" in sentence
     sentence = refused(capsys, "detail", photo, tmp_path / "out.png")  # not even in tiles
     assert "in.png needs 4 MB of memory at least, but 3 MB may be used; allow more" in sentence
 
@@ -283,3 +283,25 @@ def test_edit_luminance_keeps_colour(cat: torch.Tensor) -> None:
     torch.testing.assert_close(brighter, cat + 0.1)
     grey = cat[:, :1]
     assert torch.equal(edit_luminance(grey, lambda y: 2 * y), 2 * grey)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 3), (1, 40), (30, 20)])
+def test_flat_and_tiny_pictures_are_looked_at(size: tuple[int, int], tmp_path: Path) -> None:
+    source = tmp_path / "flat.png"
+    write_photograph(Photograph(torch.full((1, 1, *size), 0.5), "uint8"), source)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of fewer pixels than landmarks
+        assert main(["inspect", str(source), str(tmp_path / "looks")]) == 0
+    names = ["diagnostics.json", "eigenvalues.png", "eigenvectors.png", "response.png"]
+    assert sorted(path.name for path in (tmp_path / "looks").iterdir()) == names
+
+
+def test_interrupted_work_says_so(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", interrupt)
+    assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
+    assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"

@@ -19,6 +19,7 @@ from nlfilter_torch.cli.detail import detail
 from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
+from nlfilter_torch.cli.options import INTERRUPTED
 from nlfilter_torch.cli.presets import presets
 from nlfilter_torch.cli.recolor import recolor
 from nlfilter_torch.cli.sharpen import sharpen
@@ -65,7 +66,7 @@ def _common(
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run the command line; bad input becomes one sentence and exit status 2."""
+    """Run the command line; bad input becomes one sentence and exit status 2, Ctrl-C status 130."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
@@ -75,6 +76,8 @@ def run(arguments: list[str] | None = None) -> int:
             return _refuse(error.format_message())
         except (ValueError, OSError, MemoryError) as error:  # a bad file or value, found by the library
             return _refuse(str(error))
+    if status == INTERRUPTED:
+        sys.stderr.write(f"{NAME}: interrupted; no file is half written\n")
     return status if isinstance(status, int) else 0
 
 

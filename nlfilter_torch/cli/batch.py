@@ -80,7 +80,7 @@ def batch(
     paths = pictures(folder)
     with connected_ranks() as ranks:
         prepare(paths, target, settings)
-        share, tally, total = ranks.share(paths), Tally(), Tally()
+        share, tally, total, interrupted = ranks.share(paths), Tally(), Tally(), False
         cores = max(1, _cores() // ranks.local)
         count = min(workers or cores, len(share)) or 1
         room = allowed_memory(memory) / (count * ranks.local) / 1e9
@@ -97,12 +97,15 @@ def batch(
                     tally=tally,
                 )
         except KeyboardInterrupt:
-            _tell("interrupted; the same command does the rest")
+            interrupted = True
+            _tell("the same command does the rest")
         for part in ranks.gather(tally):
             total.add(part)
         if ranks.rank == 0 or ranks.group is None:
             _summarise(total, target)
         ranks.gather(None)  # the first rank to end with status 1 ends the others, which may still have to say something
+    if interrupted:
+        raise typer.Exit(options.INTERRUPTED)
     if total.failures or total.left:
         raise typer.Exit(1)
 

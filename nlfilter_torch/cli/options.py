@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 
+INTERRUPTED = 130  # exit status, as shells have it for Ctrl-C
 LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
 
 
