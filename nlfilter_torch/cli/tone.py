@@ -31,7 +31,7 @@ def tone(
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
 ) -> None:
-    """Raise or lower contrast without a change of colour or of mean brightness.
+    """Raise or lower contrast without a change of colour or of mean brightness, but where the picture clips.
 
     Example: `nlfilter-torch tone in.jpg out.jpg --contrast 1.2 --clarity 2`
     """
