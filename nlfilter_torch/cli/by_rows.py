@@ -27,7 +27,8 @@ Memory = Annotated[
     float | None,
     typer.Option(
         metavar="GB",
-        help="Gigabytes of memory that may be used, beside the 0.3 of the program itself. A larger photograph is worked out in tiles of rows, which takes "
+        help="Gigabytes of memory that may be used, beside the 0.3 of the program itself. "
+        "A larger photograph is worked out in tiles of rows, which takes "
         "longer and shows no seams. Left out: four fifths of what is free.",
     ),
 ]

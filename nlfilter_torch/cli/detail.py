@@ -117,8 +117,9 @@ def detail(
 ) -> None:
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
 
-    Colours stay as they are where nothing clips, and so do the file's depth, transparency, colour profile and notes of the camera (EXIF).
-    Photographs that fit no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
+    Colours stay as they are where nothing clips, and so do the file's depth, transparency, colour profile and notes of
+    the camera (EXIF). Photographs that fit no memory are worked out in tiles; best as TIFF files or arrays of zarr,
+    read in parts.
 
     Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,4,1.05`
 
