@@ -253,13 +253,16 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
     needed = width * height * bytes_per_pixel
     free = psutil.virtual_memory().available if memory is None else memory
     if needed > free:
-        limit = (
-            f"{free / 1e6:.0f} MB is free; " if memory is None else f"{free / 1e6:.0f} MB may be used; allow more, or "
-        )
+        limit = f"{_size(free)} is free; " if memory is None else f"{_size(free)} may be used; allow more, or "
         raise TooLarge(
-            f"{path} has {width}x{height} pixels and needs about {needed / 1e6:.0f} MB of memory, but {limit}"
+            f"{path} has {width}x{height} pixels and needs about {_size(needed)} of memory, but {limit}"
             "use fewer landmarks, smaller patches or a smaller picture"
         )
+
+
+def _size(count: int) -> str:
+    """So many bytes in words."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def _read_by_pillow(

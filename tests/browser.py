@@ -105,6 +105,8 @@ class Tab:
         self.page.mouse.move(box["x"] + start * box["width"], y)
         self.page.mouse.down()
         self.page.mouse.move(box["x"] + end * box["width"], y, steps=steps)
+        # A busy page takes moves frame by frame: one that comes with the release would be lost.
+        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         if release:
             self.page.mouse.up()
 

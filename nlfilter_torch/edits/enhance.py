@@ -54,7 +54,7 @@ def enhance(
 
     Example:
         >>> import torch
-        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> image = 0.2 * torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
         >>> region = torch.zeros(1, 1, 24, 24)
         >>> region[..., :6, :6] = 1
         >>> enhance(image, torch.tensor([3.0, 3.0, 4.0, 1.05]), region, num_landmarks=50).shape
