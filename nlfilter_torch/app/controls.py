@@ -118,6 +118,12 @@ OF_STEP: dict[str, tuple[Control, ...]] = {
 }
 
 
+class SteadySlider(ui.slider):
+    """A slider that the server does not answer: an answer that comes late would move it back under the pointer."""
+
+    LOOPBACK = False
+
+
 class Slider:
     """A slider on the page that follows the edit and changes it.
 
@@ -136,7 +142,7 @@ class Slider:
                 ui.label(control.label).tooltip(control.help)
                 self._value = ui.label().classes("value")
             value = control.read(recipe())
-            self._slider = ui.slider(min=control.low, max=control.high, step=control.grain, value=value)
+            self._slider = SteadySlider(min=control.low, max=control.high, step=control.grain, value=value)
             self._slider.props(f'aria-label="{control.label}{suffix}" dense')
             self._slider.on_value_change(lambda event: self._moved(event.value))
             self._slider.on("change", lambda event: self._released(float(event.args)))
