@@ -8,6 +8,7 @@ changes nothing, as the target allows.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -181,8 +182,7 @@ class _Problem:
 
     def _least(self, change: Tensor) -> Tensor:
         """The smallest change (B, k+1) that does the same: a layer that is a small multiple of another one rests."""
-        products = reduce_sum((self.layers * self.weights.unsqueeze(1)) @ self.layers.mT, self.shard)
-        scale, matrix, counted = self._scaled(self._pool(products))
+        scale, matrix, counted = self._scaled(self._products)
         idle = matrix.apply(torch.ones_like, ~counted)  # a projector, (B, k+1, k+1)
         moves = scale.unsqueeze(2) * idle  # mixtures of sliders that change nothing
         inner = SymmetricMatrix.of(moves.mT @ moves)
@@ -191,6 +191,11 @@ class _Problem:
         real = inner.eigenvalues > least
         inverse = inner.apply(torch.reciprocal, real)
         return change - (moves @ (inverse @ (moves.mT @ change.unsqueeze(2)))).squeeze(2)
+
+    @cached_property
+    def _products(self) -> Tensor:
+        """Of all layers with each other, (B, k+1, k+1), where all errors count."""
+        return self._pool(reduce_sum((self.layers * self.weights.unsqueeze(1)) @ self.layers.mT, self.shard))
 
     def _errors(self, change: Tensor) -> Tensor:
         """What of the edit (B, P) is left unexplained."""
@@ -207,10 +212,13 @@ class _Problem:
     def _step(self, change: Tensor) -> Tensor:
         """Newton's step (B, k+1): from anywhere to the solution where all errors count."""
         errors = self._errors(change)
-        counted = self.weights if self.dead_zone is None else self.weights * (errors != 0.0)
-        products = reduce_sum((self.layers * counted.unsqueeze(1)) @ self.layers.mT, self.shard)  # (B, k+1, k+1)
+        if self.dead_zone is None:
+            products = self._products
+        else:
+            counted = self.weights * (errors != 0.0)
+            products = self._pool(reduce_sum((self.layers * counted.unsqueeze(1)) @ self.layers.mT, self.shard))
         slope = reduce_sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2), self.shard)
-        products, slope = self._pool(products), self._pool(slope) - self.ridge * change
+        slope = self._pool(slope) - self.ridge * change
         scale, inverse = self._inverse(products)
         return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)
 
@@ -239,7 +247,7 @@ class _Problem:
     @torch.no_grad()
     def descend(self, start: Tensor, loss: Loss, target: Tensor, mask: Tensor | None) -> Tensor:
         """Change (B, k+1) that minimises ``loss``, by L-BFGS in a basis in which the squared error is round."""
-        scale, inverse = self._inverse(self._pool((self.layers * self.weights.unsqueeze(1)) @ self.layers.mT))
+        scale, inverse = self._inverse(self._products)
         basis = scale.unsqueeze(2) * SymmetricMatrix.of(inverse).apply(torch.sqrt, torch.ones_like(scale).bool())
         filtered_shape = (self.layers.shape[0], *target.shape[1:])
         target = target.expand(filtered_shape)

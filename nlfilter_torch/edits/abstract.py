@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nlfilter_torch.checks import check_count, check_image, check_positive, check_reach
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
@@ -90,37 +91,20 @@ class Abstraction:
 
     Args:
         image: of :func:`abstract`.
-        photometric_bandwidth: likewise, and so are the others.
-        spatial_bandwidth: h_x.
-        patch_size: p.
-        num_landmarks: M.
-        **options: of :func:`nonlocal_operator`.
+        **options: of its filter; those left out are its defaults.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor.
     """
 
-    def __init__(
-        self,
-        image: Tensor,
-        *,
-        photometric_bandwidth: float | Tensor | str = "auto",
-        spatial_bandwidth: float | Tensor | None = None,
-        patch_size: int = PATCH_SIZE,
-        num_landmarks: int = LANDMARKS,
-        **options: Any,
-    ) -> None:
+    def __init__(self, image: Tensor, **options: Any) -> None:
         check_image(image, "image")
-        check_count(num_landmarks, "num_landmarks")
+        options = {"patch_size": PATCH_SIZE, "num_landmarks": LANDMARKS, **options}
+        check_count(options["num_landmarks"], "num_landmarks")
+        options["num_landmarks"] = min(options["num_landmarks"], image[0, 0].numel())
         self._image = image
-        size = image.shape[-2:]
-        self._options = {
-            **options,
-            "photometric_bandwidth": photometric_bandwidth,
-            "spatial_bandwidth": LOCALITY * min(size) if spatial_bandwidth is None else spatial_bandwidth,
-            "patch_size": patch_size,
-            "num_landmarks": min(num_landmarks, size.numel()),
-        }
+        nearness = nearby(options.get("spatial_bandwidth"), LOCALITY, image.shape[-2:])
+        self._options = {**options, "spatial_bandwidth": nearness}
 
     @cached_property
     def _parted(self) -> "_Parted":

@@ -3,13 +3,14 @@
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_count, check_image, check_positive, check_same_size
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
+from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.masks import segment_mask
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -120,38 +121,24 @@ class Colorization:
 
     Args:
         grey: of :func:`colorize`.
-        photometric_bandwidth: likewise, and so are the others.
-        spatial_bandwidth: h_x.
-        patch_size: p.
-        num_landmarks: M.
-        generator: of the landmarks.
         hold: both filters; without, one at a time takes memory, and each call makes them anew.
+        **options: of its filters; those left out are its defaults.
     """
 
-    def __init__(
-        self,
-        grey: Tensor,
-        *,
-        photometric_bandwidth: float | Tensor = SIMILAR,
-        spatial_bandwidth: float | Tensor | None = None,
-        patch_size: int = PATCH_SIZE,
-        num_landmarks: int = LANDMARKS,
-        generator: torch.Generator | None = None,
-        hold: bool = True,
-    ) -> None:
+    def __init__(self, grey: Tensor, *, hold: bool = True, **options: Any) -> None:
         self._grey = grey
-        bandwidth = LOCALITY * min(grey.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth
+        defaults = {"photometric_bandwidth": SIMILAR, "patch_size": PATCH_SIZE, "num_landmarks": LANDMARKS}
+        options = {**defaults, **options}
+        bandwidth = nearby(options.get("spatial_bandwidth"), LOCALITY, grey.shape[-2:])
+        options["num_landmarks"] = min(options["num_landmarks"], grey[0].numel())
 
         def spectrum(stage: Stage) -> Spectrum:
-            luminance = grey.to(working_dtype(grey))
-            return nonlocal_operator(
-                luminance,
-                patch_size=int(min(patch_size, stage.patch_size)),
-                photometric_bandwidth=stage.photometric * photometric_bandwidth,
-                spatial_bandwidth=stage.spatial * bandwidth,
-                num_landmarks=min(num_landmarks, luminance[0].numel()),
-                generator=generator,
-            ).spectrum()
+            scaled = {
+                "patch_size": int(min(options["patch_size"], stage.patch_size)),
+                "photometric_bandwidth": stage.photometric * options["photometric_bandwidth"],
+                "spatial_bandwidth": stage.spatial * bandwidth,
+            }
+            return nonlocal_operator(grey.to(working_dtype(grey)), **(options | scaled)).spectrum()
 
         self._spectrum = cache(spectrum) if hold else spectrum
 

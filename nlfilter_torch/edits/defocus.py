@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_choice, check_image, check_positive, check_reach, check_same_size
+from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.edits.spots import Pixels, Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
@@ -96,28 +97,14 @@ class Defocusing:
 
     Args:
         image: of :func:`defocus`.
-        photometric_bandwidth: likewise, and so are the others.
-        spatial_bandwidth: h_x.
-        patch_size: p.
-        **options: of :func:`nonlocal_operator`.
+        **options: of its filter; those left out are its defaults.
     """
 
-    def __init__(
-        self,
-        image: Tensor,
-        *,
-        photometric_bandwidth: float | Tensor = SIMILAR,
-        spatial_bandwidth: float | Tensor | None = None,
-        patch_size: int = PATCH_SIZE,
-        **options: Any,
-    ) -> None:
+    def __init__(self, image: Tensor, **options: Any) -> None:
         self._image = image
-        self._options = {
-            **options,
-            "photometric_bandwidth": photometric_bandwidth,
-            "spatial_bandwidth": LOCALITY * min(image.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth,
-            "patch_size": patch_size,
-        }
+        options = {"photometric_bandwidth": SIMILAR, "patch_size": PATCH_SIZE, **options}
+        nearness = nearby(options.get("spatial_bandwidth"), LOCALITY, image.shape[-2:])
+        self._options = {**options, "spatial_bandwidth": nearness}
 
     @cached_property
     def _spectrum(self) -> Spectrum:

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.checks import check_count, check_image
+from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.features import pad_border
 from nlfilter_torch.filtering import detail_layers, weigh_layers
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
@@ -71,7 +72,7 @@ def denoise(
     operator = nonlocal_operator(
         soften(pixels, GUIDE_BLUR),
         photometric_bandwidth=heard if photometric_bandwidth is None else photometric_bandwidth,
-        spatial_bandwidth=LOCALITY * min(pixels.shape[-2:]) if spatial_bandwidth is None else spatial_bandwidth,
+        spatial_bandwidth=nearby(spatial_bandwidth, LOCALITY, pixels.shape[-2:]),
         patch_size=patch_size,
         num_landmarks=min(num_landmarks, pixels.shape[-2] * pixels.shape[-1]),
         guide_channels="all",

@@ -10,6 +10,7 @@ from torch import Tensor
 from nlfilter_torch.checks import check_choice, check_count, check_patch_size, check_positive
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.edits.colorize import FAR, LOCALITY, NEAR, Stage
+from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.precision import full_precision
@@ -139,7 +140,7 @@ def colorize_rows(
     check_count(num_landmarks, "num_landmarks")
     picture = Picture(source, names[0])
     guide = Guide(source, names[0], lambda colours: reduce_channels(colours, "luminance"))
-    bandwidth = LOCALITY * min(guide.size) if spatial_bandwidth is None else spatial_bandwidth
+    bandwidth = nearby(spatial_bandwidth, LOCALITY, guide.size)
     check_positive(bandwidth, "spatial_bandwidth")
     painted = read_strokes(guide, strokes, stroke_mask, passes, name=names[1])
 
