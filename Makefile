@@ -4,13 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
 PINS := pyproject.toml constraints.txt
+COMPILED := hatch_build.py $(wildcard nlfilter_torch/native/kernels.[ch])
 
 .DELETE_ON_ERROR:
 .PHONY: demo test lint types chromium bench bench-quick train pictures figures notebooks docs clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
-$(VENV)/.installed: $(PINS)
+$(VENV)/.installed: $(PINS) $(COMPILED)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) "$$(grep '^torch==' constraints.txt)"
 	$(PIP) hatchling editables

@@ -1,5 +1,6 @@
 """Cutting the pixels of an image into blocks whose intermediate results stay in the processor's cache."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,16 +15,20 @@ CACHED = 2032
 SWEPT = 16400
 # An accelerator wants long blocks; this one bounds the memory of intermediate results at about 1 GB for M = 100.
 ACCELERATED = 1 << 21
+LINE = 16  # numbers: one line of the cache in float32, two in float64
 
 
 def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
     """Uninitialised tensor in the dtype and on the device of ``like``, from memory that is quick to touch first.
 
-    On Linux numpy asks for huge pages where torch does not: a fresh 400 MB costs 50 ms instead of 200.
+    On Linux numpy asks for huge pages where torch does not: a fresh 400 MB costs 50 ms instead of 200. It begins on a
+    line of the cache, so that whole lines can be written without having been read.
     """
     if like.device.type != "cpu" or like.dtype not in (torch.float32, torch.float64):
         return like.new_empty(shape)
-    return torch.from_numpy(np.empty(shape, np.float64 if like.dtype == torch.float64 else np.float32))
+    numbers = np.empty(math.prod(shape) + LINE, np.float64 if like.dtype == torch.float64 else np.float32)
+    start = -(numbers.ctypes.data // numbers.itemsize) % LINE
+    return torch.from_numpy(numbers[start : start + math.prod(shape)].reshape(shape))
 
 
 def cores() -> int:

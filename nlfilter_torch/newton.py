@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nlfilter_torch import native
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 from nlfilter_torch.thin import gather, spread
@@ -118,6 +119,12 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
 
 def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
     """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
+    if native.suits(factor, diagonal):
+        halves = (total / 2).to(factor)
+        pairs = [
+            native.sweep(*image, SMALLEST_AFFINITY, LARGEST) for image in zip(factor, diagonal, halves, strict=True)
+        ]
+        return torch.stack([d for d, _ in pairs]), reduce_sum(torch.stack([m for _, m in pairs]).unsqueeze(2), shard)
     scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
     row = total.to(factor)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):

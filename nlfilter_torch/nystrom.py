@@ -11,6 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch import native
 from nlfilter_torch.blocks import buffered_blocks, large_empty, strip_count, strips
 from nlfilter_torch.differentiation import once_differentiable, strips_of_gradient, write_columns
 
@@ -96,19 +97,8 @@ class _NystromFactor(torch.autograd.Function):
         batch, _, pixels = features.shape
         factor = large_empty((batch, landmarks.shape[2], pixels), features)
         norms = features.new_ones(batch, pixels)  # |u|^2
-        count = strip_count(batch, pixels, features.device)
-        affinity = Affinity(_repeat(landmarks, count), complete)
-        whitenings = _repeat(whitening, count)
-        parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
-        for block, (first, second) in buffered_blocks(columns_of, 2):
-            kernel, _ = affinity(parts[:, :, block], first)
-            columns = torch.bmm(whitenings, kernel, out=second)  # into a buffer: rows of the factor are far apart
-            if complete:
-                norm = torch.sum(torch.square(columns, out=first), 1, out=norms_of[:, block])
-                # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
-                if features.device.type != "cpu" or norm.max().item() > 1.0:
-                    columns.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
-            columns_of[:, :, block] = columns
+        fill = _fill_natively if native.suits(features, landmarks, whitening) else _fill
+        fill(features, landmarks, whitening, complete, factor, norms)
         diagonal, scale = (1.0 - norms).clamp_(min=0.0), norms.clamp_(min=1.0).rsqrt_()
         ctx.save_for_backward(features, landmarks, whitening, factor, scale)
         ctx.complete = complete
@@ -146,6 +136,40 @@ class _NystromFactor(torch.autograd.Function):
         if count > 1:
             grad_landmarks, grad_whitening = grad_landmarks.sum(0, keepdim=True), grad_whitening.sum(0, keepdim=True)
         return grad_features, grad_landmarks.to(landmarks), grad_whitening.to(whitening), None
+
+
+def _fill(
+    features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool, factor: Tensor, norms: Tensor
+) -> None:
+    """Write the columns to ``factor`` and, of a completed kernel, what they measured before to ``norms``."""
+    batch, pixels = norms.shape
+    count = strip_count(batch, pixels, features.device)
+    affinity = Affinity(_repeat(landmarks, count), complete)
+    whitenings = _repeat(whitening, count)
+    parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
+    for block, (first, second) in buffered_blocks(columns_of, 2):
+        kernel, _ = affinity(parts[:, :, block], first)
+        columns = torch.bmm(whitenings, kernel, out=second)  # into a buffer: rows of the factor are far apart
+        if complete:
+            norm = torch.sum(torch.square(columns, out=first), 1, out=norms_of[:, block])
+            # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
+            if features.device.type != "cpu" or norm.max().item() > 1.0:
+                columns.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
+        columns_of[:, :, block] = columns
+
+
+def _fill_natively(
+    features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool, factor: Tensor, norms: Tensor
+) -> None:
+    """:func:`_fill` by the kernel in C, image by image."""
+    affinity = Affinity(landmarks, complete)
+    for image, columns in enumerate(factor):
+        norm = native.columns(
+            features[image], affinity.centre[image, :, 0], affinity.rows[image], whitening[image], affinity.floor,
+            limited=complete, out=columns,
+        )  # fmt: skip
+        if complete:
+            norms[image] = norm
 
 
 def _repeat(matrices: Tensor, count: int) -> Tensor:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nlfilter_torch import native
 from nlfilter_torch.blocks import buffered_blocks, strip_count, strips
 from nlfilter_torch.checks import check_image, check_same_size
 from nlfilter_torch.differentiation import once_differentiable
@@ -188,8 +189,8 @@ def compute_spectrum(
     remainder = None if diagonal is None else scaling.square() * diagonal
     # F F^T and F diag(r) F^T, (B, J, M, M)
     recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else _sum_grams  # transforms of torch.func know no such class
-    grams = reduce_sum(sums(factor, scaling, remainder), shard)
+    sums = _Grams.apply if recorded else sum_grams  # transforms of torch.func know no such class
+    grams = reduce_sum(sums(factor, scaling, remainder, 1 if remainder is None else 2), shard)
     pairs = RitzPairs.of_sums(grams, factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
@@ -216,31 +217,35 @@ def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tens
     return root, (projected + projected.mT) / 2, kept.sum(1)
 
 
-def _sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None) -> Tensor:
-    """``F F^T`` and, given r, ``F diag(r) F^T`` for F = factor diag(d), block by block.
+def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
+    """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64, block by block.
 
-    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small.
+    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small. Of r
+    there is no need for one sum.
     """
+    weights = scaling if remainder is None else remainder
+    if native.suits(factor, scaling, weights):
+        return torch.stack([native.grams(*image, count) for image in zip(factor, scaling, weights, strict=True)])
     batch, marks, pixels = factor.shape
-    count = strip_count(batch, pixels, factor.device)
-    factor, scaling = strips(factor, count), strips(scaling.unsqueeze(1), count)
-    remainder = None if remainder is None else strips(remainder.unsqueeze(1), count)
-    total = factor.new_zeros(len(factor), 1 if remainder is None else 2, marks, marks, dtype=torch.float64)
+    parts = strip_count(batch, pixels, factor.device)
+    factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), weights.unsqueeze(1)))
+    total = factor.new_zeros(len(factor), count, marks, marks, dtype=torch.float64)
     for block, (rows, weighted) in buffered_blocks(factor, 2):
-        torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
-        total[:, 0] += rows @ rows.mT
-        if remainder is not None:
-            total[:, 1] += torch.mul(rows, remainder[:, :, block], out=weighted) @ rows.mT
-    return total.sum(0, keepdim=True) if count > 1 else total
+        left = torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
+        for j in range(count):
+            if j:
+                left = torch.mul(left, weights[:, :, block], out=weighted)
+            total[:, j] += left @ rows.mT
+    return total.sum(0, keepdim=True) if parts > 1 else total
 
 
 class _Grams(torch.autograd.Function):
-    """:func:`_sum_grams` with a gradient that keeps none of its blocks."""
+    """:func:`sum_grams` with a gradient that keeps none of its blocks."""
 
     @staticmethod
-    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None) -> Tensor:
+    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
         ctx.save_for_backward(factor, scaling, remainder)
-        return _sum_grams(factor, scaling, remainder)
+        return sum_grams(factor, scaling, remainder, count)
 
     @staticmethod
     @once_differentiable
@@ -259,4 +264,4 @@ class _Grams(torch.autograd.Function):
                 pulled.addcmul_(weighted, remainder[:, None, block])
             grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
             grad_factor[:, :, block] = pulled.mul_(d)
-        return grad_factor, grad_scaling, grad_remainder
+        return grad_factor, grad_scaling, grad_remainder, None

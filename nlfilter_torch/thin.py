@@ -8,15 +8,19 @@ the same products run on all cores.
 import torch
 from torch import Tensor
 
+from nlfilter_torch import native
 from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.sharding import Shard, reduce_sum
 
+FEW = range(2, 9)  # rows for which the kernels in C are the quickest; a single one waits for memory in either way
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
 MOST_GATHERED = 24
 
 
 def spread(rows: Tensor, factor: Tensor) -> Tensor:
     """``rows @ factor``, (B, R, N), of rows (B, R, M) and a factor (B, M, N)."""
+    if native.suits(rows, factor) and rows.shape[1] in FEW:
+        return _whole([native.spread(*image) for image in zip(rows, factor, strict=True)])
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
         return rows @ factor
     if rows.shape[1] == 1:
@@ -55,12 +59,20 @@ def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor
     Returns:
         (B, M, C) in float64. Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
     """
+    if native.suits(factor, images) and images.shape[1] in FEW:
+        sums = [native.gather(*image).mT for image in zip(images, factor, strict=True)]
+        return reduce_sum(_whole(sums), shard)
     batch, marks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
     total = factor.new_zeros(batch, marks, images.shape[1], dtype=torch.float64)
     for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
         total = total + gather(part, rows).mT
     return reduce_sum(total, shard)
+
+
+def _whole(images: list[Tensor]) -> Tensor:
+    """A batch of its images."""
+    return images[0].unsqueeze(0) if len(images) == 1 else torch.stack(images)
 
 
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:

@@ -154,7 +154,9 @@ def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"nlfilter-torch {nlfilter_torch.__version__}\n"
+    assert capsys.readouterr().out in [
+        f"nlfilter-torch {nlfilter_torch.__version__}, kernels in C: {name}\n" for name in ("none", "AVX2", "AVX-512")
+    ]
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

@@ -1,4 +1,4 @@
-"""The least that an operator's matrix products cost on this machine, measured beside it.
+"""The least that an operator's matrix products cost with torch on this machine, measured beside it.
 
 Three products cannot be avoided on the way from features (D, N) to a spectrum: landmarks (M, D) with features, the
 whitening (M, M) of the affinities, and the Gram matrix of the factor (M, N): N x D x M and twice N x M x M. Balancing
@@ -9,7 +9,9 @@ floor is not slow by a clumsy choice:
   results never leave the cache;
 - a read as ``factor.sum()``, as ``factor @ vector`` and as ``vector @ factor``.
 
-The exponential, the features, the landmarks, the writing of the factor and the memory for it are not in the floor.
+The kernels in C (:mod:`nlfilter_torch.native`) know that the whitening is a triangle and form half of its product, so
+that the operator may be quicker than this. The exponential, the features, the landmarks, the writing of the factor and
+the memory for it are not in the floor.
 """
 
 from collections.abc import Mapping

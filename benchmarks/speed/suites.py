@@ -16,6 +16,7 @@ from nlfilter_torch import (
     PolynomialSliders,
     detail_layers,
     estimate_bandwidth,
+    native,
     polynomial_filter,
     spectral_filter,
 )
@@ -44,6 +45,20 @@ def backward_call(case: Case) -> Call:
     return lambda: torch.autograd.grad(filtered, [image, *layer.parameters()], incoming, retain_graph=True)
 
 
+def without_kernels(call: Call) -> Call:
+    """The same by torch alone, as it is where no C compiler was at hand."""
+
+    def slower() -> None:
+        level = native.level
+        native.level = 0
+        try:
+            call()
+        finally:
+            native.level = level
+
+    return slower
+
+
 def main_case(plan: Plan) -> Iterator[Record]:
     """The main operator, the sliders over it and the peers, all taking turns on one image."""
     case = plan.case()
@@ -58,6 +73,7 @@ def main_case(plan: Plan) -> Iterator[Record]:
 
     calls: dict[str, Call] = {
         "operator": discard(case.operator, image),
+        "operator, without the kernels in C": without_kernels(discard(case.operator, image)),
         "spectrum": discard(operator.spectrum),
         "detail_layers": discard(detail_layers, operator, image),
         "new alpha, operator held": discard(polynomial_filter, operator, image, torch.tensor(ALPHA)),

@@ -6,7 +6,7 @@ from typing import Annotated, TextIO
 
 import typer
 
-from nlfilter_torch import __version__
+from nlfilter_torch import __version__, native
 from nlfilter_torch.cli.abstract import abstract
 from nlfilter_torch.cli.app import app as app_verb
 from nlfilter_torch.cli.apply import apply
@@ -48,14 +48,20 @@ app.command()(demo)
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"{NAME} {__version__}")
+        typer.echo(f"{NAME} {__version__}, kernels in C: {native.LEVELS[native.level]}")
         raise typer.Exit
 
 
 @app.callback()
 def _common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+        bool,
+        typer.Option(
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Print the version, and whether compiled kernels are at work.",
+        ),
     ] = False,
 ) -> None:
     """Edit photographs with a filter that treats similar spots alike wherever they are.

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.newton import LARGEST, scaling_from_moment
 from nlfilter_torch.sinkhorn import balance
-from nlfilter_torch.spectrum import whiten_gram
+from nlfilter_torch.spectrum import sum_grams, whiten_gram
 from nlfilter_torch.thin import moment
 
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
@@ -64,7 +63,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
             remainder = scaling * (scaling * block.diagonal)
             sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
             weights = scaling * (block.weights / (1 + remainder)).sqrt()
-            jacobian += _grams(block.factor, weights, remainder, 1)[:, 0]
+            jacobian += sum_grams(block.factor, weights, remainder, 1)[:, 0]
         step = torch.cholesky_solve(sums - total, torch.linalg.cholesky_ex(jacobian).L)
         total = total + step
         change = float(step.norm() / total.norm())
@@ -111,7 +110,7 @@ def sum_up(blocks: Pass, total: Tensor, order: int) -> Sums:
     for block in blocks():
         scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor))
         remainder = scaling * (scaling * block.diagonal)
-        grams = grams + _grams(block.factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
+        grams = grams + sum_grams(block.factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
         powers = [(scaling * block.weights).unsqueeze(1) * block.image]
         for _ in range(order - 1):
             powers.append(remainder.unsqueeze(1) * powers[-1])
@@ -119,17 +118,3 @@ def sum_up(blocks: Pass, total: Tensor, order: int) -> Sums:
         moments = moments + sums.unflatten(2, (order, -1)).transpose(1, 2)
         dtype = block.factor.dtype
     return Sums(grams, moments, dtype)
-
-
-def _grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
-    """``F diag(r^j) F^T`` for F = factor diag(scaling) and j < count, (1, J, M, M) in float64."""
-    batch, marks, pixels = factor.shape
-    total = factor.new_zeros(batch, count, marks, marks, dtype=torch.float64)
-    for part in pixel_blocks(pixels, batch, factor.device):
-        rows = factor[:, :, part] * scaling[:, None, part]
-        weighted = rows
-        for j in range(count):
-            total[:, j] += weighted @ rows.mT
-            if j + 1 < count:
-                weighted = weighted * remainder[:, None, part]
-    return total

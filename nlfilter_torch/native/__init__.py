@@ -1,0 +1,161 @@
+"""Kernels in C for what filters on processors spend their time in; without them torch does the same, more slowly.
+
+They are compiled when the package is installed (``hatch_build.py``), for x86-64, where there is a C compiler. Nothing
+is compiled or looked for later. They take single precision only and know no derivatives: callers ask :func:`suits`.
+"""
+
+import ctypes
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from nlfilter_torch.checks import is_transformed
+
+SMALL = 1 << 18  # numbers of a factor below which a second thread takes longer to start than it saves
+LEVELS = ("none", "AVX2", "AVX-512")
+
+_POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
+
+
+def _load() -> ctypes.CDLL | None:
+    """The compiled library, if the installation has one."""
+    path = Path(__file__).with_name("kernels.so")
+    if not path.exists():
+        return None
+    library = ctypes.CDLL(str(path))
+    shared = [_INT, _INT, _LONG]  # instruction set, threads, pixels
+    library.nlfilter_columns.argtypes = [
+        *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
+    ]  # fmt: skip
+    library.nlfilter_spread.argtypes = [*shared, _LONG, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _LONG]
+    library.nlfilter_gather.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, _POINTER, _LONG, _POINTER]
+    library.nlfilter_sweep.argtypes = [
+        *shared, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _FLOAT, _FLOAT, _POINTER, _POINTER,
+    ]  # fmt: skip
+    library.nlfilter_grams.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3]
+    return library
+
+
+_library = _load()
+level: int = _library.nlfilter_level() if _library else 0  # of LEVELS, what this processor and installation can do
+
+
+def suits(*tensors: Tensor) -> bool:
+    """Whether the kernels can work on such tensors: plain ones in float32 on the processor, without derivatives."""
+    if not level or torch.compiler.is_compiling():
+        return False
+    return all(
+        type(tensor) in (Tensor, torch.nn.Parameter)
+        and tensor.dtype == torch.float32
+        and tensor.device.type == "cpu"
+        and not is_transformed(tensor)
+        and not (tensor.requires_grad and torch.is_grad_enabled())
+        and not tensor.is_neg()
+        and forward_ad.unpack_dual(tensor).tangent is None
+        for tensor in tensors
+    )
+
+
+def columns(
+    features: Tensor, centre: Tensor, landmarks: Tensor, whitening: Tensor, floor: float, limited: bool, out: Tensor
+) -> Tensor:
+    """Columns of the Nystrom factor of one image, written to ``out``.
+
+    Args:
+        features: (D, N).
+        centre: (D,), taken from them.
+        landmarks: (M, D + 2), of which the product with (x, 1, |x|^2) is the logarithm, to base 2, of the affinity.
+        whitening: (M, M).
+        floor: the least logarithm.
+        limited: whether columns are shortened to norm 1.
+        out: (M, N).
+
+    Returns:
+        The squared norms of the columns before they were shortened, (N,).
+    """
+    features = _by_rows(features)
+    size, pixels = features.shape
+    norms = features.new_empty(pixels)
+    centre, landmarks, whitening = centre.contiguous(), landmarks.contiguous(), whitening.contiguous()
+    _call(
+        "columns", out, size, len(out), features.data_ptr(), features.stride(0), centre.data_ptr(),
+        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, out.data_ptr(), out.stride(0), norms.data_ptr(),
+    )  # fmt: skip
+    return norms
+
+
+def spread(rows: Tensor, factor: Tensor) -> Tensor:
+    """``rows @ factor``, (R, N), of rows (R, M) and a factor (M, N)."""
+    rows, factor = rows.contiguous(), _by_rows(factor)
+    out = factor.new_empty(len(rows), factor.shape[1])
+    _call(
+        "spread", factor, len(factor), len(rows), rows.data_ptr(), factor.data_ptr(), factor.stride(0),
+        out.data_ptr(), out.stride(0),
+    )  # fmt: skip
+    return out
+
+
+def gather(images: Tensor, factor: Tensor) -> Tensor:
+    """``images @ factor^T``, (R, M) in float64, of images (R, N) and a factor (M, N)."""
+    images, factor = _by_rows(images), _by_rows(factor)
+    out = factor.new_empty(len(images), len(factor), dtype=torch.float64)
+    _call(
+        "gather", factor, len(factor), len(images), images.data_ptr(), images.stride(0), factor.data_ptr(),
+        factor.stride(0), out.data_ptr(),
+    )  # fmt: skip
+    return out
+
+
+def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, least: float, most: float) -> tuple[Tensor, Tensor]:
+    """The scaling d of every pixel of one image for a guess at its moment, and the moment that it has.
+
+    Args:
+        factor: (M, N).
+        diagonal: (N,).
+        half: of the guess t, (M,).
+        least: of half of u . t.
+        most: of d.
+
+    Returns:
+        d (N,), and factor @ d (M,) in float64.
+    """
+    factor, diagonal, half = _by_rows(factor), diagonal.contiguous(), half.contiguous()
+    scaling = torch.empty_like(diagonal)
+    moment = factor.new_empty(len(factor), dtype=torch.float64)
+    _call(
+        "sweep", factor, len(factor), half.data_ptr(), factor.data_ptr(), factor.stride(0), diagonal.data_ptr(), least,
+        most, scaling.data_ptr(), moment.data_ptr(),
+    )  # fmt: skip
+    return scaling, moment
+
+
+def grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
+    """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (count, M, M) in float64.
+
+    Args:
+        factor: (M, N).
+        scaling: d, (N,).
+        remainder: r, (N,).
+        count: of the powers.
+    """
+    factor, scaling, remainder = _by_rows(factor), scaling.contiguous(), remainder.contiguous()
+    out = factor.new_empty(count, len(factor), len(factor), dtype=torch.float64)
+    _call(
+        "grams", factor, len(factor), count, factor.data_ptr(), factor.stride(0), scaling.data_ptr(),
+        remainder.data_ptr(), out.data_ptr(),
+    )  # fmt: skip
+    return out
+
+
+def _by_rows(matrix: Tensor) -> Tensor:
+    """The matrix with each of its rows in one piece, however far they are apart."""
+    return matrix if matrix.stride(1) == 1 else matrix.contiguous()
+
+
+def _call(name: str, factor: Tensor, *arguments: int | float) -> None:
+    """Run a kernel on all pixels of a factor (M, N), on as many threads as torch would."""
+    threads = 1 if factor.numel() < SMALL else torch.get_num_threads()
+    if getattr(_library, f"nlfilter_{name}")(level, threads, factor.shape[1], *arguments):
+        raise MemoryError("no memory is left for the buffers of a few rows; make the image smaller")

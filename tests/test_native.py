@@ -1,0 +1,254 @@
+"""The kernels in C compute what torch does without them, whatever the sizes, the threads and the instruction set."""
+
+import platform
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hatch_build import FOLDER, CompiledKernels
+from nlfilter_torch import native, newton, nonlocal_operator, nystrom
+from nlfilter_torch.nystrom import nystrom_factor, whitener
+from nlfilter_torch.spectrum import sum_grams
+from nlfilter_torch.thin import moment, spread
+from tests import reference
+
+LEVELS = [pytest.param(level, id=name) for level, name in enumerate(native.LEVELS) if 0 < level <= native.level]
+POSSIBLE = platform.machine() == "x86_64" and sys.platform != "win32" and shutil.which("cc") is not None
+
+pytestmark = pytest.mark.skipif(not native.level, reason="this installation or processor has no kernels in C")
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(params=LEVELS)
+def level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(native, "level", request.param)
+    return int(request.param)
+
+
+@pytest.fixture
+def threads():
+    """Sets the number of threads; it is put back after the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def by_torch(monkeypatch: pytest.MonkeyPatch, function: Any, *arguments: Any) -> Any:
+    with monkeypatch.context() as context:
+        context.setattr(native, "level", 0)
+        return function(*arguments)
+
+
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize("pixels", [1, 7, 31, 64, 65, 1000, 8256, 20_011])
+@pytest.mark.parametrize(("size", "marks"), [(1, 1), (9, 2), (25, 5), (27, 6), (3, 100)])
+def test_columns(
+    level: int, completion: Any, pixels: int, size: int, marks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    z = random(2, size, marks, seed=1)
+    x = random(2, size, pixels) * 0.7
+    x[:, :, : min(pixels, marks)] = z[:, :, : min(pixels, marks)]  # columns that rounding may make longer than 1
+    arguments = (x, z, whitener(z), completion)
+    found = nystrom_factor(*arguments)
+    expected = nystrom_factor(*(part.double() for part in arguments[:3]), completion)
+    plain = by_torch(monkeypatch, nystrom_factor, *arguments)
+    for native_part, torch_part, exact in zip(found, plain, expected, strict=True):
+        error, usual = (native_part - exact).abs().max(), (torch_part - exact).abs().max()
+        assert error <= 2 * usual + 2e-6, (error, usual)
+    assert (found[0].square().sum(1) <= 1 + 1e-5).all() or completion == "none"
+
+
+def test_columns_of_a_whitening_without_a_triangle(level: int) -> None:
+    x, z, whitening = random(1, 4, 500), random(1, 4, 11, seed=1), random(1, 11, 11, seed=2) / 20
+    expected = nystrom_factor(x.double(), z.double(), whitening.double(), "none")[0]
+    torch.testing.assert_close(nystrom_factor(x, z, whitening, "none")[0], expected.float(), atol=1e-6, rtol=0)
+
+
+def test_far_features_meet_the_floor_and_nan_is_not_hidden(level: int) -> None:
+    z = random(1, 3, 8)
+    x = random(1, 3, 200, seed=1)
+    x[:, :, 50] = 1e30  # its squared norm overflows
+    x[:, 1, 60] = torch.nan
+    factor, diagonal = nystrom_factor(x, z, whitener(z), "diagonal")
+    assert factor[..., 50].abs().max() < 1e-12
+    assert diagonal[0, 50] == 1
+    assert factor[..., 60].isnan().all()
+    assert diagonal[0, 60].isnan()
+    rest = torch.arange(200) != 60
+    assert factor[..., rest].isfinite().all()
+
+
+@pytest.mark.parametrize("pixels", [1, 7, 255, 8256, 40_000])
+@pytest.mark.parametrize("marks", [1, 3, 50, 900])
+def test_sweep(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    factor = random(2, marks, pixels).abs()
+    factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
+    diagonal = 1 - factor.square().sum(1).clamp(max=1)
+    total = random(2, marks, 1, seed=1).abs().double() * pixels**0.5
+    arguments = (factor, diagonal, total, None)
+    exact = newton._sweep(*(part.double() for part in arguments[:3]), None)
+    found = newton._sweep(*arguments)
+    plain = by_torch(monkeypatch, newton._sweep, *arguments)
+    torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
+    error, usual = (found[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
+    assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("pixels", [1, 9, 63, 4128, 4129, 30_001])
+@pytest.mark.parametrize("rows", [2, 3, 8])
+@pytest.mark.parametrize("marks", [1, 2, 3, 5, 100])
+def test_products_with_few_rows(level: int, batch: int, pixels: int, rows: int, marks: int) -> None:
+    factor, vectors, images = random(batch, marks, pixels), random(batch, rows, marks), random(batch, rows, pixels)
+    image = (vectors.double() @ factor.double()).float()
+    torch.testing.assert_close(spread(vectors, factor), image, atol=1e-5, rtol=1e-6)
+    found = moment(factor, images)
+    assert found.dtype == torch.float64
+    size = (factor.double().abs() @ images.double().mT.abs()) * 1e-6
+    assert ((found - factor.double() @ images.double().mT).abs() <= size).all()
+
+
+@pytest.mark.parametrize("pixels", [1, 17, 1024, 1025, 9000])
+@pytest.mark.parametrize("marks", [1, 3, 6, 7, 50, 400])
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_grams(level: int, pixels: int, marks: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    factor, scaling, remainder = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, pixels).sigmoid()
+    found = sum_grams(factor, scaling, remainder, count)
+    plain = by_torch(monkeypatch, sum_grams, factor, scaling, remainder, count)
+    scaled = (factor * scaling.unsqueeze(1)).double()
+    for j in range(count):
+        exact = (scaled * remainder.double().unsqueeze(1) ** j) @ scaled.mT
+        size = exact.diagonal(dim1=1, dim2=2).amax() * 3e-7
+        assert (found[:, j] - exact).abs().max() <= size
+        assert (plain[:, j] - exact).abs().max() <= 10 * size
+    assert torch.equal(found, found.mT)
+
+
+def test_tensors_of_any_layout(level: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    factor, vectors, images = random(1, 300, 6).mT, random(1, 6, 3).mT, random(1, 300, 3).mT
+    torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
+    torch.testing.assert_close(moment(factor, images), factor.double() @ images.double().mT, atol=1e-4, rtol=0)
+    torch.testing.assert_close(spread(vectors, factor[..., 5:205:2]), vectors @ factor[..., 5:205:2])
+    z, x, diagonal = random(1, 7, 4).mT, random(1, 300, 4).mT, random(1, 600)[:, ::2].sigmoid()
+    arguments = (x, z, whitener(z), "diagonal")
+    torch.testing.assert_close(nystrom_factor(*arguments), by_torch(monkeypatch, nystrom_factor, *arguments))
+    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, None)
+    found, expected = newton._sweep(*arguments), by_torch(monkeypatch, newton._sweep, *arguments)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
+    guide = random(1, 1, 150, 131).sigmoid()
+    features = random(1, 4, 60_000)
+    marks = features[:, :, ::1000]
+
+    def results() -> list[Tensor]:
+        factor, diagonal = nystrom_factor(features, marks, whitener(marks), "diagonal")
+        scaling, found = newton._sweep(factor, diagonal, factor.double().sum(2, keepdim=True), None)
+        return [factor, scaling, found, sum_grams(factor, scaling, diagonal, 2)]
+
+    threads(1)
+    alone, operator = results(), nonlocal_operator(guide, num_landmarks=30)
+    threads(count)
+    for one, many, again in zip(alone, results(), results(), strict=True):
+        torch.testing.assert_close(one, many, rtol=1e-5, atol=1e-6)  # sums are cut elsewhere
+        assert torch.equal(many, again)
+    torch.testing.assert_close(nonlocal_operator(guide, num_landmarks=30).scaling, operator.scaling)
+
+
+def test_an_operator_is_that_of_the_dense_reference(level: int) -> None:
+    image = random(1, 1, 24, 31).sigmoid()
+    operator = nonlocal_operator(image, photometric_bandwidth=0.4, num_landmarks=24 * 31, completion="diagonal")
+    exact = torch.from_numpy(reference.filter_matrix(image[0, 0].double().numpy(), 5, 0.4))
+    torch.testing.assert_close(operator.to_dense()[0].double(), exact, atol=2e-5, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script")  # torch's own way to forward derivatives
+def test_whom_they_suit() -> None:
+    plain = random(1, 3, 4)
+    assert native.suits(plain, plain.mT)
+    assert native.suits(torch.nn.Parameter(plain).detach())
+    assert not native.suits(plain, plain.double())
+    assert not native.suits(plain.half())
+    assert not native.suits(plain.to("meta"))
+    assert not native.suits(plain.clone().requires_grad_())
+    with torch.no_grad():
+        assert native.suits(plain.clone().requires_grad_())
+    mapped = []
+    torch.vmap(lambda part: (mapped.append(native.suits(part)), part)[1])(plain)
+    assert mapped == [False]
+    with torch.autograd.forward_ad.dual_level():
+        assert not native.suits(torch.autograd.forward_ad.make_dual(plain, plain))
+    assert not native.suits(torch.imag(torch.complex(plain, plain).conj()))
+
+
+def test_without_memory_for_its_buffers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Exhausted:
+        def nlfilter_columns(self, *_: Any) -> int:
+            return -1
+
+    monkeypatch.setattr(native, "_library", Exhausted())
+    x = random(1, 2, 9)
+    with pytest.raises(MemoryError, match="make the image smaller"):
+        nystrom_factor(x, x[:, :, :3], whitener(x[:, :, :3]), "diagonal")
+
+
+class Application:
+    """What the builder shows to the one who installs."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def display_warning(self, text: str) -> None:
+        self.shown.append(text)
+
+    display_info = display_warning
+
+
+def install(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    shutil.copytree(Path(native.__file__).parent, folder / FOLDER, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    application = Application()
+    hook = CompiledKernels(str(folder), {}, None, None, str(folder), "wheel", application)
+    build_data: dict[str, Any] = {"artifacts": [], "pure_python": True}
+    hook.initialize("standard", build_data)
+    return build_data, application.shown
+
+
+@pytest.mark.skipif(not POSSIBLE, reason="there is no C compiler")
+def test_installing_compiles(tmp_path: Path) -> None:
+    build_data, shown = install(tmp_path)
+    assert not shown
+    assert (tmp_path / FOLDER / "kernels.so").stat().st_size > 10_000
+    assert build_data["artifacts"] == ["nlfilter_torch/native/kernels.so"]
+    assert build_data["tag"].startswith("py3-none-")
+    assert not build_data["pure_python"]
+
+
+@pytest.mark.skipif(not POSSIBLE, reason="there is no C compiler")
+@pytest.mark.parametrize("compiler", ["no-such-compiler", "false"])
+def test_installing_goes_on_without_a_compiler(compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", compiler)
+    build_data, shown = install(tmp_path)
+    assert len(shown) == 1
+    assert "more slowly" in shown[0]
+    assert build_data == {"artifacts": [], "pure_python": True}
+    assert not list((tmp_path / FOLDER).glob("kernels.[!ch]*"))
+
+
+def test_without_the_library_torch_does_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(native, "__file__", str(tmp_path / "__init__.py"))
+    assert native._load() is None
+    image = random(1, 1, 20, 20).sigmoid()
+    with_kernels = nonlocal_operator(image, num_landmarks=20).matmul(image)
+    without = by_torch(monkeypatch, lambda: nonlocal_operator(image, num_landmarks=20).matmul(image))
+    torch.testing.assert_close(with_kernels, without, atol=1e-4, rtol=0)
+    assert nystrom.native is native
