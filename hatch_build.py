@@ -20,7 +20,7 @@ class CompiledKernels(BuildHookInterface):
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile with ``CC`` or ``cc``; called before files are collected."""
-        if platform.machine().lower() not in ("x86_64", "amd64") or sys.platform == "win32":
+        if platform.machine() != "x86_64" or sys.platform != "linux":
             self.app.display_info("nlfilter-torch: no kernels in C for this processor or system; torch does their work")
             return
         folder = Path(self.root) / FOLDER

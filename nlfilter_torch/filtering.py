@@ -176,6 +176,8 @@ def spectral_filter(
         batch, marks, _ = spectrum.factor.shape
         shape = (max(batch, image.shape[0]), image.shape[1], marks)
         check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
+    if isinstance(residual, int | float) and residual == 0:
+        return spectrum.synthesize(response, coefficients).to(image.dtype)
     rho = torch.as_tensor(replicate(residual, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still one pass down and one up.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)

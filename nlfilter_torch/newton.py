@@ -83,7 +83,7 @@ class Sample:
 
 def row_residual(factor: Tensor, scaling: Tensor, error: Tensor, shard: Shard | None = None) -> Tensor:
     """Largest ``|d u . error|``, (B,): what row sums lack where d is the root for a total that is off by ``error``."""
-    return reduce_max((scaling * spread(error.to(factor).mT, factor).squeeze(1)).abs().amax(1), shard)
+    return reduce_max(spread(error.to(factor).mT, factor, scaling).abs().amax((1, 2)), shard)
 
 
 def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None) -> tuple[Sample, Tensor]:

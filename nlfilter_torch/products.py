@@ -41,7 +41,8 @@ def _powers(
     images, moments = [image], []
     for _ in range(order):
         moments.append(moment(factor, scaling * images[-1], shard).to(factor))
-        images.append(scaling * spread(moments[-1].mT, factor) + remainder * images[-1])
+        smooth = spread(moments[-1].mT, factor, scaling.squeeze(1))
+        images.append(torch.addcmul(smooth, remainder, images[-1]))
     return images, moments
 
 

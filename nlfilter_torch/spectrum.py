@@ -157,7 +157,7 @@ class Spectrum(RitzPairs):
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
         weighted = total @ self.gain(response).mT
-        planes = self.scaling.unsqueeze(1) * spread(weighted.to(self.factor), self.factor)
+        planes = spread(weighted.to(self.factor), self.factor, self.scaling)
         return unfold_batch(planes.unsqueeze(1), count, self.size)[:, 0]
 
     def _constant_first(self, vectors: Tensor) -> Tensor:

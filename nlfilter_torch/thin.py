@@ -12,15 +12,18 @@ from nlfilter_torch import native
 from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.sharding import Shard, reduce_sum
 
-FEW = range(2, 9)  # rows for which the kernels in C are the quickest; a single one waits for memory in either way
+FEW = range(1, 9)  # rows for which the kernels in C are the quickest
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
 MOST_GATHERED = 24
 
 
-def spread(rows: Tensor, factor: Tensor) -> Tensor:
-    """``rows @ factor``, (B, R, N), of rows (B, R, M) and a factor (B, M, N)."""
-    if native.suits(rows, factor) and rows.shape[1] in FEW:
-        return _whole([native.spread(*image) for image in zip(rows, factor, strict=True)])
+def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
+    """``rows @ factor diag(scaling)``, (B, R, N), of rows (B, R, M), a factor (B, M, N), perhaps a scaling (B, N)."""
+    tensors = (rows, factor) if scaling is None else (rows, factor, scaling)
+    if native.suits(*tensors) and rows.shape[1] in FEW:
+        return _whole([native.spread(*image) for image in zip(*tensors, strict=True)])
+    if scaling is not None:
+        return spread(rows, factor) * scaling.unsqueeze(1)
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
         return rows @ factor
     if rows.shape[1] == 1:

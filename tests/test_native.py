@@ -18,7 +18,7 @@ from nlfilter_torch.thin import moment, spread
 from tests import reference
 
 LEVELS = [pytest.param(level, id=name) for level, name in enumerate(native.LEVELS) if 0 < level <= native.level]
-POSSIBLE = platform.machine() == "x86_64" and sys.platform != "win32" and shutil.which("cc") is not None
+POSSIBLE = platform.machine() == "x86_64" and sys.platform == "linux" and shutil.which("cc") is not None
 
 pytestmark = pytest.mark.skipif(not native.level, reason="this installation or processor has no kernels in C")
 
@@ -104,12 +104,14 @@ def test_sweep(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("pixels", [1, 9, 63, 4128, 4129, 30_001])
-@pytest.mark.parametrize("rows", [2, 3, 8])
+@pytest.mark.parametrize("rows", [1, 2, 3, 8])
 @pytest.mark.parametrize("marks", [1, 2, 3, 5, 100])
 def test_products_with_few_rows(level: int, batch: int, pixels: int, rows: int, marks: int) -> None:
     factor, vectors, images = random(batch, marks, pixels), random(batch, rows, marks), random(batch, rows, pixels)
     image = (vectors.double() @ factor.double()).float()
     torch.testing.assert_close(spread(vectors, factor), image, atol=1e-5, rtol=1e-6)
+    scaling = random(batch, pixels, seed=1)
+    torch.testing.assert_close(spread(vectors, factor, scaling), image * scaling.unsqueeze(1), atol=1e-4, rtol=1e-6)
     found = moment(factor, images)
     assert found.dtype == torch.float64
     size = (factor.double().abs() @ images.double().mT.abs()) * 1e-6
@@ -145,6 +147,16 @@ def test_tensors_of_any_layout(level: int, monkeypatch: pytest.MonkeyPatch) -> N
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
 
+@pytest.fixture(params=[False, True], ids=["threads of torch", "threads of its own"])
+def own_threads(request: pytest.FixtureRequest):
+    openmp = native._openmp()
+    assert openmp is not None, "torch's OpenMP library was not found"
+    native.share_threads(native._library, None if request.param else openmp)
+    yield
+    native.share_threads(native._library, openmp)
+
+
+@pytest.mark.usefixtures("own_threads")
 @pytest.mark.parametrize("count", [2, 3, 7])
 def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
     guide = random(1, 1, 150, 131).sigmoid()

@@ -27,6 +27,8 @@ def test_equal_to_matrix_products(pixels: int, rows: int, batch: int):
     factor, vectors, images = random(batch, 6, pixels), random(batch, rows, 6), random(batch, rows, pixels)
     gathered = images @ factor.mT
     torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
+    scaling = random(batch, pixels)
+    torch.testing.assert_close(spread(vectors, factor, scaling), vectors @ factor * scaling.unsqueeze(1))
     torch.testing.assert_close(gather(images, factor), gathered)
     torch.testing.assert_close(moment(factor, images), gathered.mT)
 

@@ -6,6 +6,7 @@ is compiled or looked for later. They take single precision only and know no der
 
 import ctypes
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch.autograd import forward_ad
 
 from nlfilter_torch.checks import is_transformed
 
-SMALL = 1 << 18  # numbers of a factor below which a second thread takes longer to start than it saves
+SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
 LEVELS = ("none", "AVX2", "AVX-512")
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
@@ -26,16 +27,33 @@ def _load() -> ctypes.CDLL | None:
         return None
     library = ctypes.CDLL(str(path))
     shared = [_INT, _INT, _LONG]  # instruction set, threads, pixels
+    share_threads(library, _openmp())
     library.nlfilter_columns.argtypes = [
         *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
     ]  # fmt: skip
-    library.nlfilter_spread.argtypes = [*shared, _LONG, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _LONG]
+    library.nlfilter_spread.argtypes = [*shared, _LONG, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _POINTER, _LONG]
     library.nlfilter_gather.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, _POINTER, _LONG, _POINTER]
     library.nlfilter_sweep.argtypes = [
         *shared, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _FLOAT, _FLOAT, _POINTER, _POINTER,
     ]  # fmt: skip
     library.nlfilter_grams.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3]
     return library
+
+
+def _openmp() -> Any:
+    """The function by which torch's own OpenMP library runs another on its threads; None where it is not found."""
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    loaded = {line.split(maxsplit=5)[5] for line in maps if "omp" in line.rpartition("/")[2] and ".so" in line}
+    for path in sorted(loaded, key=lambda path: "torch" not in path):  # other packages may have brought their own
+        function = getattr(ctypes.CDLL(path), "GOMP_parallel", None)
+        if function is not None:
+            return function
+    return None
+
+
+def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
+    """Let kernels run on the threads of an OpenMP library, by its ``GOMP_parallel``; None has them start their own."""
+    library.nlfilter_share_threads(ctypes.cast(openmp, _POINTER) if openmp is not None else None)
 
 
 _library = _load()
@@ -86,13 +104,14 @@ def columns(
     return norms
 
 
-def spread(rows: Tensor, factor: Tensor) -> Tensor:
-    """``rows @ factor``, (R, N), of rows (R, M) and a factor (M, N)."""
+def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
+    """``rows @ factor``, (R, N), of rows (R, M) and a factor (M, N), times a scaling (N,)."""
     rows, factor = rows.contiguous(), _by_rows(factor)
+    scaling = None if scaling is None else scaling.contiguous()
     out = factor.new_empty(len(rows), factor.shape[1])
     _call(
         "spread", factor, len(factor), len(rows), rows.data_ptr(), factor.data_ptr(), factor.stride(0),
-        out.data_ptr(), out.stride(0),
+        None if scaling is None else scaling.data_ptr(), out.data_ptr(), out.stride(0),
     )  # fmt: skip
     return out
 
@@ -154,7 +173,7 @@ def _by_rows(matrix: Tensor) -> Tensor:
     return matrix if matrix.stride(1) == 1 else matrix.contiguous()
 
 
-def _call(name: str, factor: Tensor, *arguments: int | float) -> None:
+def _call(name: str, factor: Tensor, *arguments: int | float | None) -> None:
     """Run a kernel on all pixels of a factor (M, N), on as many threads as torch would."""
     threads = 1 if factor.numel() < SMALL else torch.get_num_threads()
     if getattr(_library, f"nlfilter_{name}")(level, threads, factor.shape[1], *arguments):

@@ -4,7 +4,7 @@
  * here in the registers: distances, exponentials, whitening by a matrix of which the empty triangle is skipped, norms.
  * Products with a few rows read the factor once, as fast as memory allows.
  *
- * Work is divided into chunks of pixels. What is written for each pixel does not depend on the number of threads; sums
+ * Work is divided into pieces of the image. What is written for each pixel does not depend on the number of threads; sums
  * over pixels are added in float64, for each thread and then in the order of these. Functions return 0, or -1 where
  * memory is short. */
 
@@ -15,8 +15,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define CHUNK 8256   /* pixels that a thread takes at a time: four times in a block of blocks.py, whole tiles */
-#define STRETCH 4128 /* pixels of a row that stay in the first cache */
+#define CHUNK 33024  /* pixels that a thread takes at a time, at most: memory likes long pieces of each row */
+#define LINE 64      /* a piece is a multiple of so many: a tile, and more than a line of the cache */
 #define NEAR 196608  /* numbers of the factor that stay in the second cache */
 #define MOST_ROWS 6
 #define MOST_PIXELS 64
@@ -42,6 +42,7 @@ struct thin {
     const float *rows, *images; /* (R, M), (R, N) */
     float *out;                 /* (R, N) */
     long images_stride, out_stride;
+    const float *scaling;  /* d, (N), or none */
     const float *diagonal; /* c, (N) */
     float least, most;     /* of half of u . t, and of d */
 };
@@ -100,30 +101,46 @@ struct work {
     void (*run)(struct work *, long piece, long first, long last);
     const void *task;
     int level;
-    long pixels, length; /* of a piece, whole chunks */
+    long pixels, length; /* of a piece */
     double *totals;      /* of each piece, where there is something to add up */
     atomic_long next;
     atomic_int failed;
 };
 
-static void *labour(void *argument)
+static void labour(void *argument)
 {
     struct work *work = argument;
     for (;;) {
         const long piece = atomic_fetch_add(&work->next, 1), first = piece * work->length, last = first + work->length;
         if (first >= work->pixels)
-            return NULL;
+            return;
         work->run(work, piece, first, last < work->pixels ? last : work->pixels);
     }
 }
 
-static int divide(struct work *work, int threads)
+/* OpenMP's way to run a function on its threads, once it is known where: torch waits for work with the same threads,
+ * awake for a while, so that others would find no free core. */
+static void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
+
+void nlfilter_share_threads(void *gomp_parallel) { parallel = gomp_parallel; }
+
+static void *help(void *work)
+{
+    labour(work);
+    return NULL;
+}
+
+static int start(struct work *work, int threads)
 {
     pthread_t helpers[MOST_THREADS];
     const long pieces = padded(work->pixels, work->length) / work->length;
     int started = 0;
+    if (parallel && threads > 1 && pieces > 1) {
+        parallel(labour, work, threads, 0);
+        return work->failed ? -1 : 0;
+    }
     while (started < threads - 1 && started < pieces - 1 && started < MOST_THREADS)
-        if (pthread_create(&helpers[started++], NULL, labour, work)) {
+        if (pthread_create(&helpers[started++], NULL, help, work)) {
             started--; /* no more threads to be had: those that there are do it */
             break;
         }
@@ -133,20 +150,22 @@ static int divide(struct work *work, int threads)
     return work->failed ? -1 : 0;
 }
 
-static int do_chunks(struct work *work, int threads)
+/* Four pieces for each thread, since one may be slower than another, or as many as memory likes. */
+static int divide(struct work *work, int threads, long most)
 {
-    work->length = CHUNK;
-    return divide(work, threads);
+    const long length = padded((work->pixels + 4 * threads - 1) / (4 * threads), LINE);
+    work->length = length < most ? length : most;
+    return start(work, threads);
 }
 
-/* Run work that adds up `sums` numbers: one piece for each thread, and their totals in order, so that runs agree. */
+/* Run work that adds up `sums` numbers, and add those of the pieces in their order, so that runs agree. */
 static int add_up(struct work *work, int threads, long sums, double *out)
 {
-    work->length = padded((work->pixels + threads - 1) / threads, CHUNK);
-    work->totals = calloc(threads * sums, sizeof(double));
-    int status = work->totals ? divide(work, threads) : -1;
+    const long pieces = 4 * threads;
+    work->totals = calloc(pieces * sums, sizeof(double));
+    int status = work->totals ? divide(work, threads, work->pixels) : -1;
     memset(out, 0, sums * sizeof(double));
-    for (long i = 0; !status && i < threads * sums; i++)
+    for (long i = 0; !status && i < pieces * sums; i++)
         out[i % sums] += work->totals[i];
     free(work->totals);
     return status;
@@ -200,7 +219,7 @@ int nlfilter_columns(int level, int threads, long pixels, long size, long marks,
     float *whiteners = depths ? pack(whitening, marks, marks, rows, depths) : NULL;
     struct work work = {run_columns, &task, level, pixels, 0, NULL, 0, !packed || !whiteners};
     task.landmarks = packed, task.whitening = whiteners, task.depths = depths;
-    int status = work.failed ? -1 : do_chunks(&work, threads);
+    int status = work.failed ? -1 : divide(&work, threads, CHUNK);
     free(depths);
     free(packed);
     free(whiteners);
@@ -214,11 +233,11 @@ static void run_spread(struct work *work, long piece, long first, long last)
 }
 
 int nlfilter_spread(int level, int threads, long pixels, long marks, long count, const float *rows, const float *factor,
-                    long factor_stride, float *out, long out_stride)
+                    long factor_stride, const float *scaling, float *out, long out_stride)
 {
-    struct thin task = {factor, factor_stride, marks, count, rows, NULL, out, 0, out_stride, NULL, 0, 0};
+    struct thin task = {factor, factor_stride, marks, count, rows, NULL, out, 0, out_stride, scaling, NULL, 0, 0};
     struct work work = {run_spread, &task, level, pixels, 0, NULL, 0, 0};
-    return do_chunks(&work, threads);
+    return divide(&work, threads, CHUNK);
 }
 
 static void run_gather(struct work *work, long piece, long first, long last)
@@ -230,7 +249,7 @@ static void run_gather(struct work *work, long piece, long first, long last)
 int nlfilter_gather(int level, int threads, long pixels, long marks, long count, const float *images,
                     long images_stride, const float *factor, long factor_stride, double *out)
 {
-    struct thin task = {factor, factor_stride, marks, count, NULL, images, NULL, images_stride, 0, NULL, 0, 0};
+    struct thin task = {factor, factor_stride, marks, count, NULL, images, NULL, images_stride, 0, NULL, NULL, 0, 0};
     struct work work = {run_gather, &task, level, pixels, 0, NULL, 0, 0};
     return add_up(&work, threads, count * marks, out);
 }
@@ -244,7 +263,7 @@ static void run_sweep(struct work *work, long piece, long first, long last)
 int nlfilter_sweep(int level, int threads, long pixels, long marks, const float *half, const float *factor,
                    long factor_stride, const float *diagonal, float least, float most, float *scaling, double *out)
 {
-    struct thin task = {factor, factor_stride, marks, 1, half, scaling, scaling, 0, 0, diagonal, least, most};
+    struct thin task = {factor, factor_stride, marks, 1, half, scaling, scaling, 0, 0, NULL, diagonal, least, most};
     struct work work = {run_sweep, &task, level, pixels, 0, NULL, 0, 0};
     return add_up(&work, threads, marks, out);
 }

@@ -129,52 +129,53 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
     __builtin_ia32_sfence(); /* what was streamed is there before anyone is told so */
 }
 
-/* Where four rows of the factor begin; past the last one it is that once more. Four at a time keep memory busy. */
-INLINE void NAME(adjacent)(const struct thin *task, long row, long start, const float *found[4])
+/* Where the next rows of the factor begin; past the last one it is that once more. Several at a time keep memory busy. */
+INLINE void NAME(adjacent)(const struct thin *task, long row, long start, int count, const float **found)
 {
-    for (long k = 0; k < 4; k++)
+    for (long k = 0; k < count; k++)
         found[k] = task->factor + (row + k < task->marks ? row + k : task->marks - 1) * task->factor_stride + start;
 }
 
-/* out = rows (R, M) times the columns of the factor from first to last. */
+/* out = rows (R, M) times the columns of the factor from first to last, not more than a chunk of them, times scaling. */
 static TARGET void NAME(spread)(const struct thin *task, long first, long last)
 {
-    const long marks = task->marks;
-    for (long start = first; start < last; start += STRETCH) {
-        const long width = last - start < STRETCH ? last - start : STRETCH;
-        const long whole = width / LANES * LANES;
-        for (long r = 0; r < task->count; r++)
-            memset(task->out + r * task->out_stride + start, 0, width * sizeof(float));
-        for (long m = 0; m < marks; m += 4) {
-            const float *column[4];
-            NAME(adjacent)(task, m, start, column);
-            for (long r = 0; r < task->count; r++) {
-                float *sums = task->out + r * task->out_stride + start, weight[4];
-                for (long k = 0; k < 4; k++)
-                    weight[k] = m + k < marks ? task->rows[r * marks + m + k] : 0.0f;
-                for (long i = 0; i < whole; i += LANES)
-                    *(FLOATS *)(sums + i) += weight[0] * *(const FLOATS *)(column[0] + i) +
-                                             weight[1] * *(const FLOATS *)(column[1] + i) +
-                                             weight[2] * *(const FLOATS *)(column[2] + i) +
-                                             weight[3] * *(const FLOATS *)(column[3] + i);
-                for (long i = whole; i < width; i++)
-                    sums[i] += weight[0] * column[0][i] + weight[1] * column[1][i] + weight[2] * column[2][i] +
-                               weight[3] * column[3][i];
+    const long marks = task->marks, width = last - first, whole = width / LANES * LANES;
+    for (long r = 0; r < task->count; r++)
+        memset(task->out + r * task->out_stride + first, 0, width * sizeof(float));
+    for (long m = 0; m < marks; m += 8) {
+        const float *column[8];
+        NAME(adjacent)(task, m, first, 8, column);
+        for (long r = 0; r < task->count; r++) {
+            float *sums = task->out + r * task->out_stride + first, weight[8];
+            for (long k = 0; k < 8; k++)
+                weight[k] = m + k < marks ? task->rows[r * marks + m + k] : 0.0f;
+            for (long i = 0; i < whole; i += LANES) {
+                FLOATS sum = *(const FLOATS *)(sums + i);
+#pragma GCC unroll 8
+                for (int k = 0; k < 8; k++)
+                    sum += weight[k] * *(const FLOATS *)(column[k] + i);
+                *(FLOATS *)(sums + i) = sum;
             }
+            for (long i = whole; i < width; i++)
+                for (long k = 0; k < 8; k++)
+                    sums[i] += weight[k] * column[k][i];
         }
     }
+    for (long r = 0; task->scaling && r < task->count; r++)
+        for (long i = first; i < last; i++)
+            task->out[r * task->out_stride + i] *= task->scaling[i];
 }
 
 /* totals (R, M) += images (R, N) times the factor's transpose, over the pixels from first to last. */
 static TARGET void NAME(gather)(const struct thin *task, long first, long last, double *totals)
 {
     const long marks = task->marks;
-    for (long start = first; start < last; start += STRETCH) {
-        const long width = last - start < STRETCH ? last - start : STRETCH;
+    for (long start = first; start < last; start += CHUNK) {
+        const long width = last - start < CHUNK ? last - start : CHUNK;
         const long whole = width / (2 * LANES) * (2 * LANES);
         for (long m = 0; m < marks; m += 4) {
             const float *column[4];
-            NAME(adjacent)(task, m, start, column);
+            NAME(adjacent)(task, m, start, 4, column);
             for (long r = 0; r < task->count; r++) {
                 const float *image = task->images + r * task->images_stride + start;
                 FLOATS sums[4][2] = {{{0}}};
