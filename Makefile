@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
 PINS := pyproject.toml constraints.txt
-COMPILED := hatch_build.py $(wildcard nlfilter_torch/native/kernels.[ch])
+COMPILED := hatch_build.py $(wildcard nlfilter_torch/native/*.[ch])
 
 .DELETE_ON_ERROR:
 .PHONY: demo test lint types chromium bench bench-quick train pictures figures notebooks docs clean

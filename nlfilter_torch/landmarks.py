@@ -5,6 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch import native
 from nlfilter_torch.sharding import Shard, from_first, gather_columns
 
 Sampling = Literal["kmeans", "uniform", "random"]
@@ -109,6 +110,8 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """
     batch, _, size = points.shape
     draws = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points)
+    if native.suits(points, draws):
+        return native.pivots(points, draws, EXPLAINED)
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
     residual = torch.ones_like(norms)
     columns = points.new_zeros(batch, count, size)
@@ -130,6 +133,8 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 def _lloyd(points: Tensor, start: Tensor) -> Tensor:
     """Assignment (B, S) of points (B, D, S) to clusters, by Lloyd from the centres ``start`` (B, D, M)."""
+    if native.suits(points, start):
+        return native.lloyd(points, start, ITERATIONS)
     together = max(1, CACHED_SCORES // (points.shape[2] * start.shape[2]))
     if points.device.type == "cpu" and together < points.shape[0]:
         return torch.cat([_lloyd(*part) for part in zip(points.split(together), start.split(together), strict=True)])

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch import chebyshev, newton
+from nlfilter_torch import chebyshev, native, newton
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
@@ -110,6 +110,9 @@ def _weighted_moment(factor: Tensor, weighted: Tensor, shard: Shard | None, tota
     """``factor @ weighted`` (B, M, 1) in float64; given a ``total``, ``factor @ (weighted * (factor^T total))``."""
     found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
     row = None if total is None else total.to(factor).mT
+    if row is not None and native.suits(factor, weighted):
+        images = zip(factor, weighted, row[:, 0], strict=True)
+        return reduce_sum(torch.stack([native.weigh(*image) for image in images]).unsqueeze(2), shard)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns, part = factor[:, :, block], weighted[:, block]
         if row is not None:

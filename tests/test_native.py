@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from hatch_build import FOLDER, CompiledKernels
-from nlfilter_torch import native, newton, nonlocal_operator, nystrom
+from nlfilter_torch import landmarks, native, newton, nonlocal_operator, nystrom
 from nlfilter_torch.nystrom import nystrom_factor, whitener
+from nlfilter_torch.sinkhorn import _weighted_moment
 from nlfilter_torch.spectrum import sum_grams
 from nlfilter_torch.thin import moment, spread
 from tests import reference
@@ -116,6 +117,34 @@ def test_products_with_few_rows(level: int, batch: int, pixels: int, rows: int, 
     assert found.dtype == torch.float64
     size = (factor.double().abs() @ images.double().mT.abs()) * 1e-6
     assert ((found - factor.double() @ images.double().mT).abs() <= size).all()
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("size", [1, 25])
+@pytest.mark.parametrize(("points", "marks"), [(1, 1), (5, 3), (64, 7), (65, 20), (1000, 50)])
+def test_landmarks(level: int, batch: int, size: int, points: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud = random(batch, size, points)
+    pivots = landmarks._pivots(cloud, marks, torch.Generator().manual_seed(1))
+    expected = by_torch(monkeypatch, landmarks._pivots, cloud, marks, torch.Generator().manual_seed(1))
+    assert torch.equal(pivots[:, :6], expected[:, :6])  # on a line that few explain all, and the rest is rounding
+    assert torch.equal(pivots, expected) or size == 1
+    start = cloud.gather(2, pivots.unsqueeze(1).expand(-1, size, -1))
+    start[:, :, marks // 2 :] += 100.0 * (marks > 3)  # far from all points, where they stay
+    assignment = landmarks._lloyd(cloud, start)
+    assert (assignment == by_torch(monkeypatch, landmarks._lloyd, cloud, start)).float().mean() > 0.95
+    assert assignment.max() < max(marks // 2, 1) or marks <= 3
+
+
+@pytest.mark.parametrize("pixels", [1, 300, 40_000])
+@pytest.mark.parametrize("marks", [1, 3, 50, 900])
+def test_weighted_moments(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), None, random(2, marks, 1).double()
+    factor, weights, total = (t.double() for t in arguments if t is not None)
+    exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
+    found = _weighted_moment(*arguments)
+    plain = by_torch(monkeypatch, _weighted_moment, *arguments)
+    error, usual = (found - exact).abs().max(), (plain - exact).abs().max()
+    assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
 
 
 @pytest.mark.parametrize("pixels", [1, 17, 1024, 1025, 9000])

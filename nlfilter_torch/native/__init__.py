@@ -36,6 +36,9 @@ def _load() -> ctypes.CDLL | None:
     library.nlfilter_sweep.argtypes = [
         *shared, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _FLOAT, _FLOAT, _POINTER, _POINTER,
     ]  # fmt: skip
+    library.nlfilter_weigh.argtypes = [*shared, _LONG, _POINTER, _POINTER, _LONG, *[_POINTER] * 3]
+    library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, *[_POINTER] * 3]
+    library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3]
     return library
 
@@ -150,6 +153,44 @@ def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, least: float, most: fl
     return scaling, moment
 
 
+def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
+    """``factor diag(weights) factor^T vector``, (M,) in float64, of a factor (M, N), weights (N,) and a vector (M,)."""
+    factor, weights, vector = _by_rows(factor), weights.contiguous(), vector.contiguous()
+    between = torch.empty_like(weights)
+    out = factor.new_empty(len(factor), dtype=torch.float64)
+    _call(
+        "weigh", factor, len(factor), vector.data_ptr(), factor.data_ptr(), factor.stride(0), weights.data_ptr(),
+        between.data_ptr(), out.data_ptr(),
+    )  # fmt: skip
+    return out
+
+
+def lloyd(points: Tensor, start: Tensor, iterations: int) -> Tensor:
+    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M)."""
+    points, start = points.contiguous(), start.contiguous()
+    batch, size, count = points.shape
+    nearest = torch.empty(batch, count, dtype=torch.int32)
+    arguments = (size, count, start.shape[2], iterations, points.data_ptr(), start.data_ptr(), nearest.data_ptr())
+    _run("lloyd", torch.get_num_threads(), batch, *arguments)
+    return nearest.long()
+
+
+def pivots(points: Tensor, draws: Tensor, explained: float) -> Tensor:
+    """Pivots (B, M) of a random Cholesky decomposition of the affinities of points (B, D, S).
+
+    Args:
+        points: (B, D, S).
+        draws: (M,) in [0, 1), what each pivot is drawn by.
+        explained: a residual of the unit diagonal that counts as none.
+    """
+    points, draws = points.contiguous(), draws.contiguous()
+    batch, size, count = points.shape
+    found = torch.empty(batch, len(draws), dtype=torch.long)
+    arguments = (size, count, len(draws), explained, points.data_ptr(), draws.data_ptr(), found.data_ptr())
+    _run("pivots", torch.get_num_threads(), batch, *arguments)
+    return found
+
+
 def grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
     """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (count, M, M) in float64.
 
@@ -175,6 +216,9 @@ def _by_rows(matrix: Tensor) -> Tensor:
 
 def _call(name: str, factor: Tensor, *arguments: int | float | None) -> None:
     """Run a kernel on all pixels of a factor (M, N), on as many threads as torch would."""
-    threads = 1 if factor.numel() < SMALL else torch.get_num_threads()
-    if getattr(_library, f"nlfilter_{name}")(level, threads, factor.shape[1], *arguments):
+    _run(name, 1 if factor.numel() < SMALL else torch.get_num_threads(), factor.shape[1], *arguments)
+
+
+def _run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:
+    if getattr(_library, f"nlfilter_{name}")(level, threads, count, *arguments):
         raise MemoryError("no memory is left for the buffers of a few rows; make the image smaller")

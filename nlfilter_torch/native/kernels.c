@@ -53,6 +53,19 @@ struct grams {
     long rows, step; /* of a tile of F: with rows of zeros below it, and so many pixels that it stays in the cache */
 };
 
+struct pivots {
+    const float *points, *draws; /* (B, D, S), (M) */
+    long *pivots;                /* (B, M) */
+    long size, used, count, marks; /* S, and S in whole lines */
+    float explained;
+};
+
+struct lloyd {
+    const float *points, *start; /* (B, D, S), (B, D, M) */
+    int *nearest;                /* (B, S) */
+    long size, count, marks, iterations;
+};
+
 #define NAME(x) x##_avx512
 #define TARGET __attribute__((target("avx512f")))
 #define LANES 16
@@ -82,10 +95,12 @@ static const struct {
     void (*gather)(const struct thin *, long, long, double *);
     void (*sweep)(const struct thin *, long, long, double *);
     void (*grams)(const struct grams *, long, long, float *, double *);
+    void (*assign)(const struct lloyd *, const float *, const float *, float *, int *, float *);
+    void (*pivots)(const struct pivots *, const float *, long *, float *);
 } SETS[] = {
     {0},
-    {3, columns_avx2, spread_avx2, gather_avx2, sweep_avx2, grams_avx2},
-    {6, columns_avx512, spread_avx512, gather_avx512, sweep_avx512, grams_avx512},
+    {3, columns_avx2, spread_avx2, gather_avx2, sweep_avx2, grams_avx2, assign_avx2, pivots_avx2},
+    {6, columns_avx512, spread_avx512, gather_avx512, sweep_avx512, grams_avx512, assign_avx512, pivots_avx512},
 };
 
 /* The best instruction set that this processor has: 2 for AVX-512, 1 for AVX2 with FMA, 0 for neither. */
@@ -96,80 +111,7 @@ int nlfilter_level(void)
     return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") ? 1 : 0;
 }
 
-/* Work on all pixels, piece by piece: whichever thread is free takes the next. */
-struct work {
-    void (*run)(struct work *, long piece, long first, long last);
-    const void *task;
-    int level;
-    long pixels, length; /* of a piece */
-    double *totals;      /* of each piece, where there is something to add up */
-    atomic_long next;
-    atomic_int failed;
-};
-
-static void labour(void *argument)
-{
-    struct work *work = argument;
-    for (;;) {
-        const long piece = atomic_fetch_add(&work->next, 1), first = piece * work->length, last = first + work->length;
-        if (first >= work->pixels)
-            return;
-        work->run(work, piece, first, last < work->pixels ? last : work->pixels);
-    }
-}
-
-/* OpenMP's way to run a function on its threads, once it is known where: torch waits for work with the same threads,
- * awake for a while, so that others would find no free core. */
-static void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
-
-void nlfilter_share_threads(void *gomp_parallel) { parallel = gomp_parallel; }
-
-static void *help(void *work)
-{
-    labour(work);
-    return NULL;
-}
-
-static int start(struct work *work, int threads)
-{
-    pthread_t helpers[MOST_THREADS];
-    const long pieces = padded(work->pixels, work->length) / work->length;
-    int started = 0;
-    if (parallel && threads > 1 && pieces > 1) {
-        parallel(labour, work, threads, 0);
-        return work->failed ? -1 : 0;
-    }
-    while (started < threads - 1 && started < pieces - 1 && started < MOST_THREADS)
-        if (pthread_create(&helpers[started++], NULL, help, work)) {
-            started--; /* no more threads to be had: those that there are do it */
-            break;
-        }
-    labour(work);
-    for (int i = 0; i < started; i++)
-        pthread_join(helpers[i], NULL);
-    return work->failed ? -1 : 0;
-}
-
-/* Four pieces for each thread, since one may be slower than another, or as many as memory likes. */
-static int divide(struct work *work, int threads, long most)
-{
-    const long length = padded((work->pixels + 4 * threads - 1) / (4 * threads), LINE);
-    work->length = length < most ? length : most;
-    return start(work, threads);
-}
-
-/* Run work that adds up `sums` numbers, and add those of the pieces in their order, so that runs agree. */
-static int add_up(struct work *work, int threads, long sums, double *out)
-{
-    const long pieces = 4 * threads;
-    work->totals = calloc(pieces * sums, sizeof(double));
-    int status = work->totals ? divide(work, threads, work->pixels) : -1;
-    memset(out, 0, sums * sizeof(double));
-    for (long i = 0; !status && i < pieces * sums; i++)
-        out[i % sums] += work->totals[i];
-    free(work->totals);
-    return status;
-}
+#include "threads.h"
 
 /* Rows of a matrix (count, depth) in blocks of `rows`, by columns; rows past the last are zero. */
 static float *pack(const float *matrix, long count, long depth, long rows, long *depths)
@@ -268,6 +210,15 @@ int nlfilter_sweep(int level, int threads, long pixels, long marks, const float 
     return add_up(&work, threads, marks, out);
 }
 
+/* out = factor diag(scaling) factor^T row; spread_out (N) is room for what lies between. */
+int nlfilter_weigh(int level, int threads, long pixels, long marks, const float *row, const float *factor,
+                   long factor_stride, const float *scaling, float *spread_out, double *out)
+{
+    struct thin task = {factor, factor_stride, marks, 1, row, spread_out, spread_out, 0, 0, scaling, NULL, 0, 0};
+    struct work work = {run_sweep, &task, level, pixels, 0, NULL, 0, 0};
+    return add_up(&work, threads, marks, out);
+}
+
 static void run_grams(struct work *work, long piece, long first, long last)
 {
     const struct grams *task = work->task;
@@ -293,4 +244,76 @@ int nlfilter_grams(int level, int threads, long pixels, long marks, long count, 
             for (long n = m + 1; n < marks; n++)
                 out[m * marks + n] = out[n * marks + m];
     return status;
+}
+
+/* Lloyd's iteration on one image; scratch holds packed centres, sums with sizes, and a tile. */
+static void cluster(const struct lloyd *task, int level, long image, float *scratch)
+{
+    const long size = task->size, count = task->count, marks = task->marks, rows = SETS[level].rows;
+    const float *points = task->points + image * size * count, *start = task->start + image * size * marks;
+    int *nearest = task->nearest + image * count;
+    float *centres = scratch, *sums = centres + padded(marks, rows) * (size + 1), *tile = sums + marks * (size + 1);
+    memset(sums, 0, marks * (size + 1) * sizeof(float));
+    for (long step = 0; step <= task->iterations; step++) {
+        for (long m = 0; m < padded(marks, rows); m++) {
+            float *target = centres + m / rows * rows * (size + 1) + m % rows, length = 0.0f;
+            const float *sum = sums + m * (size + 1);
+            for (long k = 0; k < size; k++) { /* a centre without points stays where it began */
+                const float value = m >= marks ? 0.0f : sum[size] ? sum[k] / sum[size] : start[k * marks + m];
+                target[k * rows] = value;
+                length += value * value;
+            }
+            target[size * rows] = m < marks ? -0.5f * length : -INFINITY;
+        }
+        memset(sums, 0, marks * (size + 1) * sizeof(float));
+        SETS[level].assign(task, points, centres, tile, nearest, sums);
+    }
+}
+
+static void run_lloyd(struct work *work, long piece, long first, long last)
+{
+    const struct lloyd *task = work->task;
+    size_t floats = (task->size + 1) * (2 * padded(task->marks, MOST_ROWS) + MOST_PIXELS);
+    float *scratch = aligned_alloc(64, padded(floats * sizeof(float), 64));
+    (void)piece;
+    if (!scratch)
+        work->failed = 1;
+    for (long image = first; scratch && image < last; image++)
+        cluster(task, work->level, image, scratch);
+    free(scratch);
+}
+
+int nlfilter_lloyd(int level, int threads, long images, long size, long count, long marks, long iterations,
+                   const float *points, const float *start, int *nearest)
+{
+    struct lloyd task = {points, start, nearest, size, count, marks, iterations};
+    struct work work = {run_lloyd, &task, level, images, 1, NULL, 0, 0};
+    return begin(&work, threads);
+}
+
+static void run_pivots(struct work *work, long piece, long first, long last)
+{
+    const struct pivots *task = work->task;
+    float *scratch = aligned_alloc(64, (task->marks + 2 + task->size) * task->count * sizeof(float));
+    float *points = scratch + (task->marks + 2) * task->count; /* with whole lines */
+    (void)piece;
+    if (!scratch)
+        work->failed = 1;
+    for (long image = first; scratch && image < last; image++) {
+        for (long k = 0; k < task->size; k++) {
+            const float *row = task->points + (image * task->size + k) * task->used;
+            memcpy(points + k * task->count, row, task->used * sizeof(float));
+            memset(points + k * task->count + task->used, 0, (task->count - task->used) * sizeof(float));
+        }
+        SETS[work->level].pivots(task, points, task->pivots + image * task->marks, scratch);
+    }
+    free(scratch);
+}
+
+int nlfilter_pivots(int level, int threads, long images, long size, long count, long marks, float explained,
+                    const float *points, const float *draws, long *pivots)
+{
+    struct pivots task = {points, draws, pivots, size, count, padded(count, LINE), marks, explained};
+    struct work work = {run_pivots, &task, level, images, 1, NULL, 0, 0};
+    return begin(&work, threads);
 }

@@ -1,0 +1,71 @@
+/* Features to columns of the Nystrom factor; nystrom.py says what they are. */
+
+/* The columns of the factor for the pixels from first to last: affinities, whitened, of norm at most 1 if asked. */
+static TARGET void NAME(columns)(const struct columns *task, long first, long last, float *scratch)
+{
+    const long size = task->size, marks = task->marks;
+    float *features = scratch, *affinities = features + (size + 2) * PIXELS;
+    float *edge = affinities + padded(marks, ROWS) * PIXELS; /* a row of a tile that the image ends in */
+    for (long start = first; start < last; start += PIXELS) {
+        const long width = last - start < PIXELS ? last - start : PIXELS;
+        FLOATS norm[VECTORS];
+        for (int v = 0; v < VECTORS; v++)
+            norm[v] = (FLOATS){0};
+        for (long k = 0; k < size; k++) {
+            const float *source = task->features + k * task->features_stride + start;
+            if (width < PIXELS) {
+                for (long i = 0; i < PIXELS; i++)
+                    edge[i] = i < width ? source[i] : task->centre[k];
+                source = edge;
+            }
+            for (int v = 0; v < VECTORS; v++) {
+                FLOATS centred = *(const FLOATS *)(source + v * LANES) - task->centre[k];
+                *(FLOATS *)(features + k * PIXELS + v * LANES) = centred;
+                norm[v] += centred * centred;
+            }
+        }
+        for (int v = 0; v < VECTORS; v++) {
+            *(FLOATS *)(features + size * PIXELS + v * LANES) = (FLOATS){0} + 1.0f;
+            *(FLOATS *)(features + (size + 1) * PIXELS + v * LANES) = norm[v];
+            norm[v] = (FLOATS){0};
+        }
+        for (long m = 0; m < marks; m += ROWS) {
+            FLOATS exponents[ROWS][VECTORS];
+            NAME(multiply)(task->landmarks + m * (size + 2), features, size + 2, exponents);
+            for (int r = 0; r < ROWS; r++)
+                for (int v = 0; v < VECTORS; v++)
+                    *(FLOATS *)(affinities + (m + r) * PIXELS + v * LANES) =
+                        NAME(exp2)(NAME(clamp)(exponents[r][v], task->floor, 0.0f));
+        }
+        const float *rows = task->whitening;
+        for (long m = 0, block = 0; m < marks; m += ROWS, block++) {
+            FLOATS whitened[ROWS][VECTORS];
+            NAME(multiply)(rows, affinities, task->depths[block], whitened);
+            rows += task->depths[block] * ROWS;
+            for (long r = 0; r < ROWS && m + r < marks; r++) {
+                float *target = task->factor + (m + r) * task->factor_stride + start;
+                float *found = width < PIXELS ? edge : target;
+                const int streamed = (uintptr_t)found % sizeof(FLOATS) == 0;
+                for (int v = 0; v < VECTORS; v++) {
+                    norm[v] += whitened[r][v] * whitened[r][v];
+                    if (streamed)
+                        STREAM(found + v * LANES, whitened[r][v]);
+                    else
+                        *(FLOATS *)(found + v * LANES) = whitened[r][v];
+                }
+                if (width < PIXELS)
+                    memcpy(target, edge, width * sizeof(float));
+            }
+        }
+        for (int v = 0; v < VECTORS; v++)
+            *(FLOATS *)(edge + v * LANES) = norm[v];
+        memcpy(task->norms + start, edge, width * sizeof(float));
+        for (long i = 0; task->limited && i < width; i++)
+            if (edge[i] > 1.0f) { /* by rounding alone, and seldom */
+                const float scale = 1.0f / sqrtf(edge[i]);
+                for (long m = 0; m < marks; m++)
+                    task->factor[m * task->factor_stride + start + i] *= scale;
+            }
+    }
+    __builtin_ia32_sfence(); /* what was streamed is there before anyone is told so */
+}

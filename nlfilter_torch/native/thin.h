@@ -1,0 +1,90 @@
+/* Products of the factor with a few rows, each reading it once; see thin.py, and newton.py for the sweep. */
+
+/* Where the next rows of the factor begin; past the last one it is that once more. Several at a time keep memory busy. */
+INLINE void NAME(adjacent)(const struct thin *task, long row, long start, int count, const float **found)
+{
+    for (long k = 0; k < count; k++)
+        found[k] = task->factor + (row + k < task->marks ? row + k : task->marks - 1) * task->factor_stride + start;
+}
+
+/* out = rows (R, M) times the columns of the factor from first to last, not more than a chunk of them, times scaling. */
+static TARGET void NAME(spread)(const struct thin *task, long first, long last)
+{
+    const long marks = task->marks, width = last - first, whole = width / LANES * LANES;
+    for (long r = 0; r < task->count; r++)
+        memset(task->out + r * task->out_stride + first, 0, width * sizeof(float));
+    for (long m = 0; m < marks; m += 8) {
+        const float *column[8];
+        NAME(adjacent)(task, m, first, 8, column);
+        for (long r = 0; r < task->count; r++) {
+            float *sums = task->out + r * task->out_stride + first, weight[8];
+            for (long k = 0; k < 8; k++)
+                weight[k] = m + k < marks ? task->rows[r * marks + m + k] : 0.0f;
+            for (long i = 0; i < whole; i += LANES) {
+                FLOATS sum = *(const FLOATS *)(sums + i);
+#pragma GCC unroll 8
+                for (int k = 0; k < 8; k++)
+                    sum += weight[k] * *(const FLOATS *)(column[k] + i);
+                *(FLOATS *)(sums + i) = sum;
+            }
+            for (long i = whole; i < width; i++)
+                for (long k = 0; k < 8; k++)
+                    sums[i] += weight[k] * column[k][i];
+        }
+    }
+    for (long r = 0; task->scaling && r < task->count; r++)
+        for (long i = first; i < last; i++)
+            task->out[r * task->out_stride + i] *= task->scaling[i];
+}
+
+/* totals (R, M) += images (R, N) times the factor's transpose, over the pixels from first to last. */
+static TARGET void NAME(gather)(const struct thin *task, long first, long last, double *totals)
+{
+    const long marks = task->marks;
+    for (long start = first; start < last; start += CHUNK) {
+        const long width = last - start < CHUNK ? last - start : CHUNK;
+        const long whole = width / (2 * LANES) * (2 * LANES);
+        for (long m = 0; m < marks; m += 4) {
+            const float *column[4];
+            NAME(adjacent)(task, m, start, 4, column);
+            for (long r = 0; r < task->count; r++) {
+                const float *image = task->images + r * task->images_stride + start;
+                FLOATS sums[4][2] = {{{0}}};
+                for (long i = 0; i < whole; i += 2 * LANES) {
+                    FLOATS left = *(const FLOATS *)(image + i), right = *(const FLOATS *)(image + i + LANES);
+#pragma GCC unroll 4
+                    for (int k = 0; k < 4; k++) {
+                        sums[k][0] += left * *(const FLOATS *)(column[k] + i);
+                        sums[k][1] += right * *(const FLOATS *)(column[k] + i + LANES);
+                    }
+                }
+                for (long k = 0; k < 4 && m + k < marks; k++) {
+                    FLOATS lanes = sums[k][0] + sums[k][1];
+                    float sum = 0.0f;
+                    for (int lane = 0; lane < LANES; lane++)
+                        sum += lanes[lane];
+                    for (long i = whole; i < width; i++)
+                        sum += image[i] * column[k][i];
+                    totals[r * marks + m + k] += sum;
+                }
+            }
+        }
+    }
+}
+
+/* out = the root d of d (u . 2 rows + c d) = 1 for the pixels from first to last, or without c a row spread and scaled as
+ * above, and totals += its moment, factor out. So few pixels at a time that their columns are near when it is formed. */
+static TARGET void NAME(sweep)(const struct thin *task, long first, long last, double *totals)
+{
+    const long most = NEAR / task->marks / 64 * 64, step = most < 256 ? 256 : most;
+    for (long start = first; start < last; start += step) {
+        const long end = last - start < step ? last : start + step;
+        NAME(spread)(task, start, end);
+        for (long i = start; task->diagonal && i < end; i++) {
+            const float half = task->out[i] < task->least ? task->least : task->out[i];
+            const float root = 1.0f / (sqrtf(half * half + task->diagonal[i]) + half);
+            task->out[i] = root > task->most ? task->most : root;
+        }
+        NAME(gather)(task, start, end, totals);
+    }
+}
