@@ -120,11 +120,9 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
 def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
     """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
     if native.suits(factor, diagonal):
-        halves = (total / 2).to(factor)
-        pairs = [
-            native.sweep(*image, SMALLEST_AFFINITY, LARGEST) for image in zip(factor, diagonal, halves, strict=True)
-        ]
-        return torch.stack([d for d, _ in pairs]), reduce_sum(torch.stack([m for _, m in pairs]).unsqueeze(2), shard)
+        half = (total / 2).squeeze(2).to(factor)
+        scaling, found = native.sweep(factor, diagonal, half, SMALLEST_AFFINITY, LARGEST)
+        return scaling, reduce_sum(found.unsqueeze(2), shard)
     scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
     row = total.to(factor)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):

@@ -111,8 +111,7 @@ def _weighted_moment(factor: Tensor, weighted: Tensor, shard: Shard | None, tota
     found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
     row = None if total is None else total.to(factor).mT
     if row is not None and native.suits(factor, weighted):
-        images = zip(factor, weighted, row[:, 0], strict=True)
-        return reduce_sum(torch.stack([native.weigh(*image) for image in images]).unsqueeze(2), shard)
+        return reduce_sum(native.weigh(factor, weighted, row[:, 0]).unsqueeze(2), shard)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns, part = factor[:, :, block], weighted[:, block]
         if row is not None:

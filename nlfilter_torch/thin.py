@@ -21,7 +21,7 @@ def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tenso
     """``rows @ factor diag(scaling)``, (B, R, N), of rows (B, R, M), a factor (B, M, N), perhaps a scaling (B, N)."""
     tensors = (rows, factor) if scaling is None else (rows, factor, scaling)
     if native.suits(*tensors) and rows.shape[1] in FEW:
-        return _whole([native.spread(*image) for image in zip(*tensors, strict=True)])
+        return native.spread(*tensors)
     if scaling is not None:
         return spread(rows, factor) * scaling.unsqueeze(1)
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
@@ -63,19 +63,13 @@ def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor
         (B, M, C) in float64. Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
     """
     if native.suits(factor, images) and images.shape[1] in FEW:
-        sums = [native.gather(*image).mT for image in zip(images, factor, strict=True)]
-        return reduce_sum(_whole(sums), shard)
+        return reduce_sum(native.gather(images, factor).mT, shard)
     batch, marks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
     total = factor.new_zeros(batch, marks, images.shape[1], dtype=torch.float64)
     for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
         total = total + gather(part, rows).mT
     return reduce_sum(total, shard)
-
-
-def _whole(images: list[Tensor]) -> Tensor:
-    """A batch of its images."""
-    return images[0].unsqueeze(0) if len(images) == 1 else torch.stack(images)
 
 
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:

@@ -26,17 +26,15 @@ def _load() -> ctypes.CDLL | None:
     if not path.exists():
         return None
     library = ctypes.CDLL(str(path))
-    shared = [_INT, _INT, _LONG]  # instruction set, threads, pixels
+    shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
     share_threads(library, _openmp())
     library.nlfilter_columns.argtypes = [
         *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
     ]  # fmt: skip
-    library.nlfilter_spread.argtypes = [*shared, _LONG, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _POINTER, _LONG]
-    library.nlfilter_gather.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, _POINTER, _LONG, _POINTER]
-    library.nlfilter_sweep.argtypes = [
-        *shared, _LONG, _POINTER, _POINTER, _LONG, _POINTER, _FLOAT, _FLOAT, _POINTER, _POINTER,
-    ]  # fmt: skip
-    library.nlfilter_weigh.argtypes = [*shared, _LONG, _POINTER, _POINTER, _LONG, *[_POINTER] * 3]
+    factor: list[Any] = [_LONG, _LONG, _POINTER, _LONG, _LONG]  # images, landmarks, (B, M, N) and its strides
+    library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
+    library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, _POINTER, _LONG, _LONG, _POINTER]
+    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _FLOAT, _POINTER, _POINTER]
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3]
@@ -96,73 +94,78 @@ def columns(
     Returns:
         The squared norms of the columns before they were shortened, (N,).
     """
-    features = _by_rows(features)
+    features = features if features.stride(1) == 1 else features.contiguous()
     size, pixels = features.shape
     norms = features.new_empty(pixels)
     centre, landmarks, whitening = centre.contiguous(), landmarks.contiguous(), whitening.contiguous()
-    _call(
-        "columns", out, size, len(out), features.data_ptr(), features.stride(0), centre.data_ptr(),
+    _run(
+        "columns", _threads(out), pixels, size, len(out), features.data_ptr(), features.stride(0), centre.data_ptr(),
         landmarks.data_ptr(), whitening.data_ptr(), floor, limited, out.data_ptr(), out.stride(0), norms.data_ptr(),
     )  # fmt: skip
     return norms
 
 
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
-    """``rows @ factor``, (R, N), of rows (R, M) and a factor (M, N), times a scaling (N,)."""
-    rows, factor = rows.contiguous(), _by_rows(factor)
-    scaling = None if scaling is None else scaling.contiguous()
-    out = factor.new_empty(len(rows), factor.shape[1])
+    """``rows @ factor``, (B, R, N), of rows (B, R, M) and a factor (B, M, N), times a scaling (B, N)."""
+    factor = _by_rows(factor)
+    batch, marks, pixels = factor.shape
+    rows = rows.expand(batch, -1, marks).contiguous()
+    scaling = None if scaling is None else scaling.expand(batch, pixels).contiguous()
+    out = factor.new_empty(batch, rows.shape[1], pixels)
     _call(
-        "spread", factor, len(factor), len(rows), rows.data_ptr(), factor.data_ptr(), factor.stride(0),
-        None if scaling is None else scaling.data_ptr(), out.data_ptr(), out.stride(0),
+        "spread", factor, rows.shape[1], rows.data_ptr(), None if scaling is None else scaling.data_ptr(),
+        out.data_ptr(),
     )  # fmt: skip
     return out
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
-    """``images @ factor^T``, (R, M) in float64, of images (R, N) and a factor (M, N)."""
-    images, factor = _by_rows(images), _by_rows(factor)
-    out = factor.new_empty(len(images), len(factor), dtype=torch.float64)
+    """``images @ factor^T``, (B, R, M) in float64, of images (B, R, N) and a factor (B, M, N)."""
+    factor = _by_rows(factor)
+    batch, marks, pixels = factor.shape
+    images = _by_rows(images.expand(batch, -1, pixels))
+    out = factor.new_empty(batch, images.shape[1], marks, dtype=torch.float64)
     _call(
-        "gather", factor, len(factor), len(images), images.data_ptr(), images.stride(0), factor.data_ptr(),
-        factor.stride(0), out.data_ptr(),
+        "gather", factor, images.shape[1], images.data_ptr(), images.stride(0), images.stride(1), out.data_ptr()
     )  # fmt: skip
     return out
 
 
 def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, least: float, most: float) -> tuple[Tensor, Tensor]:
-    """The scaling d of every pixel of one image for a guess at its moment, and the moment that it has.
+    """The scaling d of every pixel for a guess at its moment, and the moment that it has.
 
     Args:
-        factor: (M, N).
-        diagonal: (N,).
-        half: of the guess t, (M,).
+        factor: (B, M, N).
+        diagonal: (B, N).
+        half: of the guess t, (B, M).
         least: of half of u . t.
         most: of d.
 
     Returns:
-        d (N,), and factor @ d (M,) in float64.
+        d (B, N), and factor @ d (B, M) in float64.
     """
-    factor, diagonal, half = _by_rows(factor), diagonal.contiguous(), half.contiguous()
-    scaling = torch.empty_like(diagonal)
-    moment = factor.new_empty(len(factor), dtype=torch.float64)
-    _call(
-        "sweep", factor, len(factor), half.data_ptr(), factor.data_ptr(), factor.stride(0), diagonal.data_ptr(), least,
-        most, scaling.data_ptr(), moment.data_ptr(),
-    )  # fmt: skip
-    return scaling, moment
+    return _sweep(factor, half, None, diagonal, least, most)
 
 
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
-    """``factor diag(weights) factor^T vector``, (M,) in float64, of a factor (M, N), weights (N,) and a vector (M,)."""
-    factor, weights, vector = _by_rows(factor), weights.contiguous(), vector.contiguous()
-    between = torch.empty_like(weights)
-    out = factor.new_empty(len(factor), dtype=torch.float64)
+    """``factor diag(weights) factor^T vector``, (B, M) in float64, of a factor (B, M, N), (B, N) and (B, M)."""
+    return _sweep(factor, vector, weights, None, 0.0, 0.0)[1]
+
+
+def _sweep(
+    factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, least: float, most: float
+) -> tuple[Tensor, Tensor]:
+    factor = _by_rows(factor)
+    batch, marks, pixels = factor.shape
+    row = row.expand(batch, marks).contiguous()
+    scaling, diagonal = (t if t is None else t.expand(batch, pixels).contiguous() for t in (scaling, diagonal))
+    out = factor.new_empty(batch, pixels)
+    moment = factor.new_empty(batch, marks, dtype=torch.float64)
     _call(
-        "weigh", factor, len(factor), vector.data_ptr(), factor.data_ptr(), factor.stride(0), weights.data_ptr(),
-        between.data_ptr(), out.data_ptr(),
+        "sweep", factor, row.data_ptr(), *(t if t is None else t.data_ptr() for t in (scaling, diagonal)), least, most,
+        out.data_ptr(), moment.data_ptr(),
     )  # fmt: skip
-    return out
+    return out, moment
 
 
 def lloyd(points: Tensor, start: Tensor, iterations: int) -> Tensor:
@@ -200,23 +203,31 @@ def grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Ten
         remainder: r, (N,).
         count: of the powers.
     """
-    factor, scaling, remainder = _by_rows(factor), scaling.contiguous(), remainder.contiguous()
+    factor = factor if factor.stride(1) == 1 else factor.contiguous()
+    scaling, remainder = scaling.contiguous(), remainder.contiguous()
     out = factor.new_empty(count, len(factor), len(factor), dtype=torch.float64)
-    _call(
-        "grams", factor, len(factor), count, factor.data_ptr(), factor.stride(0), scaling.data_ptr(),
-        remainder.data_ptr(), out.data_ptr(),
+    _run(
+        "grams", _threads(factor), factor.shape[1], len(factor), count, factor.data_ptr(), factor.stride(0),
+        scaling.data_ptr(), remainder.data_ptr(), out.data_ptr(),
     )  # fmt: skip
     return out
 
 
-def _by_rows(matrix: Tensor) -> Tensor:
-    """The matrix with each of its rows in one piece, however far they are apart."""
-    return matrix if matrix.stride(1) == 1 else matrix.contiguous()
+def _by_rows(planes: Tensor) -> Tensor:
+    """Planes (B, R, N) with each of their rows in one piece, however far they are apart."""
+    return planes if planes.stride(2) == 1 else planes.contiguous()
+
+
+def _threads(factor: Tensor) -> int:
+    """As many as torch would use, but for small work."""
+    return 1 if factor.numel() < SMALL else torch.get_num_threads()
 
 
 def _call(name: str, factor: Tensor, *arguments: int | float | None) -> None:
-    """Run a kernel on all pixels of a factor (M, N), on as many threads as torch would."""
-    _run(name, 1 if factor.numel() < SMALL else torch.get_num_threads(), factor.shape[1], *arguments)
+    """Run a kernel on all pixels of a factor (B, M, N)."""
+    batch, marks, pixels = factor.shape
+    steps = (factor.data_ptr(), factor.stride(0), factor.stride(1))
+    _run(name, _threads(factor), pixels, batch, marks, *steps, *arguments)
 
 
 def _run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:

@@ -43,8 +43,9 @@ struct thin {
     float *out;                 /* (R, N) */
     long images_stride, out_stride;
     const float *scaling;  /* d, (N), or none */
-    const float *diagonal; /* c, (N) */
+    const float *diagonal; /* c, (N), or none */
     float least, most;     /* of half of u . t, and of d */
+    long factor_step, images_step, pixels; /* from one image of a batch to the next; everything else is contiguous */
 };
 
 struct grams {
@@ -136,12 +137,12 @@ static float *pack(const float *matrix, long count, long depth, long rows, long 
     return packed;
 }
 
-static void run_columns(struct work *work, long piece, long first, long last)
+static void run_columns(struct work *work, long image, long piece, long first, long last)
 {
     const struct columns *task = work->task;
     size_t floats = (task->size + 3 + padded(task->marks, MOST_ROWS)) * MOST_PIXELS;
     float *scratch = aligned_alloc(64, floats * sizeof(float));
-    (void)piece;
+    (void)image, (void)piece;
     if (scratch)
         SETS[work->level].columns(task, first, last, scratch);
     else
@@ -159,70 +160,86 @@ int nlfilter_columns(int level, int threads, long pixels, long size, long marks,
     long *depths = malloc(padded(marks, rows) / rows * sizeof(long));
     float *packed = pack(landmarks, marks, size + 2, rows, NULL);
     float *whiteners = depths ? pack(whitening, marks, marks, rows, depths) : NULL;
-    struct work work = {run_columns, &task, level, pixels, 0, NULL, 0, !packed || !whiteners};
+    struct work work = {.run = run_columns, .task = &task, .level = level, .images = 1, .pixels = pixels};
     task.landmarks = packed, task.whitening = whiteners, task.depths = depths;
-    int status = work.failed ? -1 : divide(&work, threads, CHUNK);
+    int status = packed && whiteners ? divide(&work, threads, CHUNK) : -1;
     free(depths);
     free(packed);
     free(whiteners);
     return status;
 }
 
-static void run_spread(struct work *work, long piece, long first, long last)
+/* What there is of a batch for one of its images. */
+static struct thin part(const struct work *work, long image)
 {
-    (void)piece;
-    SETS[work->level].spread(work->task, first, last);
+    struct thin task = *(const struct thin *)work->task;
+    task.factor += image * task.factor_step;
+    task.rows = task.rows ? task.rows + image * task.count * task.marks : NULL;
+    task.images = task.images ? task.images + image * task.images_step : NULL;
+    task.out = task.out ? task.out + image * task.count * task.pixels : NULL;
+    task.scaling = task.scaling ? task.scaling + image * task.pixels : NULL;
+    task.diagonal = task.diagonal ? task.diagonal + image * task.pixels : NULL;
+    return task;
 }
 
-int nlfilter_spread(int level, int threads, long pixels, long marks, long count, const float *rows, const float *factor,
-                    long factor_stride, const float *scaling, float *out, long out_stride)
+static void run_spread(struct work *work, long image, long piece, long first, long last)
 {
-    struct thin task = {factor, factor_stride, marks, count, rows, NULL, out, 0, out_stride, scaling, NULL, 0, 0};
-    struct work work = {run_spread, &task, level, pixels, 0, NULL, 0, 0};
+    const struct thin task = part(work, image);
+    (void)piece;
+    SETS[work->level].spread(&task, first, last);
+}
+
+int nlfilter_spread(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
+                    long factor_stride, long count, const float *rows, const float *scaling, float *out)
+{
+    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
+                        .count = count, .rows = rows, .scaling = scaling, .out = out, .out_stride = pixels,
+                        .pixels = pixels};
+    struct work work = {.run = run_spread, .task = &task, .level = level, .images = images, .pixels = pixels};
     return divide(&work, threads, CHUNK);
 }
 
-static void run_gather(struct work *work, long piece, long first, long last)
+static void run_gather(struct work *work, long image, long piece, long first, long last)
 {
-    const struct thin *task = work->task;
-    SETS[work->level].gather(task, first, last, work->totals + piece * task->count * task->marks);
+    const struct thin task = part(work, image);
+    SETS[work->level].gather(&task, first, last, work->totals + piece * task.count * task.marks);
 }
 
-int nlfilter_gather(int level, int threads, long pixels, long marks, long count, const float *images,
-                    long images_stride, const float *factor, long factor_stride, double *out)
+int nlfilter_gather(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
+                    long factor_stride, long count, const float *planes, long planes_step, long planes_stride,
+                    double *out)
 {
-    struct thin task = {factor, factor_stride, marks, count, NULL, images, NULL, images_stride, 0, NULL, NULL, 0, 0};
-    struct work work = {run_gather, &task, level, pixels, 0, NULL, 0, 0};
+    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
+                        .count = count, .images = planes, .images_step = planes_step, .images_stride = planes_stride,
+                        .pixels = pixels};
+    struct work work = {.run = run_gather, .task = &task, .level = level, .images = images, .pixels = pixels};
     return add_up(&work, threads, count * marks, out);
 }
 
-static void run_sweep(struct work *work, long piece, long first, long last)
+static void run_sweep(struct work *work, long image, long piece, long first, long last)
 {
-    const struct thin *task = work->task;
-    SETS[work->level].sweep(task, first, last, work->totals + piece * task->marks);
+    const struct thin task = part(work, image);
+    SETS[work->level].sweep(&task, first, last, work->totals + piece * task.marks);
 }
 
-int nlfilter_sweep(int level, int threads, long pixels, long marks, const float *half, const float *factor,
-                   long factor_stride, const float *diagonal, float least, float most, float *scaling, double *out)
+/* Given a diagonal, what out = d has for a moment where row is half of its guess; else factor diag(scaling) factor^T row,
+ * and out is room for what lies between. */
+int nlfilter_sweep(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
+                   long factor_stride, const float *row, const float *scaling, const float *diagonal, float least,
+                   float most, float *out, double *moment)
 {
-    struct thin task = {factor, factor_stride, marks, 1, half, scaling, scaling, 0, 0, NULL, diagonal, least, most};
-    struct work work = {run_sweep, &task, level, pixels, 0, NULL, 0, 0};
-    return add_up(&work, threads, marks, out);
+    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
+                        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .least = least, .most = most,
+                        .images = out, .images_step = pixels, .out = out, .pixels = pixels};
+    struct work work = {.run = run_sweep, .task = &task, .level = level, .images = images, .pixels = pixels};
+    return add_up(&work, threads, marks, moment);
 }
 
-/* out = factor diag(scaling) factor^T row; spread_out (N) is room for what lies between. */
-int nlfilter_weigh(int level, int threads, long pixels, long marks, const float *row, const float *factor,
-                   long factor_stride, const float *scaling, float *spread_out, double *out)
-{
-    struct thin task = {factor, factor_stride, marks, 1, row, spread_out, spread_out, 0, 0, scaling, NULL, 0, 0};
-    struct work work = {run_sweep, &task, level, pixels, 0, NULL, 0, 0};
-    return add_up(&work, threads, marks, out);
-}
-
-static void run_grams(struct work *work, long piece, long first, long last)
+static void run_grams(struct work *work, long image, long piece, long first, long last)
 {
     const struct grams *task = work->task;
     size_t floats = (1 + MOST_ROWS + task->rows) * task->step;
+    (void)image;
     float *scratch = aligned_alloc(64, floats * sizeof(float));
     if (scratch)
         SETS[work->level].grams(task, first, last, scratch, work->totals + piece * task->count * task->marks * task->marks);
@@ -237,7 +254,7 @@ int nlfilter_grams(int level, int threads, long pixels, long marks, long count, 
     const long rows = padded(marks, 12), fitting = NEAR / rows / 64 * 64; /* rows: whole blocks both ways */
     struct grams task = {factor, scaling, remainder, factor_stride, marks, count, rows, 0};
     task.step = fitting < 64 ? 64 : fitting > 1024 ? 1024 : fitting;
-    struct work work = {run_grams, &task, level, pixels, 0, NULL, 0, 0};
+    struct work work = {.run = run_grams, .task = &task, .level = level, .images = 1, .pixels = pixels};
     int status = add_up(&work, threads, count * marks * marks, out);
     for (long k = 0; k < count; k++, out += marks * marks)
         for (long m = 0; m < marks; m++)
@@ -270,15 +287,15 @@ static void cluster(const struct lloyd *task, int level, long image, float *scra
     }
 }
 
-static void run_lloyd(struct work *work, long piece, long first, long last)
+static void run_lloyd(struct work *work, long image, long piece, long first, long last)
 {
     const struct lloyd *task = work->task;
     size_t floats = (task->size + 1) * (2 * padded(task->marks, MOST_ROWS) + MOST_PIXELS);
     float *scratch = aligned_alloc(64, padded(floats * sizeof(float), 64));
-    (void)piece;
+    (void)piece, (void)first, (void)last;
     if (!scratch)
         work->failed = 1;
-    for (long image = first; scratch && image < last; image++)
+    else
         cluster(task, work->level, image, scratch);
     free(scratch);
 }
@@ -287,26 +304,26 @@ int nlfilter_lloyd(int level, int threads, long images, long size, long count, l
                    const float *points, const float *start, int *nearest)
 {
     struct lloyd task = {points, start, nearest, size, count, marks, iterations};
-    struct work work = {run_lloyd, &task, level, images, 1, NULL, 0, 0};
+    struct work work = {.run = run_lloyd, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1, .each = 1};
     return begin(&work, threads);
 }
 
-static void run_pivots(struct work *work, long piece, long first, long last)
+static void run_pivots(struct work *work, long image, long piece, long first, long last)
 {
     const struct pivots *task = work->task;
     float *scratch = aligned_alloc(64, (task->marks + 2 + task->size) * task->count * sizeof(float));
     float *points = scratch + (task->marks + 2) * task->count; /* with whole lines */
-    (void)piece;
-    if (!scratch)
+    (void)piece, (void)first, (void)last;
+    if (!scratch) {
         work->failed = 1;
-    for (long image = first; scratch && image < last; image++) {
-        for (long k = 0; k < task->size; k++) {
-            const float *row = task->points + (image * task->size + k) * task->used;
-            memcpy(points + k * task->count, row, task->used * sizeof(float));
-            memset(points + k * task->count + task->used, 0, (task->count - task->used) * sizeof(float));
-        }
-        SETS[work->level].pivots(task, points, task->pivots + image * task->marks, scratch);
+        return;
     }
+    for (long k = 0; k < task->size; k++) {
+        const float *row = task->points + (image * task->size + k) * task->used;
+        memcpy(points + k * task->count, row, task->used * sizeof(float));
+        memset(points + k * task->count + task->used, 0, (task->count - task->used) * sizeof(float));
+    }
+    SETS[work->level].pivots(task, points, task->pivots + image * task->marks, scratch);
     free(scratch);
 }
 
@@ -314,6 +331,6 @@ int nlfilter_pivots(int level, int threads, long images, long size, long count, 
                     const float *points, const float *draws, long *pivots)
 {
     struct pivots task = {points, draws, pivots, size, count, padded(count, LINE), marks, explained};
-    struct work work = {run_pivots, &task, level, images, 1, NULL, 0, 0};
+    struct work work = {.run = run_pivots, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1, .each = 1};
     return begin(&work, threads);
 }

@@ -1,11 +1,12 @@
 /* Division of work among threads. */
 
-/* Work on all pixels, piece by piece: whichever thread is free takes the next. */
+/* Work on all pixels of a batch of images, piece by piece: whichever thread is free takes the next. */
 struct work {
-    void (*run)(struct work *, long piece, long first, long last);
+    void (*run)(struct work *, long image, long piece, long first, long last);
     const void *task;
     int level;
-    long pixels, length; /* of a piece */
+    long images, pixels; /* of each image */
+    long length, each;   /* of a piece, and how many pieces each image has */
     double *totals;      /* of each piece, where there is something to add up */
     atomic_long next;
     atomic_int failed;
@@ -15,10 +16,11 @@ static void labour(void *argument)
 {
     struct work *work = argument;
     for (;;) {
-        const long piece = atomic_fetch_add(&work->next, 1), first = piece * work->length, last = first + work->length;
-        if (first >= work->pixels)
+        const long piece = atomic_fetch_add(&work->next, 1), image = piece / work->each;
+        const long first = piece % work->each * work->length, last = first + work->length;
+        if (image >= work->images)
             return;
-        work->run(work, piece, first, last < work->pixels ? last : work->pixels);
+        work->run(work, image, piece, first, last < work->pixels ? last : work->pixels);
     }
 }
 
@@ -37,7 +39,7 @@ static void *help(void *work)
 static int begin(struct work *work, int threads)
 {
     pthread_t helpers[MOST_THREADS];
-    const long pieces = padded(work->pixels, work->length) / work->length;
+    const long pieces = work->images * work->each;
     int started = 0;
     if (parallel && threads > 1 && pieces > 1) {
         parallel(labour, work, threads, 0);
@@ -54,23 +56,31 @@ static int begin(struct work *work, int threads)
     return work->failed ? -1 : 0;
 }
 
-/* Four pieces for each thread, since one may be slower than another, or as many as memory likes. */
+/* Four pieces for each thread, since one may be slower than another, but no piece longer than `most`. */
+static void cut(struct work *work, int threads, long most)
+{
+    const long wanted = (4 * threads + work->images - 1) / work->images;
+    const long length = padded((work->pixels + wanted - 1) / wanted, LINE);
+    work->length = length < most ? length : most;
+    work->each = (work->pixels + work->length - 1) / work->length;
+}
+
 static int divide(struct work *work, int threads, long most)
 {
-    const long length = padded((work->pixels + 4 * threads - 1) / (4 * threads), LINE);
-    work->length = length < most ? length : most;
+    cut(work, threads, most);
     return begin(work, threads);
 }
 
-/* Run work that adds up `sums` numbers, and add those of the pieces in their order, so that runs agree. */
+/* Run work that adds up `sums` numbers for each image, and add those of the pieces in their order, so that runs agree. */
 static int add_up(struct work *work, int threads, long sums, double *out)
 {
-    const long pieces = 4 * threads;
-    work->totals = calloc(pieces * sums, sizeof(double));
-    int status = work->totals ? divide(work, threads, work->pixels) : -1;
-    memset(out, 0, sums * sizeof(double));
-    for (long i = 0; !status && i < pieces * sums; i++)
-        out[i % sums] += work->totals[i];
+    cut(work, threads, work->pixels);
+    work->totals = calloc(work->images * work->each * sums, sizeof(double));
+    int status = work->totals ? begin(work, threads) : -1;
+    memset(out, 0, work->images * sums * sizeof(double));
+    for (long piece = 0; !status && piece < work->images * work->each; piece++)
+        for (long k = 0; k < sums; k++)
+            out[piece / work->each * sums + k] += work->totals[piece * sums + k];
     free(work->totals);
     return status;
 }
