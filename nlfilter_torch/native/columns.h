@@ -5,7 +5,8 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
 {
     const long size = task->size, marks = task->marks;
     float *features = scratch, *affinities = features + (size + 2) * PIXELS;
-    float *edge = affinities + padded(marks, ROWS) * PIXELS; /* a row of a tile that the image ends in */
+    float *whitened = affinities + padded(marks, ROWS) * PIXELS;
+    float *edge = whitened + padded(marks, ROWS) * PIXELS; /* a row of a tile that the image ends in */
     for (long start = first; start < last; start += PIXELS) {
         const long width = last - start < PIXELS ? last - start : PIXELS;
         FLOATS norm[VECTORS];
@@ -39,33 +40,38 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
         }
         const float *rows = task->whitening;
         for (long m = 0, block = 0; m < marks; m += ROWS, block++) {
-            FLOATS whitened[ROWS][VECTORS];
-            NAME(multiply)(rows, affinities, task->depths[block], whitened);
+            FLOATS sums[ROWS][VECTORS];
+            NAME(multiply)(rows, affinities, task->depths[block], sums);
             rows += task->depths[block] * ROWS;
-            for (long r = 0; r < ROWS && m + r < marks; r++) {
-                float *target = task->factor + (m + r) * task->factor_stride + start;
-                float *found = width < PIXELS ? edge : target;
-                const int streamed = (uintptr_t)found % sizeof(FLOATS) == 0;
+            for (int r = 0; r < ROWS; r++) /* rows past the last are zero */
                 for (int v = 0; v < VECTORS; v++) {
-                    norm[v] += whitened[r][v] * whitened[r][v];
-                    if (streamed)
-                        STREAM(found + v * LANES, whitened[r][v]);
-                    else
-                        *(FLOATS *)(found + v * LANES) = whitened[r][v];
+                    *(FLOATS *)(whitened + (m + r) * PIXELS + v * LANES) = sums[r][v];
+                    norm[v] += sums[r][v] * sums[r][v];
                 }
-                if (width < PIXELS)
-                    memcpy(target, edge, width * sizeof(float));
-            }
         }
+        /* Norms exceed 1 by rounding alone, but those of all pixels that are like a landmark do: a black sky, say. */
+        FLOATS scale[VECTORS];
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(edge + v * LANES) = norm[v];
         memcpy(task->norms + start, edge, width * sizeof(float));
-        for (long i = 0; task->limited && i < width; i++)
-            if (edge[i] > 1.0f) { /* by rounding alone, and seldom */
-                const float scale = 1.0f / sqrtf(edge[i]);
-                for (long m = 0; m < marks; m++)
-                    task->factor[m * task->factor_stride + start + i] *= scale;
+        for (long i = 0; i < PIXELS; i++)
+            edge[i] = task->limited && edge[i] > 1.0f ? 1.0f / sqrtf(edge[i]) : 1.0f;
+        for (int v = 0; v < VECTORS; v++)
+            scale[v] = *(const FLOATS *)(edge + v * LANES);
+        for (long m = 0; m < marks; m++) {
+            float *target = task->factor + m * task->factor_stride + start;
+            const float *row = whitened + m * PIXELS;
+            const int streamed = width == PIXELS && (uintptr_t)target % sizeof(FLOATS) == 0;
+            for (int v = 0; v < VECTORS; v++) {
+                const FLOATS value = *(const FLOATS *)(row + v * LANES) * scale[v];
+                if (streamed)
+                    STREAM(target + v * LANES, value);
+                else
+                    *(FLOATS *)((width == PIXELS ? target : edge) + v * LANES) = value;
             }
+            if (width < PIXELS)
+                memcpy(target, edge, width * sizeof(float));
+        }
     }
     __builtin_ia32_sfence(); /* what was streamed is there before anyone is told so */
 }

@@ -140,7 +140,7 @@ static float *pack(const float *matrix, long count, long depth, long rows, long 
 static void run_columns(struct work *work, long image, long piece, long first, long last)
 {
     const struct columns *task = work->task;
-    size_t floats = (task->size + 3 + padded(task->marks, MOST_ROWS)) * MOST_PIXELS;
+    size_t floats = (task->size + 3 + 2 * padded(task->marks, MOST_ROWS)) * MOST_PIXELS;
     float *scratch = aligned_alloc(64, floats * sizeof(float));
     (void)image, (void)piece;
     if (scratch)
