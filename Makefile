@@ -6,12 +6,15 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c const
 PINS := pyproject.toml constraints.txt
 COMPILED := hatch_build.py $(wildcard nlfilter_torch/native/*.[ch])
 
+AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
+INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --no-install-recommends
+
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types chromium bench bench-quick train pictures figures notebooks docs clean
+.PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks docs clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
-$(VENV)/.installed: $(PINS) $(COMPILED)
+$(VENV)/.installed: $(PINS) $(COMPILED) | compiler
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) "$$(grep '^torch==' constraints.txt)"
 	$(PIP) hatchling editables
@@ -22,11 +25,15 @@ $(VENV)/.installed-test: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[cli,app,notebooks,bench,docs,test]'
 	touch $@
 
+# Compiles the kernels in C.
+compiler:
+	@command -v cc >/dev/null || { $(INSTALL_DEBIAN) gcc libc6-dev; } >/dev/null 2>&1 \
+	|| echo "No C compiler could be installed; torch does the work of the kernels in C, more slowly."
+
 # The browser that the editor is tested in; without one those tests are skipped, and say so.
 chromium:
 	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit; done; \
-	if [ "$$(id -u)" = 0 ]; then as_root=; else as_root='sudo -n'; fi; \
-	{ $$as_root apt-get update && $$as_root apt-get install -y --no-install-recommends chromium; } >/dev/null 2>&1 \
+	{ $(INSTALL_DEBIAN) chromium; } >/dev/null 2>&1 \
 	|| echo "No Chromium could be installed; the editor's tests in the browser will be skipped."
 
 # A picture of every step, from a photograph that comes with scikit-image, in out/.
