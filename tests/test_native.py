@@ -220,6 +220,7 @@ def test_whom_they_suit() -> None:
     assert native.suits(torch.nn.Parameter(plain).detach())
     assert not native.suits(plain, plain.double())
     assert not native.suits(plain.half())
+    assert not native.suits(plain[:, :0])
     assert not native.suits(plain.to("meta"))
     assert not native.suits(plain.clone().requires_grad_())
     with torch.no_grad():

@@ -1,6 +1,6 @@
 """Kernels in C for what filters on processors spend their time in; without them torch does the same, more slowly.
 
-They are compiled when the package is installed (``hatch_build.py``), for x86-64, where there is a C compiler. Nothing
+They are compiled when the package is installed (``hatch_build.py``), for Linux on x86-64, where there is GCC. Nothing
 is compiled or looked for later. They take single precision only and know no derivatives: callers ask :func:`suits`.
 """
 
@@ -62,13 +62,14 @@ level: int = _library.nlfilter_level() if _library else 0  # of LEVELS, what thi
 
 
 def suits(*tensors: Tensor) -> bool:
-    """Whether the kernels can work on such tensors: plain ones in float32 on the processor, without derivatives."""
+    """Whether the kernels can work on such tensors: plain float32 on the processor, not empty, without derivatives."""
     if not level or torch.compiler.is_compiling():
         return False
     return all(
         type(tensor) in (Tensor, torch.nn.Parameter)
         and tensor.dtype == torch.float32
         and tensor.device.type == "cpu"
+        and tensor.numel() > 0
         and not is_transformed(tensor)
         and not (tensor.requires_grad and torch.is_grad_enabled())
         and not tensor.is_neg()

@@ -1,6 +1,6 @@
-/* Columns of the Nystrom factor, and its products with a few rows, in single precision on processors of the x86-64 kind.
+/* Columns of the Nystrom factor, its products, and landmarks, in single precision on processors of the x86-64 kind.
  *
- * The same mathematics as in nystrom.py and thin.py. What they do with several passes over blocks of memory happens
+ * The same mathematics as in the files of Python that each part names. What they do with several passes over blocks of memory happens
  * here in the registers: distances, exponentials, whitening by a matrix of which the empty triangle is skipped, norms.
  * Products with a few rows read the factor once, as fast as memory allows.
  *
