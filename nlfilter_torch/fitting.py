@@ -195,7 +195,11 @@ class _Problem:
     @cached_property
     def _products(self) -> Tensor:
         """Of all layers with each other, (B, k+1, k+1), where all errors count."""
-        return self._pool(reduce_sum((self.layers * self.weights.unsqueeze(1)) @ self.layers.mT, self.shard))
+        return self._weighed(self.weights)
+
+    def _weighed(self, weights: Tensor) -> Tensor:
+        """Products of all layers with each other, (B, k+1, k+1), under weights (B, P)."""
+        return self._pool(reduce_sum((self.layers * weights.unsqueeze(1)) @ self.layers.mT, self.shard))
 
     def _errors(self, change: Tensor) -> Tensor:
         """What of the edit (B, P) is left unexplained."""
@@ -212,11 +216,7 @@ class _Problem:
     def _step(self, change: Tensor) -> Tensor:
         """Newton's step (B, k+1): from anywhere to the solution where all errors count."""
         errors = self._errors(change)
-        if self.dead_zone is None:
-            products = self._products
-        else:
-            counted = self.weights * (errors != 0.0)
-            products = self._pool(reduce_sum((self.layers * counted.unsqueeze(1)) @ self.layers.mT, self.shard))
+        products = self._products if self.dead_zone is None else self._weighed(self.weights * (errors != 0.0))
         slope = reduce_sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2), self.shard)
         slope = self._pool(slope) - self.ridge * change
         scale, inverse = self._inverse(products)

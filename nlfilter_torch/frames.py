@@ -121,15 +121,15 @@ class FittedFilter:
     def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
         """The same (B, k+1 or k+2, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
-        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor)).unsqueeze(1)
-        remainder = scaling.square() * diagonal.unsqueeze(1)
+        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor))
+        remainder = (scaling.square() * diagonal).unsqueeze(1)
         smoothed = [image]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
-            smoothed.append(scaling * spread(coefficients.mT, factor) + remainder * smoothed[-1])
+            smoothed.append(torch.addcmul(spread(coefficients.mT, factor, scaling), remainder, smoothed[-1]))
         layers = layers_between(torch.stack(smoothed, dim=1))
         if not missed:
             return layers
-        explained = scaling * spread(self.explained.to(factor).mT, factor)
+        explained = spread(self.explained.to(factor).mT, factor, scaling)
         return torch.cat([layers, ((1 - remainder) * (image - explained)).unsqueeze(1)], dim=1)
 
 

@@ -119,8 +119,8 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
 
 def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
     """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
-    if native.suits(factor, diagonal):
-        half = (total / 2).squeeze(2).to(factor)
+    half = (total / 2).squeeze(2).to(factor)
+    if native.suits(factor, diagonal, half):
         scaling, found = native.sweep(factor, diagonal, half, SMALLEST_AFFINITY, LARGEST)
         return scaling, reduce_sum(found.unsqueeze(2), shard)
     scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)

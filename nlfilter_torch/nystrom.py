@@ -164,12 +164,10 @@ def _fill_natively(
     """:func:`_fill` by the kernel in C, image by image."""
     affinity = Affinity(landmarks, complete)
     for image, columns in enumerate(factor):
-        norm = native.columns(
+        native.columns(
             features[image], affinity.centre[image, :, 0], affinity.rows[image], whitening[image], affinity.floor,
-            limited=complete, out=columns,
+            limited=complete, out=columns, norms=norms[image],
         )  # fmt: skip
-        if complete:
-            norms[image] = norm
 
 
 def _repeat(matrices: Tensor, count: int) -> Tensor:

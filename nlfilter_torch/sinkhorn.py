@@ -15,7 +15,7 @@ from nlfilter_torch.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
 from nlfilter_torch.sharding import Shard, reduce_sum
-from nlfilter_torch.thin import gather, spread
+from nlfilter_torch.thin import gather, moment, spread
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = 1e-3  # a residual that balancing ends above is worth a warning
@@ -98,7 +98,7 @@ class _Balance(torch.autograd.Function):
         factor, diagonal, scaling, total, inverse = ctx.saved_tensors
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
-        right = _weighted_moment(factor, scaling.square() * share * grad, ctx.shard)
+        right = moment(factor, (weight * grad).unsqueeze(1), ctx.shard)
         solution = _conjugate_gradients(factor, weight, right, inverse, ctx.shard)
         affinity = spread(solution.to(factor).mT, factor).squeeze(1)
         a = scaling * scaling * share * (grad - affinity)
@@ -106,17 +106,15 @@ class _Balance(torch.autograd.Function):
         return outer_product(totals, torch.stack([-a, -scaling], dim=1)), -a * scaling, None, None, None
 
 
-def _weighted_moment(factor: Tensor, weighted: Tensor, shard: Shard | None, total: Tensor | None = None) -> Tensor:
-    """``factor @ weighted`` (B, M, 1) in float64; given a ``total``, ``factor @ (weighted * (factor^T total))``."""
+def _weighted_moment(factor: Tensor, weight: Tensor, shard: Shard | None, total: Tensor) -> Tensor:
+    """``factor @ (weight * (factor^T total))``, (B, M, 1) in float64."""
+    row = total.to(factor).mT
+    if native.suits(factor, weight, row):
+        return reduce_sum(native.weigh(factor, weight, row[:, 0]).unsqueeze(2), shard)
     found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
-    row = None if total is None else total.to(factor).mT
-    if row is not None and native.suits(factor, weighted):
-        return reduce_sum(native.weigh(factor, weighted, row[:, 0]).unsqueeze(2), shard)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        columns, part = factor[:, :, block], weighted[:, block]
-        if row is not None:
-            part = part * spread(row, columns).squeeze(1)
-        found += gather(part.unsqueeze(1), columns).mT
+        columns = factor[:, :, block]
+        found += gather(weight[:, None, block] * spread(row, columns), columns).mT
     return reduce_sum(found, shard)
 
 

@@ -79,8 +79,16 @@ def suits(*tensors: Tensor) -> bool:
 
 
 def columns(
-    features: Tensor, centre: Tensor, landmarks: Tensor, whitening: Tensor, floor: float, limited: bool, out: Tensor
-) -> Tensor:
+    features: Tensor,
+    centre: Tensor,
+    landmarks: Tensor,
+    whitening: Tensor,
+    floor: float,
+    *,
+    limited: bool,
+    out: Tensor,
+    norms: Tensor,
+) -> None:
     """Columns of the Nystrom factor of one image, written to ``out``.
 
     Args:
@@ -90,20 +98,16 @@ def columns(
         whitening: (M, M).
         floor: the least logarithm.
         limited: whether columns are shortened to norm 1.
-        out: (M, N).
-
-    Returns:
-        The squared norms of the columns before they were shortened, (N,).
+        out: (M, N), rows in one piece.
+        norms: (N,), in one piece; takes the squared norms of the columns before they are shortened, if they are.
     """
     features = features if features.stride(1) == 1 else features.contiguous()
     size, pixels = features.shape
-    norms = features.new_empty(pixels)
     centre, landmarks, whitening = centre.contiguous(), landmarks.contiguous(), whitening.contiguous()
     _run(
         "columns", _threads(out), pixels, size, len(out), features.data_ptr(), features.stride(0), centre.data_ptr(),
         landmarks.data_ptr(), whitening.data_ptr(), floor, limited, out.data_ptr(), out.stride(0), norms.data_ptr(),
     )  # fmt: skip
-    return norms
 
 
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:

@@ -53,7 +53,8 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
         FLOATS scale[VECTORS];
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(edge + v * LANES) = norm[v];
-        memcpy(task->norms + start, edge, width * sizeof(float));
+        if (task->limited)
+            memcpy(task->norms + start, edge, width * sizeof(float));
         for (long i = 0; i < PIXELS; i++)
             edge[i] = task->limited && edge[i] > 1.0f ? 1.0f / sqrtf(edge[i]) : 1.0f;
         for (int v = 0; v < VECTORS; v++)

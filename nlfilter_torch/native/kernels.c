@@ -1,11 +1,12 @@
 /* Columns of the Nystrom factor, its products, and landmarks, in single precision on processors of the x86-64 kind.
  *
- * The same mathematics as in the files of Python that each part names. What they do with several passes over blocks of memory happens
- * here in the registers: distances, exponentials, whitening by a matrix of which the empty triangle is skipped, norms.
+ * The same mathematics as in the files of Python that each part names. What they do with several passes over blocks of
+ * memory happens here in the registers: distances, exponentials, whitening by a matrix of which the empty triangle is
+ * skipped, norms.
  * Products with a few rows read the factor once, as fast as memory allows.
  *
- * Work is divided into pieces of the image. What is written for each pixel does not depend on the number of threads; sums
- * over pixels are added in float64, for each thread and then in the order of these. Functions return 0, or -1 where
+ * Work is divided into pieces of the image. What is written for each pixel does not depend on the number of threads;
+ * sums over pixels are added in float64, for each piece and then in the order of these. Functions return 0, or -1 where
  * memory is short. */
 
 #include <math.h>
@@ -27,7 +28,7 @@ static long padded(long count, long step) { return (count + step - 1) / step * s
 /* U = whitening exp2(landmarks (x, 1, |x|^2)), x = features - centre. */
 struct columns {
     const float *features, *centre; /* (D, N), (D) */
-    float *factor, *norms;          /* (M, N), (N): |u|^2 before it is limited */
+    float *factor, *norms;          /* (M, N), (N): |u|^2 before it is limited, if it is */
     long features_stride, factor_stride, size, marks;
     float floor; /* of the exponents */
     int limited; /* columns longer than 1 are shortened */
@@ -41,11 +42,12 @@ struct thin {
     long factor_stride, marks, count;
     const float *rows, *images; /* (R, M), (R, N) */
     float *out;                 /* (R, N) */
-    long images_stride, out_stride;
+    long images_stride;
     const float *scaling;  /* d, (N), or none */
     const float *diagonal; /* c, (N), or none */
     float least, most;     /* of half of u . t, and of d */
-    long factor_step, images_step, pixels; /* from one image of a batch to the next; everything else is contiguous */
+    long factor_step, images_step; /* from one image of a batch to the next; everything else is contiguous */
+    long pixels;                   /* N */
 };
 
 struct grams {
@@ -137,17 +139,10 @@ static float *pack(const float *matrix, long count, long depth, long rows, long 
     return packed;
 }
 
-static void run_columns(struct work *work, long image, long piece, long first, long last)
+static void run_columns(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
-    const struct columns *task = work->task;
-    size_t floats = (task->size + 3 + 2 * padded(task->marks, MOST_ROWS)) * MOST_PIXELS;
-    float *scratch = aligned_alloc(64, floats * sizeof(float));
     (void)image, (void)piece;
-    if (scratch)
-        SETS[work->level].columns(task, first, last, scratch);
-    else
-        work->failed = 1;
-    free(scratch);
+    SETS[work->level].columns(work->task, first, last, scratch);
 }
 
 int nlfilter_columns(int level, int threads, long pixels, long size, long marks, const float *features,
@@ -160,7 +155,8 @@ int nlfilter_columns(int level, int threads, long pixels, long size, long marks,
     long *depths = malloc(padded(marks, rows) / rows * sizeof(long));
     float *packed = pack(landmarks, marks, size + 2, rows, NULL);
     float *whiteners = depths ? pack(whitening, marks, marks, rows, depths) : NULL;
-    struct work work = {.run = run_columns, .task = &task, .level = level, .images = 1, .pixels = pixels};
+    struct work work = {.run = run_columns, .task = &task, .level = level, .images = 1, .pixels = pixels,
+                        .floats = (size + 3 + 2 * padded(marks, rows)) * MOST_PIXELS};
     task.landmarks = packed, task.whitening = whiteners, task.depths = depths;
     int status = packed && whiteners ? divide(&work, threads, CHUNK) : -1;
     free(depths);
@@ -182,10 +178,10 @@ static struct thin part(const struct work *work, long image)
     return task;
 }
 
-static void run_spread(struct work *work, long image, long piece, long first, long last)
+static void run_spread(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct thin task = part(work, image);
-    (void)piece;
+    (void)piece, (void)scratch;
     SETS[work->level].spread(&task, first, last);
 }
 
@@ -193,15 +189,15 @@ int nlfilter_spread(int level, int threads, long pixels, long images, long marks
                     long factor_stride, long count, const float *rows, const float *scaling, float *out)
 {
     struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
-                        .count = count, .rows = rows, .scaling = scaling, .out = out, .out_stride = pixels,
-                        .pixels = pixels};
+                        .count = count, .rows = rows, .scaling = scaling, .out = out, .pixels = pixels};
     struct work work = {.run = run_spread, .task = &task, .level = level, .images = images, .pixels = pixels};
     return divide(&work, threads, CHUNK);
 }
 
-static void run_gather(struct work *work, long image, long piece, long first, long last)
+static void run_gather(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct thin task = part(work, image);
+    (void)scratch;
     SETS[work->level].gather(&task, first, last, work->totals + piece * task.count * task.marks);
 }
 
@@ -216,14 +212,15 @@ int nlfilter_gather(int level, int threads, long pixels, long images, long marks
     return add_up(&work, threads, count * marks, out);
 }
 
-static void run_sweep(struct work *work, long image, long piece, long first, long last)
+static void run_sweep(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct thin task = part(work, image);
+    (void)scratch;
     SETS[work->level].sweep(&task, first, last, work->totals + piece * task.marks);
 }
 
-/* Given a diagonal, what out = d has for a moment where row is half of its guess; else factor diag(scaling) factor^T row,
- * and out is room for what lies between. */
+/* Given a diagonal, what out = d has for a moment where row is half of its guess; else factor diag(scaling) factor^T
+ * row, and out is room for what lies between. */
 int nlfilter_sweep(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
                    long factor_stride, const float *row, const float *scaling, const float *diagonal, float least,
                    float most, float *out, double *moment)
@@ -235,17 +232,11 @@ int nlfilter_sweep(int level, int threads, long pixels, long images, long marks,
     return add_up(&work, threads, marks, moment);
 }
 
-static void run_grams(struct work *work, long image, long piece, long first, long last)
+static void run_grams(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct grams *task = work->task;
-    size_t floats = (1 + MOST_ROWS + task->rows) * task->step;
     (void)image;
-    float *scratch = aligned_alloc(64, floats * sizeof(float));
-    if (scratch)
-        SETS[work->level].grams(task, first, last, scratch, work->totals + piece * task->count * task->marks * task->marks);
-    else
-        work->failed = 1;
-    free(scratch);
+    SETS[work->level].grams(task, first, last, scratch, work->totals + piece * task->count * task->marks * task->marks);
 }
 
 int nlfilter_grams(int level, int threads, long pixels, long marks, long count, const float *factor, long factor_stride,
@@ -254,7 +245,8 @@ int nlfilter_grams(int level, int threads, long pixels, long marks, long count, 
     const long rows = padded(marks, 12), fitting = NEAR / rows / 64 * 64; /* rows: whole blocks both ways */
     struct grams task = {factor, scaling, remainder, factor_stride, marks, count, rows, 0};
     task.step = fitting < 64 ? 64 : fitting > 1024 ? 1024 : fitting;
-    struct work work = {.run = run_grams, .task = &task, .level = level, .images = 1, .pixels = pixels};
+    struct work work = {.run = run_grams, .task = &task, .level = level, .images = 1, .pixels = pixels,
+                        .floats = (1 + MOST_ROWS + rows) * task.step};
     int status = add_up(&work, threads, count * marks * marks, out);
     for (long k = 0; k < count; k++, out += marks * marks)
         for (long m = 0; m < marks; m++)
@@ -287,50 +279,40 @@ static void cluster(const struct lloyd *task, int level, long image, float *scra
     }
 }
 
-static void run_lloyd(struct work *work, long image, long piece, long first, long last)
+static void run_lloyd(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
-    const struct lloyd *task = work->task;
-    size_t floats = (task->size + 1) * (2 * padded(task->marks, MOST_ROWS) + MOST_PIXELS);
-    float *scratch = aligned_alloc(64, padded(floats * sizeof(float), 64));
     (void)piece, (void)first, (void)last;
-    if (!scratch)
-        work->failed = 1;
-    else
-        cluster(task, work->level, image, scratch);
-    free(scratch);
+    cluster(work->task, work->level, image, scratch);
 }
 
 int nlfilter_lloyd(int level, int threads, long images, long size, long count, long marks, long iterations,
                    const float *points, const float *start, int *nearest)
 {
     struct lloyd task = {points, start, nearest, size, count, marks, iterations};
-    struct work work = {.run = run_lloyd, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1, .each = 1};
+    struct work work = {.run = run_lloyd, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
+                        .each = 1, .floats = (size + 1) * (2 * padded(marks, MOST_ROWS) + MOST_PIXELS)};
     return begin(&work, threads);
 }
 
-static void run_pivots(struct work *work, long image, long piece, long first, long last)
+static void run_pivots(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct pivots *task = work->task;
-    float *scratch = aligned_alloc(64, (task->marks + 2 + task->size) * task->count * sizeof(float));
     float *points = scratch + (task->marks + 2) * task->count; /* with whole lines */
     (void)piece, (void)first, (void)last;
-    if (!scratch) {
-        work->failed = 1;
-        return;
-    }
     for (long k = 0; k < task->size; k++) {
         const float *row = task->points + (image * task->size + k) * task->used;
         memcpy(points + k * task->count, row, task->used * sizeof(float));
         memset(points + k * task->count + task->used, 0, (task->count - task->used) * sizeof(float));
     }
     SETS[work->level].pivots(task, points, task->pivots + image * task->marks, scratch);
-    free(scratch);
 }
 
 int nlfilter_pivots(int level, int threads, long images, long size, long count, long marks, float explained,
                     const float *points, const float *draws, long *pivots)
 {
-    struct pivots task = {points, draws, pivots, size, count, padded(count, LINE), marks, explained};
-    struct work work = {.run = run_pivots, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1, .each = 1};
+    const long whole = padded(count, LINE);
+    struct pivots task = {points, draws, pivots, size, count, whole, marks, explained};
+    struct work work = {.run = run_pivots, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
+                        .each = 1, .floats = (marks + 2 + size) * whole};
     return begin(&work, threads);
 }

@@ -39,7 +39,14 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
     }
 }
 
-/* out (S) += sum over the rows of left[r * step] times row r of right (R, S); four at a time, for fewer passes over out. */
+/* What a residual counts for in the draw: its fourth power. */
+INLINE float NAME(chance)(float residual, float explained)
+{
+    const float rest = residual > explained ? residual : explained;
+    return (rest * rest) * (rest * rest);
+}
+
+/* out (S) += sum over the rows of left[r * step] times row r of right (R, S); four at a time, for fewer passes. */
 INLINE void NAME(accumulate)(const float *left, long step, const float *right, long rows, long count, float sign,
                              float *out)
 {
@@ -69,14 +76,11 @@ static TARGET void NAME(pivots)(const struct pivots *task, const float *points, 
         residual[i] = 1.0f;
     for (long m = 0; m < task->marks; m++) {
         double total = 0.0, reached = 0.0;
-        for (long i = 0; i < task->used; i++) {
-            const float square = residual[i] > task->explained ? residual[i] * residual[i] : task->explained * task->explained;
-            total += square * square;
-        }
+        for (long i = 0; i < task->used; i++)
+            total += NAME(chance)(residual[i], task->explained);
         long pivot = 0;
         for (; pivot < task->used - 1; pivot++) {
-            const float rest = residual[pivot] > task->explained ? residual[pivot] : task->explained;
-            reached += (rest * rest) * (rest * rest);
+            reached += NAME(chance)(residual[pivot], task->explained);
             if (reached >= task->draws[m] * total)
                 break;
         }

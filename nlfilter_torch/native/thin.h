@@ -1,23 +1,23 @@
 /* Products of the factor with a few rows, each reading it once; see thin.py, and newton.py for the sweep. */
 
-/* Where the next rows of the factor begin; past the last one it is that once more. Several at a time keep memory busy. */
+/* Where the next rows of the factor begin; past the last one it is that once more. Several keep memory busy. */
 INLINE void NAME(adjacent)(const struct thin *task, long row, long start, int count, const float **found)
 {
     for (long k = 0; k < count; k++)
         found[k] = task->factor + (row + k < task->marks ? row + k : task->marks - 1) * task->factor_stride + start;
 }
 
-/* out = rows (R, M) times the columns of the factor from first to last, not more than a chunk of them, times scaling. */
+/* out = rows (R, M) times the columns of the factor from first to last, at most a chunk of them, times scaling. */
 static TARGET void NAME(spread)(const struct thin *task, long first, long last)
 {
     const long marks = task->marks, width = last - first, whole = width / LANES * LANES;
     for (long r = 0; r < task->count; r++)
-        memset(task->out + r * task->out_stride + first, 0, width * sizeof(float));
+        memset(task->out + r * task->pixels + first, 0, width * sizeof(float));
     for (long m = 0; m < marks; m += 8) {
         const float *column[8];
         NAME(adjacent)(task, m, first, 8, column);
         for (long r = 0; r < task->count; r++) {
-            float *sums = task->out + r * task->out_stride + first, weight[8];
+            float *sums = task->out + r * task->pixels + first, weight[8];
             for (long k = 0; k < 8; k++)
                 weight[k] = m + k < marks ? task->rows[r * marks + m + k] : 0.0f;
             for (long i = 0; i < whole; i += LANES) {
@@ -34,7 +34,7 @@ static TARGET void NAME(spread)(const struct thin *task, long first, long last)
     }
     for (long r = 0; task->scaling && r < task->count; r++)
         for (long i = first; i < last; i++)
-            task->out[r * task->out_stride + i] *= task->scaling[i];
+            task->out[r * task->pixels + i] *= task->scaling[i];
 }
 
 /* totals (R, M) += images (R, N) times the factor's transpose, over the pixels from first to last. */
@@ -72,8 +72,9 @@ static TARGET void NAME(gather)(const struct thin *task, long first, long last, 
     }
 }
 
-/* out = the root d of d (u . 2 rows + c d) = 1 for the pixels from first to last, or without c a row spread and scaled as
- * above, and totals += its moment, factor out. So few pixels at a time that their columns are near when it is formed. */
+/* out = the root d of d (u . 2 rows + c d) = 1 for the pixels from first to last, or without c a row spread and scaled
+ * as above, and totals += its moment, factor out. So few pixels at a time that their columns are near when it is
+ * formed. */
 static TARGET void NAME(sweep)(const struct thin *task, long first, long last, double *totals)
 {
     const long most = NEAR / task->marks / 64 * 64, step = most < 256 ? 256 : most;

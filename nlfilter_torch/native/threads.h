@@ -2,8 +2,9 @@
 
 /* Work on all pixels of a batch of images, piece by piece: whichever thread is free takes the next. */
 struct work {
-    void (*run)(struct work *, long image, long piece, long first, long last);
+    void (*run)(struct work *, long image, long piece, long first, long last, float *scratch);
     const void *task;
+    size_t floats; /* of scratch, which every thread has for itself */
     int level;
     long images, pixels; /* of each image */
     long length, each;   /* of a piece, and how many pieces each image has */
@@ -15,13 +16,17 @@ struct work {
 static void labour(void *argument)
 {
     struct work *work = argument;
-    for (;;) {
+    float *scratch = aligned_alloc(64, padded((work->floats + 1) * sizeof(float), 64));
+    if (!scratch)
+        work->failed = 1;
+    while (scratch) {
         const long piece = atomic_fetch_add(&work->next, 1), image = piece / work->each;
         const long first = piece % work->each * work->length, last = first + work->length;
         if (image >= work->images)
-            return;
-        work->run(work, image, piece, first, last < work->pixels ? last : work->pixels);
+            break;
+        work->run(work, image, piece, first, last < work->pixels ? last : work->pixels, scratch);
     }
+    free(scratch);
 }
 
 /* OpenMP's way to run a function on its threads, once it is known where: torch waits for work with the same threads,
@@ -71,7 +76,7 @@ static int divide(struct work *work, int threads, long most)
     return begin(work, threads);
 }
 
-/* Run work that adds up `sums` numbers for each image, and add those of the pieces in their order, so that runs agree. */
+/* Run work that adds up `sums` numbers for each image, and add those of the pieces in their order: runs agree. */
 static int add_up(struct work *work, int threads, long sums, double *out)
 {
     cut(work, threads, work->pixels);
