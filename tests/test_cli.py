@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -307,3 +308,36 @@ def test_interrupted_work_says_so(
     monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", interrupt)
     assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
     assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
+
+
+def test_an_interrupt_that_python_loses_comes_again(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Busy:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt  # as where Ctrl-C comes at this moment
+
+    def work(*_: object, **__: object) -> None:
+        Busy()
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", work)
+    assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
+    assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
+
+
+def test_other_errors_of_destructors_are_told_as_ever(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Faulty:
+        def __del__(self) -> None:
+            raise RuntimeError("of its own")
+
+    told: list[BaseException | None] = []
+    monkeypatch.setattr("sys.unraisablehook", lambda lost: told.append(lost.exc_value))
+    monkeypatch.setattr(
+        "nlfilter_torch.cli.editing.read_photograph", lambda *_, **__: Faulty() and read_photograph(photo)
+    )
+    assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 0
+    assert [str(error) for error in told] == ["of its own"]

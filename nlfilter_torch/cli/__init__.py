@@ -5,15 +5,18 @@ Bad input of any kind is one sentence on the standard error stream and exit stat
 
 import sys
 
+from nlfilter_torch.cli import interrupts
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status."""
-    try:
-        from nlfilter_torch.cli.application import run
-    except ModuleNotFoundError as error:
-        sys.stderr.write(
-            f"nlfilter-torch: the command line needs {error.name}, which is not installed; "
-            "install it with: pip install 'nlfilter-torch[cli]'\n"
-        )
-        return 2
-    return run(arguments)
+    with interrupts.heeded():
+        try:
+            from nlfilter_torch.cli.application import run
+        except ModuleNotFoundError as error:
+            sys.stderr.write(
+                f"nlfilter-torch: the command line needs {error.name}, which is not installed; "
+                "install it with: pip install 'nlfilter-torch[cli]'\n"
+            )
+            return 2
+        return run(arguments)
