@@ -26,7 +26,8 @@ class CompiledKernels(BuildHookInterface):
         folder = Path(self.root) / FOLDER
         target = folder / "kernels.so"
         beside = target.with_suffix(".part")
-        command = [*shlex.split(os.environ.get("CC", "cc")), *FLAGS, "-o", str(beside), str(folder / "kernels.c")]
+        sources = map(str, sorted(folder.glob("*.c")))
+        command = [*shlex.split(os.environ.get("CC", "cc")), *FLAGS, "-o", str(beside), *sources]
         try:
             subprocess.run(command, check=True, capture_output=True, text=True)
         except (OSError, subprocess.CalledProcessError) as error:

@@ -66,6 +66,11 @@ def strips_of_gradient(gradient: Tensor, count: int) -> Tensor:
     return strips(gradient, count)
 
 
+def factors_of(gradient: Tensor) -> tuple[Tensor, ...]:
+    """What a gradient is the product of: (B, M, r) and (B, r, N) of one that is not formed, otherwise itself alone."""
+    return (gradient.left, gradient.right) if isinstance(gradient, OuterProduct) else (gradient,)
+
+
 def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:
     """The columns ``block`` of a gradient (B, M, N), formed or not, in ``out`` (B, M, n)."""
     if isinstance(gradient, OuterProduct):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nlfilter_torch import native
 from nlfilter_torch.blocks import buffered_blocks, large_empty, strip_count, strips
-from nlfilter_torch.differentiation import once_differentiable, strips_of_gradient, write_columns
+from nlfilter_torch.differentiation import factors_of, once_differentiable, strips_of_gradient, write_columns
 
 Completion = Literal["diagonal", "none"]
 
@@ -109,6 +109,9 @@ class _NystromFactor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
+        if native.suits(features, landmarks, whitening, factor, scale, grad_diagonal, *factors_of(grad_factor)):
+            inputs = (features, landmarks, whitening)
+            return *_backward_natively(*inputs, factor, scale, ctx.complete, grad_factor, grad_diagonal), None
         grad_features = large_empty(features.shape, features)
         batch, pixels = scale.shape
         count = strip_count(batch, pixels, features.device)
@@ -168,6 +171,34 @@ def _fill_natively(
             features[image], affinity.centre[image, :, 0], affinity.rows[image], whitening[image], affinity.floor,
             limited=complete, out=columns, norms=norms[image],
         )  # fmt: skip
+
+
+def _backward_natively(
+    features: Tensor,
+    landmarks: Tensor,
+    whitening: Tensor,
+    factor: Tensor,
+    scale: Tensor,
+    complete: bool,
+    grad_factor: Tensor,
+    grad_diagonal: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The gradients of features, landmarks and whitening by the kernel in C, image by image."""
+    affinity = Affinity(landmarks, complete)
+    # K_im = exp(-|x_i - z_m|^2): its derivative is -2 (x_i - z_m) K_im in x_i and the opposite in z_m.
+    points = 2.0 * torch.cat([affinity.landmarks, torch.ones_like(landmarks[:, :1])], dim=1)
+    grad_features = large_empty(features.shape, features)
+    grad_landmarks, grad_whitening = torch.empty_like(landmarks), torch.empty_like(whitening)
+    for image in range(len(features)):
+        by_whitening, sums = native.columns_backward(
+            features[image], affinity.centre[image, :, 0], affinity.rows[image], whitening[image], affinity.floor,
+            limited=complete, factor=factor[image], scale=scale[image],
+            gradient=[part[image] for part in factors_of(grad_factor)], diagonal=grad_diagonal[image],
+            points=points[image], out=grad_features[image],
+        )  # fmt: skip
+        grad_whitening[image] = by_whitening
+        grad_landmarks[image] = 2.0 * (sums[:, :-1].mT - affinity.landmarks[image] * sums[:, -1])
+    return grad_features, grad_landmarks, grad_whitening
 
 
 def _repeat(matrices: Tensor, count: int) -> Tensor:

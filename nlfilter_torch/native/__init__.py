@@ -5,6 +5,7 @@ is compiled or looked for later. They take single precision only and know no der
 """
 
 import ctypes
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,10 @@ def _load() -> ctypes.CDLL | None:
     share_threads(library, _openmp())
     library.nlfilter_columns.argtypes = [
         *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
+    ]  # fmt: skip
+    library.nlfilter_backward.argtypes = [
+        *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
+        _LONG, _POINTER, _POINTER, _LONG, *[_POINTER] * 4,
     ]  # fmt: skip
     factor: list[Any] = [_LONG, _LONG, _POINTER, _LONG, _LONG]  # images, landmarks, (B, M, N) and its strides
     library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
@@ -108,6 +113,57 @@ def columns(
         "columns", _threads(out), pixels, size, len(out), features.data_ptr(), features.stride(0), centre.data_ptr(),
         landmarks.data_ptr(), whitening.data_ptr(), floor, limited, out.data_ptr(), out.stride(0), norms.data_ptr(),
     )  # fmt: skip
+
+
+def columns_backward(
+    features: Tensor,
+    centre: Tensor,
+    landmarks: Tensor,
+    whitening: Tensor,
+    floor: float,
+    *,
+    limited: bool,
+    factor: Tensor,
+    scale: Tensor,
+    gradient: Sequence[Tensor],
+    diagonal: Tensor,
+    points: Tensor,
+    out: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Derivatives of :func:`columns` of one image.
+
+    Args:
+        features: (D, N).
+        centre: (D,).
+        landmarks: (M, D + 2), as there.
+        whitening: (M, M).
+        floor: the least logarithm.
+        limited: whether columns were shortened to norm 1.
+        factor: (M, N), the columns.
+        scale: (N,), what they were shortened by.
+        gradient: of the loss by the columns, (M, r) and (r, N) whose product it is, or itself alone, (M, N).
+        diagonal: (N,), of the loss by 1 - |u|^2 where that is not negative.
+        points: (D + 1, M); its products with the derivatives by the exponents move the features.
+        out: (D, N), in one piece; takes the derivatives by the features.
+
+    Returns:
+        The derivative by the whitening, (M, M), of a lower triangle that of its own entries alone, and the products
+        (M, D + 1) of the derivatives by the exponents with the features from the centre and with 1, both in float64.
+    """
+    features, factor, right = (t if t.stride(1) == 1 else t.contiguous() for t in (features, factor, gradient[-1]))
+    left = gradient[0].contiguous() if len(gradient) == 2 else None
+    centre, landmarks, whitening = centre.contiguous(), landmarks.contiguous(), whitening.contiguous()
+    scale, diagonal, points = scale.contiguous(), diagonal.contiguous(), points.contiguous()
+    size, pixels = features.shape
+    marks = len(factor)
+    sums = torch.empty(marks * (marks + size + 1), dtype=torch.float64)
+    _run(
+        "backward", _threads(factor), pixels, size, marks, features.data_ptr(), features.stride(0), centre.data_ptr(),
+        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, factor.data_ptr(), factor.stride(0),
+        scale.data_ptr(), len(right), None if left is None else left.data_ptr(), right.data_ptr(), right.stride(0),
+        diagonal.data_ptr(), points.data_ptr(), out.data_ptr(), sums.data_ptr(),
+    )  # fmt: skip
+    return sums[: marks * marks].view(marks, marks), sums[marks * marks :].view(marks, size + 1)
 
 
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:

@@ -1,10 +1,44 @@
 /* Features to columns of the Nystrom factor; nystrom.py says what they are. */
 
+/* A tile of features relative to the centre, above rows of ones and of |x|^2; past the image it is the centre. */
+INLINE void NAME(approach)(const struct columns *task, long start, long width, float *features, float *edge)
+{
+    FLOATS norm[VECTORS];
+    for (int v = 0; v < VECTORS; v++)
+        norm[v] = (FLOATS){0};
+    for (long k = 0; k < task->size; k++, features += PIXELS) {
+        const float centre = task->centre[k];
+        const float *source = NAME(fetch)(task->features + k * task->features_stride + start, width, centre, edge);
+        for (int v = 0; v < VECTORS; v++) {
+            const FLOATS centred = *(const FLOATS *)(source + v * LANES) - centre;
+            *(FLOATS *)(features + v * LANES) = centred;
+            norm[v] += centred * centred;
+        }
+    }
+    for (int v = 0; v < VECTORS; v++) {
+        *(FLOATS *)(features + v * LANES) = (FLOATS){0} + 1.0f;
+        *(FLOATS *)(features + PIXELS + v * LANES) = norm[v];
+    }
+}
+
+/* A tile of affinities to the landmarks. */
+INLINE void NAME(relate)(const struct columns *task, const float *features, float *affinities)
+{
+    for (long m = 0; m < task->marks; m += ROWS) {
+        FLOATS exponents[ROWS][VECTORS];
+        NAME(multiply)(task->landmarks + m * (task->size + 2), features, task->size + 2, exponents);
+        for (int r = 0; r < ROWS; r++)
+            for (int v = 0; v < VECTORS; v++)
+                *(FLOATS *)(affinities + (m + r) * PIXELS + v * LANES) =
+                    NAME(exp2)(NAME(clamp)(exponents[r][v], task->floor, 0.0f));
+    }
+}
+
 /* The columns of the factor for the pixels from first to last: affinities, whitened, of norm at most 1 if asked. */
 static TARGET void NAME(columns)(const struct columns *task, long first, long last, float *scratch)
 {
-    const long size = task->size, marks = task->marks;
-    float *features = scratch, *affinities = features + (size + 2) * PIXELS;
+    const long marks = task->marks;
+    float *features = scratch, *affinities = features + (task->size + 2) * PIXELS;
     float *whitened = affinities + padded(marks, ROWS) * PIXELS;
     float *edge = whitened + padded(marks, ROWS) * PIXELS; /* a row of a tile that the image ends in */
     for (long start = first; start < last; start += PIXELS) {
@@ -12,32 +46,8 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
         FLOATS norm[VECTORS];
         for (int v = 0; v < VECTORS; v++)
             norm[v] = (FLOATS){0};
-        for (long k = 0; k < size; k++) {
-            const float *source = task->features + k * task->features_stride + start;
-            if (width < PIXELS) {
-                for (long i = 0; i < PIXELS; i++)
-                    edge[i] = i < width ? source[i] : task->centre[k];
-                source = edge;
-            }
-            for (int v = 0; v < VECTORS; v++) {
-                FLOATS centred = *(const FLOATS *)(source + v * LANES) - task->centre[k];
-                *(FLOATS *)(features + k * PIXELS + v * LANES) = centred;
-                norm[v] += centred * centred;
-            }
-        }
-        for (int v = 0; v < VECTORS; v++) {
-            *(FLOATS *)(features + size * PIXELS + v * LANES) = (FLOATS){0} + 1.0f;
-            *(FLOATS *)(features + (size + 1) * PIXELS + v * LANES) = norm[v];
-            norm[v] = (FLOATS){0};
-        }
-        for (long m = 0; m < marks; m += ROWS) {
-            FLOATS exponents[ROWS][VECTORS];
-            NAME(multiply)(task->landmarks + m * (size + 2), features, size + 2, exponents);
-            for (int r = 0; r < ROWS; r++)
-                for (int v = 0; v < VECTORS; v++)
-                    *(FLOATS *)(affinities + (m + r) * PIXELS + v * LANES) =
-                        NAME(exp2)(NAME(clamp)(exponents[r][v], task->floor, 0.0f));
-        }
+        NAME(approach)(task, start, width, features, edge);
+        NAME(relate)(task, features, affinities);
         const float *rows = task->whitening;
         for (long m = 0, block = 0; m < marks; m += ROWS, block++) {
             FLOATS sums[ROWS][VECTORS];

@@ -1,16 +1,5 @@
 /* Gram matrices of the scaled factor; see spectrum.py. */
 
-INLINE float NAME(total)(FLOATS x)
-{
-    INTS lanes;
-    for (int k = 0; k < LANES; k++)
-        lanes[k] = k;
-#pragma GCC unroll 4
-    for (int distance = LANES / 2; distance; distance /= 2)
-        x += __builtin_shuffle(x, lanes ^ distance);
-    return x[0];
-}
-
 /* totals (J, M, M) += F diag(r^j) F^T over the pixels from first to last, F = factor diag(d); lower triangles only. */
 static TARGET void NAME(grams)(const struct grams *task, long first, long last, float *scratch, double *totals)
 {
@@ -40,26 +29,8 @@ static TARGET void NAME(grams)(const struct grams *task, long first, long last, 
                     left = weighted;
                 }
                 for (long n = 0; n < m + ROWS && n < marks; n += VECTORS) {
-                    const float *right = scaled + n * step;
                     FLOATS sums[ROWS][VECTORS];
-#pragma GCC unroll 8
-                    for (int r = 0; r < ROWS; r++)
-#pragma GCC unroll 8
-                        for (int v = 0; v < VECTORS; v++)
-                            sums[r][v] = (FLOATS){0};
-                    for (long i = 0; i < whole; i += LANES) {
-                        FLOATS pixels[VECTORS];
-#pragma GCC unroll 8
-                        for (int v = 0; v < VECTORS; v++)
-                            pixels[v] = *(const FLOATS *)(right + v * step + i);
-#pragma GCC unroll 8
-                        for (int r = 0; r < ROWS; r++) {
-                            const FLOATS row = *(const FLOATS *)(left + r * step + i);
-#pragma GCC unroll 8
-                            for (int v = 0; v < VECTORS; v++)
-                                sums[r][v] += row * pixels[v];
-                        }
-                    }
+                    NAME(correlate)(left, 0, scaled + n * step, 0, 1, step, whole, sums);
 #pragma GCC unroll 8
                     for (int r = 0; r < ROWS; r++)
 #pragma GCC unroll 8

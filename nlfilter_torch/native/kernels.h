@@ -59,7 +59,55 @@ INLINE void NAME(multiply)(const float *rows, const float *tile, long depth, FLO
     }
 }
 
+/* sums = rows of left times rows of right, lane by lane: `tiles` tiles of `length` pixels each, in which rows are
+ * `stride` apart. */
+INLINE void NAME(correlate)(const float *left, long left_step, const float *right, long right_step, long tiles,
+                            long stride, long length, FLOATS sums[ROWS][VECTORS])
+{
+#pragma GCC unroll 8
+    for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 8
+        for (int v = 0; v < VECTORS; v++)
+            sums[r][v] = (FLOATS){0};
+    for (long t = 0; t < tiles; t++, left += left_step, right += right_step)
+        for (long i = 0; i < length; i += LANES) {
+            FLOATS pixels[VECTORS];
+#pragma GCC unroll 8
+            for (int v = 0; v < VECTORS; v++)
+                pixels[v] = *(const FLOATS *)(right + v * stride + i);
+#pragma GCC unroll 8
+            for (int r = 0; r < ROWS; r++) {
+                const FLOATS row = *(const FLOATS *)(left + r * stride + i);
+#pragma GCC unroll 8
+                for (int v = 0; v < VECTORS; v++)
+                    sums[r][v] += row * pixels[v];
+            }
+        }
+}
+
+INLINE float NAME(total)(FLOATS x)
+{
+    INTS lanes;
+    for (int k = 0; k < LANES; k++)
+        lanes[k] = k;
+#pragma GCC unroll 4
+    for (int distance = LANES / 2; distance; distance /= 2)
+        x += __builtin_shuffle(x, lanes ^ distance);
+    return x[0];
+}
+
+/* PIXELS numbers from source on; where the image ends after `width` of them, in `edge`, and the rest is `fill`. */
+INLINE const float *NAME(fetch)(const float *source, long width, float fill, float *edge)
+{
+    if (width == PIXELS)
+        return source;
+    for (long i = 0; i < PIXELS; i++)
+        edge[i] = i < width ? source[i] : fill;
+    return edge;
+}
+
 #include "columns.h"
+#include "backward.h"
 #include "grams.h"
 #include "landmarks.h"
 #include "thin.h"

@@ -1,17 +1,10 @@
 /* Division of work among threads. */
 
-/* Work on all pixels of a batch of images, piece by piece: whichever thread is free takes the next. */
-struct work {
-    void (*run)(struct work *, long image, long piece, long first, long last, float *scratch);
-    const void *task;
-    size_t floats; /* of scratch, which every thread has for itself */
-    int level;
-    long images, pixels; /* of each image */
-    long length, each;   /* of a piece, and how many pieces each image has */
-    double *totals;      /* of each piece, where there is something to add up */
-    atomic_long next;
-    atomic_int failed;
-};
+#include <pthread.h>
+
+#include "tasks.h"
+
+#define MOST_THREADS 256
 
 static void labour(void *argument)
 {
@@ -41,7 +34,7 @@ static void *help(void *work)
     return NULL;
 }
 
-static int begin(struct work *work, int threads)
+int run_pieces(struct work *work, int threads)
 {
     pthread_t helpers[MOST_THREADS];
     const long pieces = work->images * work->each;
@@ -70,18 +63,18 @@ static void cut(struct work *work, int threads, long most)
     work->each = (work->pixels + work->length - 1) / work->length;
 }
 
-static int divide(struct work *work, int threads, long most)
+int divide(struct work *work, int threads, long most)
 {
     cut(work, threads, most);
-    return begin(work, threads);
+    return run_pieces(work, threads);
 }
 
-/* Run work that adds up `sums` numbers for each image, and add those of the pieces in their order: runs agree. */
-static int add_up(struct work *work, int threads, long sums, double *out)
+/* Numbers of the pieces are added in their order: runs agree. */
+int add_up(struct work *work, int threads, long sums, double *out)
 {
     cut(work, threads, work->pixels);
     work->totals = calloc(work->images * work->each * sums, sizeof(double));
-    int status = work->totals ? begin(work, threads) : -1;
+    int status = work->totals ? run_pieces(work, threads) : -1;
     memset(out, 0, work->images * sums * sizeof(double));
     for (long piece = 0; !status && piece < work->images * work->each; piece++)
         for (long k = 0; k < sums; k++)

@@ -1,0 +1,119 @@
+/* Derivatives of the columns of the Nystrom factor; nystrom.py says which. */
+
+/* The gradient of a tile of columns, from that of what they are after they were shortened. */
+INLINE void NAME(receive)(const struct backward *task, long start, long width, float *gradient, float *spare)
+{
+    const struct columns *columns = &task->columns;
+    float *edge = spare, *right = spare + PIXELS;
+    for (long k = 0; k < task->rank; k++) {
+        float *target = task->left ? right : gradient;
+        memcpy(target + k * PIXELS, NAME(fetch)(task->right + k * task->right_stride + start, width, 0.0f, edge),
+               PIXELS * sizeof(float));
+    }
+    for (long m = 0; task->left && m < columns->marks; m += ROWS) {
+        FLOATS sums[ROWS][VECTORS];
+        NAME(multiply)(task->left + m * task->rank, right, task->rank, sums);
+        for (int r = 0; r < ROWS; r++)
+            for (int v = 0; v < VECTORS; v++)
+                *(FLOATS *)(gradient + (m + r) * PIXELS + v * LANES) = sums[r][v];
+    }
+    if (!columns->limited)
+        return;
+    FLOATS along[VECTORS], scale[VECTORS];
+    for (int v = 0; v < VECTORS; v++)
+        along[v] = (FLOATS){0};
+    for (long m = 0; m < columns->marks; m++) {
+        const float *column = NAME(fetch)(columns->factor + m * columns->factor_stride + start, width, 0.0f, edge);
+        for (int v = 0; v < VECTORS; v++)
+            along[v] += *(const FLOATS *)(column + v * LANES) * *(const FLOATS *)(gradient + m * PIXELS + v * LANES);
+    }
+    for (int v = 0; v < VECTORS; v++)
+        *(FLOATS *)(right + v * LANES) = along[v];
+    for (long i = 0; i < PIXELS; i++) {
+        edge[i] = i < width ? task->scale[start + i] : 1.0f;
+        right[i] = edge[i] < 1.0f ? right[i] : i < width ? 2.0f * task->diagonal[start + i] : 0.0f;
+    }
+    for (int v = 0; v < VECTORS; v++) {
+        scale[v] = *(const FLOATS *)(edge + v * LANES);
+        along[v] = *(const FLOATS *)(right + v * LANES);
+    }
+    for (long m = 0; m < columns->marks; m++) {
+        const float *column = NAME(fetch)(columns->factor + m * columns->factor_stride + start, width, 0.0f, edge);
+        for (int v = 0; v < VECTORS; v++) {
+            FLOATS *target = (FLOATS *)(gradient + m * PIXELS + v * LANES);
+            *target = (*target - *(const FLOATS *)(column + v * LANES) * along[v]) * scale[v];
+        }
+    }
+}
+
+/* The gradient of a tile of features, of which these are the derivatives by the exponents. */
+INLINE void NAME(move)(const struct backward *task, long start, long width, const float *slopes, const float *features,
+                       float *moved)
+{
+    const long size = task->columns.size;
+    for (long k = 0; k < size + 1; k += ROWS) {
+        FLOATS sums[ROWS][VECTORS];
+        NAME(multiply)(task->points + k * task->columns.marks, slopes, task->columns.marks, sums);
+        for (int r = 0; r < ROWS; r++)
+            for (int v = 0; v < VECTORS; v++)
+                *(FLOATS *)(moved + (k + r) * PIXELS + v * LANES) = sums[r][v];
+    }
+    for (long k = 0; k < size; k++) {
+        for (int v = 0; v < VECTORS; v++)
+            *(FLOATS *)(moved + k * PIXELS + v * LANES) -= *(const FLOATS *)(features + k * PIXELS + v * LANES) *
+                                                           *(const FLOATS *)(moved + size * PIXELS + v * LANES);
+        memcpy(task->moved + k * task->moved_stride + start, moved + k * PIXELS, width * sizeof(float));
+    }
+}
+
+/* totals (count, most) += left times the transpose of right over the tiles; of a triangle, its lower half. */
+INLINE void NAME(amount)(const float *left, long left_step, const float *right, long right_step, long tiles, long count,
+                         long most, int lower, double *totals)
+{
+    for (long m = 0; m < count; m += ROWS)
+        for (long n = 0; n < most && !(lower && n >= m + ROWS); n += VECTORS) {
+            FLOATS sums[ROWS][VECTORS];
+            NAME(correlate)(left + m * PIXELS, left_step, right + n * PIXELS, right_step, tiles, PIXELS, PIXELS, sums);
+            for (int r = 0; r < ROWS; r++)
+                for (int v = 0; v < VECTORS; v++)
+                    if (m + r < count && n + v < most && !(lower && n + v > m + r))
+                        totals[(m + r) * most + n + v] += NAME(total)(sums[r][v]);
+        }
+}
+
+/* Gradients of the features of the pixels from first to last; totals += those of the whitening (M, M), and below it the
+ * products of slopes and features (M, D + 1) that make those of the landmarks. So many tiles at a time as stay near. */
+static TARGET void NAME(backward)(const struct backward *task, long first, long last, float *scratch, double *totals)
+{
+    const long size = task->columns.size, marks = task->columns.marks;
+    const long step = task->rows * PIXELS, features_step = task->feature_rows * PIXELS;
+    float *gradients = scratch, *affinities = gradients + task->tiles * step;
+    float *features = affinities + task->tiles * step, *spare = features + task->tiles * features_step;
+    for (long start = first; start < last; start += task->tiles * PIXELS) {
+        const long end = last - start < task->tiles * PIXELS ? last : start + task->tiles * PIXELS;
+        const long tiles = (end - start + PIXELS - 1) / PIXELS;
+        for (long t = 0; t < tiles; t++) {
+            const long at = start + t * PIXELS, width = end - at < PIXELS ? end - at : PIXELS;
+            NAME(approach)(&task->columns, at, width, features + t * features_step, spare);
+            NAME(relate)(&task->columns, features + t * features_step, affinities + t * step);
+            NAME(receive)(task, at, width, gradients + t * step, spare);
+        }
+        NAME(amount)(gradients, step, affinities, step, tiles, marks, marks, task->lower, totals);
+        for (long t = 0; t < tiles; t++) {
+            const long at = start + t * PIXELS, width = end - at < PIXELS ? end - at : PIXELS;
+            const float *rows = task->columns.whitening, *gradient = gradients + t * step;
+            float *slopes = affinities + t * step; /* by the exponents, in place of the affinities */
+            for (long m = 0; m < marks; m += ROWS) {
+                const long skipped = task->lower ? m : 0;
+                FLOATS sums[ROWS][VECTORS];
+                NAME(multiply)(rows, gradient + skipped * PIXELS, marks - skipped, sums);
+                rows += (marks - skipped) * ROWS;
+                for (int r = 0; r < ROWS; r++)
+                    for (int v = 0; v < VECTORS; v++)
+                        *(FLOATS *)(slopes + (m + r) * PIXELS + v * LANES) *= sums[r][v];
+            }
+            NAME(move)(task, at, width, slopes, features + t * features_step, spare);
+        }
+        NAME(amount)(affinities, step, features, features_step, tiles, marks, size + 1, 0, totals + marks * marks);
+    }
+}

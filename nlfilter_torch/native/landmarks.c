@@ -1,0 +1,67 @@
+/* Choice of landmarks. */
+
+#include <math.h>
+
+#include "tasks.h"
+
+/* Lloyd's iteration on one image; scratch holds packed centres, sums with sizes, and a tile. */
+static void cluster(const struct lloyd *task, int level, long image, float *scratch)
+{
+    const long size = task->size, count = task->count, marks = task->marks, rows = SETS[level].rows;
+    const float *points = task->points + image * size * count, *start = task->start + image * size * marks;
+    int *nearest = task->nearest + image * count;
+    float *centres = scratch, *sums = centres + padded(marks, rows) * (size + 1), *tile = sums + marks * (size + 1);
+    memset(sums, 0, marks * (size + 1) * sizeof(float));
+    for (long step = 0; step <= task->iterations; step++) {
+        for (long m = 0; m < padded(marks, rows); m++) {
+            float *target = centres + m / rows * rows * (size + 1) + m % rows, length = 0.0f;
+            const float *sum = sums + m * (size + 1);
+            for (long k = 0; k < size; k++) { /* a centre without points stays where it began */
+                const float value = m >= marks ? 0.0f : sum[size] ? sum[k] / sum[size] : start[k * marks + m];
+                target[k * rows] = value;
+                length += value * value;
+            }
+            target[size * rows] = m < marks ? -0.5f * length : -INFINITY;
+        }
+        memset(sums, 0, marks * (size + 1) * sizeof(float));
+        SETS[level].assign(task, points, centres, tile, nearest, sums);
+    }
+}
+
+static void run_lloyd(struct work *work, long image, long piece, long first, long last, float *scratch)
+{
+    (void)piece, (void)first, (void)last;
+    cluster(work->task, work->level, image, scratch);
+}
+
+int nlfilter_lloyd(int level, int threads, long images, long size, long count, long marks, long iterations,
+                   const float *points, const float *start, int *nearest)
+{
+    struct lloyd task = {points, start, nearest, size, count, marks, iterations};
+    struct work work = {.run = run_lloyd, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
+                        .each = 1, .floats = (size + 1) * (2 * padded(marks, MOST_ROWS) + MOST_PIXELS)};
+    return run_pieces(&work, threads);
+}
+
+static void run_pivots(struct work *work, long image, long piece, long first, long last, float *scratch)
+{
+    const struct pivots *task = work->task;
+    float *points = scratch + (task->marks + 2) * task->count; /* with whole lines */
+    (void)piece, (void)first, (void)last;
+    for (long k = 0; k < task->size; k++) {
+        const float *row = task->points + (image * task->size + k) * task->used;
+        memcpy(points + k * task->count, row, task->used * sizeof(float));
+        memset(points + k * task->count + task->used, 0, (task->count - task->used) * sizeof(float));
+    }
+    SETS[work->level].pivots(task, points, task->pivots + image * task->marks, scratch);
+}
+
+int nlfilter_pivots(int level, int threads, long images, long size, long count, long marks, float explained,
+                    const float *points, const float *draws, long *pivots)
+{
+    const long whole = padded(count, LINE);
+    struct pivots task = {points, draws, pivots, size, count, whole, marks, explained};
+    struct work work = {.run = run_pivots, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
+                        .each = 1, .floats = (marks + 2 + size) * whole};
+    return run_pieces(&work, threads);
+}

@@ -1,0 +1,70 @@
+/* Products of the factor with a few rows. */
+
+#include "tasks.h"
+
+/* What there is of a batch for one of its images. */
+static struct thin part(const struct work *work, long image)
+{
+    struct thin task = *(const struct thin *)work->task;
+    task.factor += image * task.factor_step;
+    task.rows = task.rows ? task.rows + image * task.count * task.marks : NULL;
+    task.images = task.images ? task.images + image * task.images_step : NULL;
+    task.out = task.out ? task.out + image * task.count * task.pixels : NULL;
+    task.scaling = task.scaling ? task.scaling + image * task.pixels : NULL;
+    task.diagonal = task.diagonal ? task.diagonal + image * task.pixels : NULL;
+    return task;
+}
+
+static void run_spread(struct work *work, long image, long piece, long first, long last, float *scratch)
+{
+    const struct thin task = part(work, image);
+    (void)piece, (void)scratch;
+    SETS[work->level].spread(&task, first, last);
+}
+
+int nlfilter_spread(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
+                    long factor_stride, long count, const float *rows, const float *scaling, float *out)
+{
+    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
+                        .count = count, .rows = rows, .scaling = scaling, .out = out, .pixels = pixels};
+    struct work work = {.run = run_spread, .task = &task, .level = level, .images = images, .pixels = pixels};
+    return divide(&work, threads, CHUNK);
+}
+
+static void run_gather(struct work *work, long image, long piece, long first, long last, float *scratch)
+{
+    const struct thin task = part(work, image);
+    (void)scratch;
+    SETS[work->level].gather(&task, first, last, work->totals + piece * task.count * task.marks);
+}
+
+int nlfilter_gather(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
+                    long factor_stride, long count, const float *planes, long planes_step, long planes_stride,
+                    double *out)
+{
+    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
+                        .count = count, .images = planes, .images_step = planes_step, .images_stride = planes_stride,
+                        .pixels = pixels};
+    struct work work = {.run = run_gather, .task = &task, .level = level, .images = images, .pixels = pixels};
+    return add_up(&work, threads, count * marks, out);
+}
+
+static void run_sweep(struct work *work, long image, long piece, long first, long last, float *scratch)
+{
+    const struct thin task = part(work, image);
+    (void)scratch;
+    SETS[work->level].sweep(&task, first, last, work->totals + piece * task.marks);
+}
+
+/* Given a diagonal, what out = d has for a moment where row is half of its guess; else factor diag(scaling) factor^T
+ * row, and out is room for what lies between. */
+int nlfilter_sweep(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
+                   long factor_stride, const float *row, const float *scaling, const float *diagonal, float least,
+                   float most, float *out, double *moment)
+{
+    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
+                        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .least = least, .most = most,
+                        .images = out, .images_step = pixels, .out = out, .pixels = pixels};
+    struct work work = {.run = run_sweep, .task = &task, .level = level, .images = images, .pixels = pixels};
+    return add_up(&work, threads, marks, moment);
+}
