@@ -32,7 +32,7 @@ struct columns {
 
 /* Derivatives of these, given G, that of the loss by the columns: left right, or where left is none, right itself. */
 struct backward {
-    struct columns columns;        /* the whitening is transposed here, and of a triangle blocks begin at the diagonal */
+    struct columns columns;        /* with the whitening transposed; of a triangle, blocks begin at the diagonal */
     const float *left, *right;     /* (M, R) in blocks, (R, N) */
     const float *scale, *diagonal; /* (N), by which columns were shortened, and the derivative by 1 - |u|^2 */
     const float *points;           /* (D + 1, M) in blocks: what slopes of exponents move the features by */
