@@ -156,8 +156,20 @@ def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
 
 def _cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
     """Mean (B, D, M) of the points (B, D, S) of every cluster; an empty one takes its column of ``fallback``."""
-    members = points.new_zeros(points.shape[0], fallback.shape[2], points.shape[2])
-    members.scatter_(1, assignment.unsqueeze(1), 1.0)
-    sizes = members.sum(2).unsqueeze(1)  # (B, 1, M)
-    means = points @ members.mT / sizes.clamp(min=1.0)  # not an index_add: deterministic on every device
-    return torch.where(sizes > 0, means, fallback)
+    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # sums and sizes in one
+    add = _sums_in_order if points.device.type == "cpu" else _sums_by_product
+    sums = add(extended, assignment, fallback.shape[2])
+    sizes = sums[:, -1:]
+    return torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), fallback)
+
+
+def _sums_in_order(points: Tensor, assignment: Tensor, count: int) -> Tensor:
+    """Sums (B, D, M) of the points of every cluster, one after the other."""
+    zeros = points.new_zeros(*points.shape[:2], count)
+    return zeros.scatter_add(2, assignment.unsqueeze(1).expand_as(points), points)
+
+
+def _sums_by_product(points: Tensor, assignment: Tensor, count: int) -> Tensor:
+    """The same on accelerators, which would add up in another order every time."""
+    members = points.new_zeros(points.shape[0], count, points.shape[2])
+    return points @ members.scatter_(1, assignment.unsqueeze(1), 1.0).mT

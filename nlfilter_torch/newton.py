@@ -73,7 +73,11 @@ class Sample:
         """J, (B, M, M) in float64."""
         slope = scaling.square()
         slope = self.weight * slope / (1 + self.diagonal * slope)
-        gram = reduce_sum((self.factor * slope.unsqueeze(1)) @ self.factor.mT, self.shard)
+        if native.suits(self.factor, slope):
+            gram = native.grams(self.factor, slope.sqrt(), slope, 1)[:, 0].to(self.factor)
+        else:
+            gram = (self.factor * slope.unsqueeze(1)) @ self.factor.mT
+        gram = reduce_sum(gram, self.shard)
         return gram.double() + torch.eye(gram.shape[1], dtype=torch.float64, device=gram.device)
 
     def residual(self, total: Tensor, found: Tensor) -> Tensor:

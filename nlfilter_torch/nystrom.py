@@ -164,13 +164,12 @@ def _fill(
 def _fill_natively(
     features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool, factor: Tensor, norms: Tensor
 ) -> None:
-    """:func:`_fill` by the kernel in C, image by image."""
+    """:func:`_fill` by the kernel in C."""
     affinity = Affinity(landmarks, complete)
-    for image, columns in enumerate(factor):
-        native.columns(
-            features[image], affinity.centre[image, :, 0], affinity.rows[image], whitening[image], affinity.floor,
-            limited=complete, out=columns, norms=norms[image],
-        )  # fmt: skip
+    native.columns(
+        features, affinity.centre.squeeze(2), affinity.rows, whitening, affinity.floor,
+        limited=complete, out=factor, norms=norms,
+    )  # fmt: skip
 
 
 def _backward_natively(
@@ -183,22 +182,18 @@ def _backward_natively(
     grad_factor: Tensor,
     grad_diagonal: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The gradients of features, landmarks and whitening by the kernel in C, image by image."""
+    """The gradients of features, landmarks and whitening by the kernel in C."""
     affinity = Affinity(landmarks, complete)
     # K_im = exp(-|x_i - z_m|^2): its derivative is -2 (x_i - z_m) K_im in x_i and the opposite in z_m.
     points = 2.0 * torch.cat([affinity.landmarks, torch.ones_like(landmarks[:, :1])], dim=1)
     grad_features = large_empty(features.shape, features)
-    grad_landmarks, grad_whitening = torch.empty_like(landmarks), torch.empty_like(whitening)
-    for image in range(len(features)):
-        by_whitening, sums = native.columns_backward(
-            features[image], affinity.centre[image, :, 0], affinity.rows[image], whitening[image], affinity.floor,
-            limited=complete, factor=factor[image], scale=scale[image],
-            gradient=[part[image] for part in factors_of(grad_factor)], diagonal=grad_diagonal[image],
-            points=points[image], out=grad_features[image],
-        )  # fmt: skip
-        grad_whitening[image] = by_whitening
-        grad_landmarks[image] = 2.0 * (sums[:, :-1].mT - affinity.landmarks[image] * sums[:, -1])
-    return grad_features, grad_landmarks, grad_whitening
+    grad_whitening, sums = native.columns_backward(
+        features, affinity.centre.squeeze(2), affinity.rows, whitening, affinity.floor,
+        limited=complete, factor=factor, scale=scale, gradient=factors_of(grad_factor), diagonal=grad_diagonal,
+        points=points, out=grad_features,
+    )  # fmt: skip
+    grad_landmarks = 2.0 * (sums[:, :, :-1].mT - affinity.landmarks * sums[:, None, :, -1])
+    return grad_features, grad_landmarks.to(landmarks), grad_whitening.to(whitening)
 
 
 def _repeat(matrices: Tensor, count: int) -> Tensor:

@@ -225,7 +225,7 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
     """
     weights = scaling if remainder is None else remainder
     if native.suits(factor, scaling, weights):
-        return torch.stack([native.grams(*image, count) for image in zip(factor, scaling, weights, strict=True)])
+        return native.grams(factor, scaling, weights, count)
     batch, marks, pixels = factor.shape
     parts = strip_count(batch, pixels, factor.device)
     factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), weights.unsqueeze(1)))

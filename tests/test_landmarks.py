@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch.landmarks import choose_landmarks
+from nlfilter_torch.landmarks import _sums_by_product, _sums_in_order, choose_landmarks
 from nlfilter_torch.nystrom import nystrom_factor, whitener
 from tests.images import hard_images, photograph
 
@@ -122,3 +122,17 @@ def test_kmeans_does_not_mind_an_offset() -> None:
     x = torch.from_numpy(photograph("camera", 20, 30).copy()).float().view(1, 1, -1) * 10
     near, far = (choose_landmarks(x + shift, (20, 30), 20, "kmeans", seeded()) - shift for shift in (0.0, 256.0))
     torch.testing.assert_close(near, far, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_both_ways_to_add_up_clusters_agree(dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(2, 3, 200, generator=generator, dtype=dtype, requires_grad=True)
+    assignment = torch.randint(0, 6, (2, 200), generator=generator)  # of 7: the last is empty
+    in_order, by_product = (add(points, assignment, 7) for add in (_sums_in_order, _sums_by_product))
+    torch.testing.assert_close(in_order, by_product)
+    torch.testing.assert_close(in_order[1, :, 2], points[1][:, assignment[1] == 2].sum(1))
+    assert (in_order[:, :, 6] == 0).all()
+    slopes = torch.randn(in_order.shape, generator=generator, dtype=dtype)
+    gradients = [torch.autograd.grad(sums, points, slopes)[0] for sums in (in_order, by_product)]
+    torch.testing.assert_close(*gradients)

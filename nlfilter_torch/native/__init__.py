@@ -5,7 +5,7 @@ is compiled or looked for later. They take single precision only and know no der
 """
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,20 +29,17 @@ def _load() -> ctypes.CDLL | None:
     library = ctypes.CDLL(str(path))
     shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
     share_threads(library, _openmp())
-    library.nlfilter_columns.argtypes = [
-        *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
-    ]  # fmt: skip
-    library.nlfilter_backward.argtypes = [
-        *shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3, _FLOAT, _INT, _POINTER, _LONG, _POINTER,
-        _LONG, _POINTER, _POINTER, _LONG, *[_POINTER] * 4,
-    ]  # fmt: skip
-    factor: list[Any] = [_LONG, _LONG, _POINTER, _LONG, _LONG]  # images, landmarks, (B, M, N) and its strides
+    planes: list[Any] = [_POINTER, _LONG, _LONG]  # (B, R, N) and their strides
+    columns: list[Any] = [*shared, _LONG, _LONG, _LONG, *planes, *[_POINTER] * 3, _FLOAT, _INT, *planes, _POINTER]
+    library.nlfilter_columns.argtypes = columns
+    library.nlfilter_backward.argtypes = [*columns, _LONG, _POINTER, *planes, *[_POINTER] * 4]
+    factor: list[Any] = [_LONG, _LONG, *planes]  # images, landmarks, (B, M, N)
     library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
-    library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, _POINTER, _LONG, _LONG, _POINTER]
+    library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, *planes, _POINTER]
     library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _FLOAT, _POINTER, _POINTER]
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
-    library.nlfilter_grams.argtypes = [*shared, _LONG, _LONG, _POINTER, _LONG, *[_POINTER] * 3]
+    library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     return library
 
 
@@ -94,24 +91,23 @@ def columns(
     out: Tensor,
     norms: Tensor,
 ) -> None:
-    """Columns of the Nystrom factor of one image, written to ``out``.
+    """Columns of the Nystrom factor, written to ``out``.
 
     Args:
-        features: (D, N).
-        centre: (D,), taken from them.
-        landmarks: (M, D + 2), of which the product with (x, 1, |x|^2) is the logarithm, to base 2, of the affinity.
-        whitening: (M, M).
+        features: (B, D, N).
+        centre: (B, D), taken from them.
+        landmarks: (B, M, D + 2), of which the product with (x, 1, |x|^2) is the logarithm, to base 2, of the affinity.
+        whitening: (B, M, M).
         floor: the least logarithm.
         limited: whether columns are shortened to norm 1.
-        out: (M, N), rows in one piece.
-        norms: (N,), in one piece; takes the squared norms of the columns before they are shortened, if they are.
+        out: (B, M, N), rows in one piece.
+        norms: (B, N), in one piece; takes the squared norms of columns before they are shortened, if they are.
     """
-    features = features if features.stride(1) == 1 else features.contiguous()
-    size, pixels = features.shape
-    centre, landmarks, whitening = centre.contiguous(), landmarks.contiguous(), whitening.contiguous()
+    features, centre, landmarks, whitening = _by_rows(features), *_contiguous(centre, landmarks, whitening)
+    batch, size, pixels = features.shape
     _run(
-        "columns", _threads(out), pixels, size, len(out), features.data_ptr(), features.stride(0), centre.data_ptr(),
-        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, out.data_ptr(), out.stride(0), norms.data_ptr(),
+        "columns", _threads(out), pixels, batch, size, out.shape[1], *_place(features), centre.data_ptr(),
+        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, *_place(out), norms.data_ptr(),
     )  # fmt: skip
 
 
@@ -130,40 +126,40 @@ def columns_backward(
     points: Tensor,
     out: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Derivatives of :func:`columns` of one image.
+    """Derivatives of :func:`columns`.
 
     Args:
-        features: (D, N).
-        centre: (D,).
-        landmarks: (M, D + 2), as there.
-        whitening: (M, M).
+        features: (B, D, N).
+        centre: (B, D).
+        landmarks: (B, M, D + 2), as there.
+        whitening: (B, M, M).
         floor: the least logarithm.
         limited: whether columns were shortened to norm 1.
-        factor: (M, N), the columns.
-        scale: (N,), what they were shortened by.
-        gradient: of the loss by the columns, (M, r) and (r, N) whose product it is, or itself alone, (M, N).
-        diagonal: (N,), of the loss by 1 - |u|^2 where that is not negative.
-        points: (D + 1, M); its products with the derivatives by the exponents move the features.
-        out: (D, N), in one piece; takes the derivatives by the features.
+        factor: (B, M, N), the columns.
+        scale: (B, N), what they were shortened by.
+        gradient: of the loss by the columns, (B, M, r) and (B, r, N) whose product it is, or itself alone, (B, M, N).
+        diagonal: (B, N), of the loss by 1 - |u|^2 where that is not negative.
+        points: (B, D + 1, M); their products with the derivatives by the exponents move the features.
+        out: (B, D, N), in one piece; takes the derivatives by the features.
 
     Returns:
-        The derivative by the whitening, (M, M), of a lower triangle that of its own entries alone, and the products
-        (M, D + 1) of the derivatives by the exponents with the features from the centre and with 1, both in float64.
+        The derivative by the whitening, (B, M, M), of lower triangles that of their own entries alone, and the products
+        (B, M, D + 1) of the derivatives by the exponents with the features from the centre and with 1; in float64.
     """
-    features, factor, right = (t if t.stride(1) == 1 else t.contiguous() for t in (features, factor, gradient[-1]))
+    features, factor, right = map(_by_rows, (features, factor, gradient[-1]))
     left = gradient[0].contiguous() if len(gradient) == 2 else None
-    centre, landmarks, whitening = centre.contiguous(), landmarks.contiguous(), whitening.contiguous()
-    scale, diagonal, points = scale.contiguous(), diagonal.contiguous(), points.contiguous()
-    size, pixels = features.shape
-    marks = len(factor)
-    sums = torch.empty(marks * (marks + size + 1), dtype=torch.float64)
+    centre, landmarks, whitening, points = _contiguous(centre, landmarks, whitening, points)
+    scale, diagonal = _contiguous(scale, diagonal)
+    (batch, size, pixels), marks = features.shape, factor.shape[1]
+    sums = torch.empty(batch, marks * (marks + size + 1), dtype=torch.float64)
     _run(
-        "backward", _threads(factor), pixels, size, marks, features.data_ptr(), features.stride(0), centre.data_ptr(),
-        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, factor.data_ptr(), factor.stride(0),
-        scale.data_ptr(), len(right), None if left is None else left.data_ptr(), right.data_ptr(), right.stride(0),
-        diagonal.data_ptr(), points.data_ptr(), out.data_ptr(), sums.data_ptr(),
+        "backward", _threads(factor), pixels, batch, size, marks, *_place(features), centre.data_ptr(),
+        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, *_place(factor), scale.data_ptr(), right.shape[1],
+        None if left is None else left.data_ptr(), *_place(right), diagonal.data_ptr(), points.data_ptr(),
+        out.data_ptr(), sums.data_ptr(),
     )  # fmt: skip
-    return sums[: marks * marks].view(marks, marks), sums[marks * marks :].view(marks, size + 1)
+    by_whitening, products = sums.split([marks * marks, marks * (size + 1)], dim=1)
+    return by_whitening.unflatten(1, (marks, marks)), products.unflatten(1, (marks, size + 1))
 
 
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
@@ -186,9 +182,7 @@ def gather(images: Tensor, factor: Tensor) -> Tensor:
     batch, marks, pixels = factor.shape
     images = _by_rows(images.expand(batch, -1, pixels))
     out = factor.new_empty(batch, images.shape[1], marks, dtype=torch.float64)
-    _call(
-        "gather", factor, images.shape[1], images.data_ptr(), images.stride(0), images.stride(1), out.data_ptr()
-    )  # fmt: skip
+    _call("gather", factor, images.shape[1], *_place(images), out.data_ptr())
     return out
 
 
@@ -256,27 +250,34 @@ def pivots(points: Tensor, draws: Tensor, explained: float) -> Tensor:
 
 
 def grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
-    """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (count, M, M) in float64.
+    """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, count, M, M) in float64.
 
     Args:
-        factor: (M, N).
-        scaling: d, (N,).
-        remainder: r, (N,).
+        factor: (B, M, N).
+        scaling: d, (B, N).
+        remainder: r, (B, N).
         count: of the powers.
     """
-    factor = factor if factor.stride(1) == 1 else factor.contiguous()
-    scaling, remainder = scaling.contiguous(), remainder.contiguous()
-    out = factor.new_empty(count, len(factor), len(factor), dtype=torch.float64)
-    _run(
-        "grams", _threads(factor), factor.shape[1], len(factor), count, factor.data_ptr(), factor.stride(0),
-        scaling.data_ptr(), remainder.data_ptr(), out.data_ptr(),
-    )  # fmt: skip
+    factor = _by_rows(factor)
+    scaling, remainder = _contiguous(scaling, remainder)
+    batch, marks, _ = factor.shape
+    out = factor.new_empty(batch, count, marks, marks, dtype=torch.float64)
+    _call("grams", factor, count, scaling.data_ptr(), remainder.data_ptr(), out.data_ptr())
     return out
 
 
 def _by_rows(planes: Tensor) -> Tensor:
     """Planes (B, R, N) with each of their rows in one piece, however far they are apart."""
     return planes if planes.stride(2) == 1 else planes.contiguous()
+
+
+def _contiguous(*tensors: Tensor) -> Iterator[Tensor]:
+    return (tensor.contiguous() for tensor in tensors)
+
+
+def _place(planes: Tensor) -> tuple[int, int, int]:
+    """Where planes (B, R, N) with rows in one piece are, and how far images and rows are apart."""
+    return planes.data_ptr(), planes.stride(0), planes.stride(1)
 
 
 def _threads(factor: Tensor) -> int:
@@ -287,8 +288,7 @@ def _threads(factor: Tensor) -> int:
 def _call(name: str, factor: Tensor, *arguments: int | float | None) -> None:
     """Run a kernel on all pixels of a factor (B, M, N)."""
     batch, marks, pixels = factor.shape
-    steps = (factor.data_ptr(), factor.stride(0), factor.stride(1))
-    _run(name, _threads(factor), pixels, batch, marks, *steps, *arguments)
+    _run(name, _threads(factor), pixels, batch, marks, *_place(factor), *arguments)
 
 
 def _run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:

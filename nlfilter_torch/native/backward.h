@@ -62,7 +62,7 @@ INLINE void NAME(move)(const struct backward *task, long start, long width, cons
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(moved + k * PIXELS + v * LANES) -= *(const FLOATS *)(features + k * PIXELS + v * LANES) *
                                                            *(const FLOATS *)(moved + size * PIXELS + v * LANES);
-        memcpy(task->moved + k * task->moved_stride + start, moved + k * PIXELS, width * sizeof(float));
+        memcpy(task->moved + k * task->columns.pixels + start, moved + k * PIXELS, width * sizeof(float));
     }
 }
 

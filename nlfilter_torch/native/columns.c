@@ -2,106 +2,141 @@
 
 #include "tasks.h"
 
-/* Rows of a matrix (count, depth) in blocks of `rows`, by columns; rows past the last are zero. */
-static float *pack(const float *matrix, long count, long depth, long rows, long *depths)
+/* Rows of each of the matrices (B, count, depth) in blocks of `rows`, by columns; rows past the last are zero. With
+ * `depths`, (B, blocks), a block ends with the last of its columns that is not zero. */
+static float *pack(const float *matrix, long images, long count, long depth, long rows, long *depths)
 {
-    float *packed = malloc(padded(count, rows) * depth * sizeof(float)), *target = packed;
-    if (!packed)
-        return NULL;
-    for (long m = 0, block = 0; m < count; m += rows, block++) {
-        long used = 0;
-        for (long r = m; r < m + rows && r < count; r++)
-            for (long k = used; k < depth; k++)
-                if (matrix[r * depth + k] != 0.0f)
-                    used = k + 1;
-        if (!depths)
-            used = depth;
-        else
-            depths[block] = used;
-        for (long k = 0; k < used; k++)
-            for (long r = 0; r < rows; r++)
-                *target++ = m + r < count ? matrix[(m + r) * depth + k] : 0.0f;
+    const long whole = padded(count, rows);
+    float *packed = malloc(images * whole * depth * sizeof(float));
+    for (long image = 0; packed && image < images; image++, matrix += count * depth) {
+        float *target = packed + image * whole * depth;
+        for (long m = 0; m < count; m += rows) {
+            long used = depths ? 0 : depth;
+            for (long r = m; r < m + rows && r < count; r++)
+                for (long k = used; k < depth; k++)
+                    if (matrix[r * depth + k] != 0.0f)
+                        used = k + 1;
+            if (depths)
+                *depths++ = used;
+            for (long k = 0; k < used; k++)
+                for (long r = m; r < m + rows; r++)
+                    *target++ = r < count ? matrix[r * depth + k] : 0.0f;
+        }
     }
     return packed;
 }
 
-static void run_columns(struct work *work, long image, long piece, long first, long last, float *scratch)
+/* The transposes of square matrices in the same blocks; of lower triangles each block begins with the first of its
+ * columns that is not zero. */
+static float *pack_transposes(const float *matrix, long images, long size, long rows, int lower)
 {
-    (void)image, (void)piece;
-    SETS[work->level].columns(work->task, first, last, scratch);
+    const long whole = padded(size, rows);
+    float *packed = malloc(images * whole * size * sizeof(float));
+    for (long image = 0; packed && image < images; image++, matrix += size * size) {
+        float *target = packed + image * whole * size;
+        for (long m = 0; m < size; m += rows)
+            for (long k = lower ? m : 0; k < size; k++)
+                for (long r = m; r < m + rows; r++)
+                    *target++ = r < size ? matrix[k * size + r] : 0.0f;
+    }
+    return packed;
 }
 
-int nlfilter_columns(int level, int threads, long pixels, long size, long marks, const float *features,
-                     long features_stride, const float *centre, const float *landmarks, const float *whitening,
-                     float floor, int limited, float *factor, long factor_stride, float *norms)
+static int are_lower(const float *matrix, long images, long size)
 {
-    const long rows = SETS[level].rows;
-    struct columns task = {features, centre, factor, norms, features_stride, factor_stride, size, marks, floor, limited,
-                           NULL, NULL, NULL};
-    long *depths = malloc(padded(marks, rows) / rows * sizeof(long));
-    float *packed = pack(landmarks, marks, size + 2, rows, NULL);
-    float *whiteners = depths ? pack(whitening, marks, marks, rows, depths) : NULL;
-    struct work work = {.run = run_columns, .task = &task, .level = level, .images = 1, .pixels = pixels,
-                        .floats = (size + 3 + 2 * padded(marks, rows)) * MOST_PIXELS};
-    task.landmarks = packed, task.whitening = whiteners, task.depths = depths;
-    int status = packed && whiteners ? divide(&work, threads, CHUNK) : -1;
+    for (long m = 0; m < images * size; m++)
+        for (long n = m % size + 1; n < size; n++)
+            if (matrix[m * size + n] != 0.0f)
+                return 0;
+    return 1;
+}
+
+/* What there is of a batch for one of its images. */
+static struct columns of_image(struct columns task, long image, long rows)
+{
+    const long whole = padded(task.marks, rows);
+    task.features += image * task.features_step;
+    task.centre += image * task.size;
+    task.factor += image * task.factor_step;
+    task.norms = task.norms ? task.norms + image * task.pixels : NULL;
+    task.landmarks += image * whole * (task.size + 2);
+    task.whitening += image * whole * task.marks;
+    task.depths = task.depths ? task.depths + image * whole / rows : NULL;
+    return task;
+}
+
+static void run_columns(struct work *work, long image, long piece, long first, long last, float *scratch)
+{
+    const struct columns task = of_image(*(const struct columns *)work->task, image, SETS[work->level].rows);
+    (void)piece;
+    SETS[work->level].columns(&task, first, last, scratch);
+}
+
+int nlfilter_columns(int level, int threads, long pixels, long images, long size, long marks, const float *features,
+                     long features_step, long features_stride, const float *centre, const float *landmarks,
+                     const float *whitening, float floor, int limited, float *factor, long factor_step,
+                     long factor_stride, float *norms)
+{
+    const long rows = SETS[level].rows, whole = padded(marks, rows);
+    long *depths = malloc(images * whole / rows * sizeof(long));
+    float *packed = pack(landmarks, images, marks, size + 2, rows, NULL);
+    float *whiteners = depths ? pack(whitening, images, marks, marks, rows, depths) : NULL;
+    const struct columns task = {
+        .features = features, .features_step = features_step, .features_stride = features_stride, .centre = centre,
+        .factor = factor, .factor_step = factor_step, .factor_stride = factor_stride, .norms = norms, .pixels = pixels,
+        .size = size, .marks = marks, .floor = floor, .limited = limited, .landmarks = packed, .whitening = whiteners,
+        .depths = depths};
+    struct work work = {.run = run_columns, .task = &task, .level = level, .images = images, .pixels = pixels,
+                        .floats = (size + 3 + 2 * whole) * MOST_PIXELS};
+    const int status = packed && whiteners ? divide(&work, threads, CHUNK) : -1;
     free(depths);
     free(packed);
     free(whiteners);
     return status;
 }
 
-/* The transpose of a square matrix in blocks of `rows` of its rows, as above; of a lower triangle each block begins
- * with the first column that is not zero in it. */
-static float *pack_transpose(const float *matrix, long size, long rows, int lower)
-{
-    float *packed = malloc(padded(size, rows) * size * sizeof(float)), *target = packed;
-    for (long m = 0; packed && m < size; m += rows)
-        for (long k = lower ? m : 0; k < size; k++)
-            for (long r = m; r < m + rows; r++)
-                *target++ = r < size ? matrix[k * size + r] : 0.0f;
-    return packed;
-}
-
-static int is_lower(const float *matrix, long size)
-{
-    for (long m = 0; m < size; m++)
-        for (long n = m + 1; n < size; n++)
-            if (matrix[m * size + n] != 0.0f)
-                return 0;
-    return 1;
-}
-
 static void run_backward(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
-    const struct backward *task = work->task;
-    const long sums = task->columns.marks * (task->columns.marks + task->columns.size + 1);
-    (void)image;
-    SETS[work->level].backward(task, first, last, scratch, work->totals + piece * sums);
+    struct backward task = *(const struct backward *)work->task;
+    const long rows = SETS[work->level].rows, marks = task.columns.marks, size = task.columns.size;
+    task.columns = of_image(task.columns, image, rows);
+    task.left = task.left ? task.left + image * padded(marks, rows) * task.rank : NULL;
+    task.right += image * task.right_step;
+    task.scale += image * task.columns.pixels;
+    task.diagonal += image * task.columns.pixels;
+    task.points += image * padded(size + 1, rows) * marks;
+    task.moved += image * size * task.columns.pixels;
+    SETS[work->level].backward(&task, first, last, scratch, work->totals + piece * marks * (marks + size + 1));
 }
 
-/* left is NULL, and right the gradient of the columns itself, where rank is the number of landmarks. */
-int nlfilter_backward(int level, int threads, long pixels, long size, long marks, const float *features,
-                      long features_stride, const float *centre, const float *landmarks, const float *whitening,
-                      float floor, int limited, float *factor, long factor_stride, const float *scale, long rank,
-                      const float *left, const float *right, long right_stride, const float *diagonal,
-                      const float *points, float *moved, double *totals)
+/* Without `left` it is `right` that is the derivative by the columns, and `rank` the number of landmarks. */
+int nlfilter_backward(int level, int threads, long pixels, long images, long size, long marks, const float *features,
+                      long features_step, long features_stride, const float *centre, const float *landmarks,
+                      const float *whitening, float floor, int limited, float *factor, long factor_step,
+                      long factor_stride, const float *scale, long rank, const float *left, const float *right,
+                      long right_step, long right_stride, const float *diagonal, const float *points, float *moved,
+                      double *totals)
 {
     const long rows = SETS[level].rows, tile_rows = padded(marks, 12), feature_rows = padded(size + 2, 4);
+    const long fitting = NEAR / (2 * tile_rows + feature_rows) / MOST_PIXELS;
     const long spare = 2 + (rank > padded(size + 1, rows) ? rank : padded(size + 1, rows));
-    const long fitting = NEAR / (2 * tile_rows + feature_rows) / MOST_PIXELS, lower = is_lower(whitening, marks);
-    float *packed[] = {pack(landmarks, marks, size + 2, rows, NULL), pack_transpose(whitening, marks, rows, lower),
-                       pack(points, size + 1, marks, rows, NULL), left ? pack(left, marks, rank, rows, NULL) : NULL};
+    const int lower = are_lower(whitening, images, marks);
+    float *packed[] = {pack(landmarks, images, marks, size + 2, rows, NULL),
+                       pack_transposes(whitening, images, marks, rows, lower),
+                       pack(points, images, size + 1, marks, rows, NULL),
+                       left ? pack(left, images, marks, rank, rows, NULL) : NULL};
     const struct backward task = {
-        .columns = {features, centre, factor, NULL, features_stride, factor_stride, size, marks, floor, limited,
-                    packed[0], packed[1], NULL},
-        .left = packed[3], .right = right, .rank = rank, .right_stride = right_stride, .scale = scale,
-        .diagonal = diagonal, .points = packed[2], .moved = moved, .moved_stride = pixels, .lower = lower,
+        .columns = {.features = features, .features_step = features_step, .features_stride = features_stride,
+                    .centre = centre, .factor = factor, .factor_step = factor_step, .factor_stride = factor_stride,
+                    .pixels = pixels, .size = size, .marks = marks, .floor = floor, .limited = limited,
+                    .landmarks = packed[0], .whitening = packed[1]},
+        .points = packed[2], .left = packed[3], .right = right, .rank = rank, .right_step = right_step,
+        .right_stride = right_stride, .scale = scale, .diagonal = diagonal, .moved = moved, .lower = lower,
         .tiles = fitting < 1 ? 1 : fitting > 16 ? 16 : fitting, .rows = tile_rows, .feature_rows = feature_rows};
-    struct work work = {.run = run_backward, .task = &task, .level = level, .images = 1, .pixels = pixels,
+    struct work work = {.run = run_backward, .task = &task, .level = level, .images = images, .pixels = pixels,
                         .floats = (task.tiles * (2 * tile_rows + feature_rows) + spare) * MOST_PIXELS};
-    const int short_of_memory = !packed[0] || !packed[1] || !packed[2] || (left && !packed[3]);
-    const int status = short_of_memory ? -1 : add_up(&work, threads, marks * (marks + size + 1), totals);
+    const int enough = packed[0] && packed[1] && packed[2] && (packed[3] || !left);
+    const int status = enough ? add_up(&work, threads, marks * (marks + size + 1), totals) : -1;
     for (int k = 0; k < 4; k++)
         free(packed[k]);
     return status;

@@ -22,9 +22,11 @@ static inline long padded(long count, long step) { return (count + step - 1) / s
 struct columns {
     const float *features, *centre; /* (D, N), (D) */
     float *factor, *norms;          /* (M, N), (N): |u|^2 before it is limited, if it is */
-    long features_stride, factor_stride, size, marks;
-    float floor; /* of the exponents */
-    int limited; /* columns longer than 1 are shortened */
+    long size, marks, pixels;
+    long features_stride, factor_stride;
+    long features_step, factor_step; /* from one image of a batch to the next; everything else is contiguous */
+    float floor;                     /* of the exponents */
+    int limited;                     /* columns longer than 1 are shortened */
     /* Matrices in blocks of ROWS rows, each stored by columns up to the last that is not zero. */
     const float *landmarks, *whitening;
     const long *depths; /* columns of each block of the whitening */
@@ -37,7 +39,7 @@ struct backward {
     const float *scale, *diagonal; /* (N), by which columns were shortened, and the derivative by 1 - |u|^2 */
     const float *points;           /* (D + 1, M) in blocks: what slopes of exponents move the features by */
     float *moved;                  /* (D, N), derivatives by the features */
-    long rank, right_stride, moved_stride;
+    long rank, right_stride, right_step;
     long tiles, rows, feature_rows; /* how many are worked on together, and their rows */
     int lower;                      /* the whitening is a lower triangle */
 };
@@ -57,7 +59,7 @@ struct thin {
 
 struct grams {
     const float *factor, *scaling, *remainder; /* (M, N), (N), (N) */
-    long factor_stride, marks, count;
+    long factor_stride, factor_step, marks, count;
     long rows, step; /* of a tile of F: with rows of zeros below it, and so many pixels that it stays in the cache */
 };
 
