@@ -154,8 +154,9 @@ def solve(
             for _ in range(REFINEMENTS):
                 part = sample.scaling(total)
                 # J is positive definite; its Cholesky factor, unlike batched LU in MKL, withstands several threads.
-                inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(sample.jacobian(part)).L)
-                total = total - inverse @ (total - sample.moment(part) - error)
+                lower = torch.linalg.cholesky_ex(sample.jacobian(part)).L
+                total = total - torch.cholesky_solve(total - sample.moment(part) - error, lower)
+            inverse = torch.cholesky_inverse(lower)
         else:
             total = total - inverse @ (total - found)
         scaling, found = _sweep(factor, diagonal, total, shard)

@@ -126,12 +126,13 @@ def from_first(tensor: Tensor, shard: Shard | None) -> Tensor:
 
 def gather_columns(features: Tensor, indices: Tensor, shard: Shard | None) -> Tensor:
     """Columns (B, D, S) of the features (B, D, N), wherever they are, by their pixels' indices in the whole image."""
-    planes = features.flatten(0, 1)  # torch selects columns of a matrix three times as fast as any other way
+    # Under one index for all planes torch gathers on all cores, and selects on one.
+    batch, size, _ = features.shape
     if shard is None:
-        return planes.index_select(1, indices).unflatten(0, features.shape[:2])
+        return features.gather(2, indices.expand(batch, size, -1))
     local = indices - shard.first * shard.width
     here = (local >= 0) & (local < features.shape[2])
-    columns = planes.index_select(1, local.clamp(0, features.shape[2] - 1)).unflatten(0, features.shape[:2])
+    columns = features.gather(2, local.clamp(0, features.shape[2] - 1).expand(batch, size, -1))
     return reduce_sum(torch.where(here, columns, torch.zeros_like(columns)), shard)
 
 
