@@ -120,8 +120,10 @@ def test_landmarks_pass_gradients_to_the_features(sampling: str) -> None:
 
 def test_kmeans_does_not_mind_an_offset() -> None:
     x = torch.from_numpy(photograph("camera", 20, 30).copy()).float().view(1, 1, -1) * 10
-    near, far = (choose_landmarks(x + shift, (20, 30), 20, "kmeans", seeded()) - shift for shift in (0.0, 256.0))
-    torch.testing.assert_close(near, far, atol=1e-3, rtol=0)
+    near, far = (choose_landmarks(x + shift, (20, 30), 20, "kmeans", seeded()) - shift for shift in (0.0, 4096.0))
+    # Grey levels are often as far from one centre as from another. Rounding decides; what the centres are worth stays.
+    spread, spread_far = ((x - marks.mT).square().amin(1).mean() for marks in (near, far))
+    assert spread_far < 1.1 * spread
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
