@@ -165,11 +165,7 @@ def _fill_natively(
     features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool, factor: Tensor, norms: Tensor
 ) -> None:
     """:func:`_fill` by the kernel in C."""
-    affinity = Affinity(landmarks, complete)
-    native.columns(
-        features, affinity.centre.squeeze(2), affinity.rows, whitening, affinity.floor,
-        limited=complete, out=factor, norms=norms,
-    )  # fmt: skip
+    native.columns(features, Affinity(landmarks, complete), whitening, limited=complete, out=factor, norms=norms)
 
 
 def _backward_natively(
@@ -188,9 +184,8 @@ def _backward_natively(
     points = 2.0 * torch.cat([affinity.landmarks, torch.ones_like(landmarks[:, :1])], dim=1)
     grad_features = large_empty(features.shape, features)
     grad_whitening, sums = native.columns_backward(
-        features, affinity.centre.squeeze(2), affinity.rows, whitening, affinity.floor,
-        limited=complete, factor=factor, scale=scale, gradient=factors_of(grad_factor), diagonal=grad_diagonal,
-        points=points, out=grad_features,
+        features, affinity, whitening, limited=complete, factor=factor, scale=scale,
+        gradient=factors_of(grad_factor), diagonal=grad_diagonal, points=points, out=grad_features,
     )  # fmt: skip
     grad_landmarks = 2.0 * (sums[:, :, :-1].mT - affinity.landmarks * sums[:, None, :, -1])
     return grad_features, grad_landmarks.to(landmarks), grad_whitening.to(whitening)

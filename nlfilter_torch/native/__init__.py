@@ -1,19 +1,23 @@
 """Kernels in C for what filters on processors spend their time in; without them torch does the same, more slowly.
 
 They are compiled when the package is installed (``hatch_build.py``), for Linux on x86-64, where there is GCC. Nothing
-is compiled or looked for later. They take single precision only and know no derivatives: callers ask :func:`suits`.
+is compiled or looked for later. They take single precision only and are hidden from autograd: callers ask
+:func:`suits`.
 """
 
 import ctypes
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from nlfilter_torch.checks import is_transformed
+
+if TYPE_CHECKING:
+    from nlfilter_torch.nystrom import Affinity
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
 LEVELS = ("none", "AVX2", "AVX-512")
@@ -81,42 +85,31 @@ def suits(*tensors: Tensor) -> bool:
 
 
 def columns(
-    features: Tensor,
-    centre: Tensor,
-    landmarks: Tensor,
-    whitening: Tensor,
-    floor: float,
-    *,
-    limited: bool,
-    out: Tensor,
-    norms: Tensor,
+    features: Tensor, affinity: "Affinity", whitening: Tensor, *, limited: bool, out: Tensor, norms: Tensor
 ) -> None:
     """Columns of the Nystrom factor, written to ``out``.
 
     Args:
         features: (B, D, N).
-        centre: (B, D), taken from them.
-        landmarks: (B, M, D + 2), of which the product with (x, 1, |x|^2) is the logarithm, to base 2, of the affinity.
+        affinity: to the landmarks.
         whitening: (B, M, M).
-        floor: the least logarithm.
         limited: whether columns are shortened to norm 1.
         out: (B, M, N), rows in one piece.
         norms: (B, N), in one piece; takes the squared norms of columns before they are shortened, if they are.
     """
-    features, centre, landmarks, whitening = _by_rows(features), *_contiguous(centre, landmarks, whitening)
+    features = _by_rows(features)
+    centre, landmarks, whitening = _contiguous(affinity.centre, affinity.rows, whitening)
     batch, size, pixels = features.shape
     _run(
         "columns", _threads(out), pixels, batch, size, out.shape[1], *_place(features), centre.data_ptr(),
-        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, *_place(out), norms.data_ptr(),
+        landmarks.data_ptr(), whitening.data_ptr(), affinity.floor, limited, *_place(out), norms.data_ptr(),
     )  # fmt: skip
 
 
 def columns_backward(
     features: Tensor,
-    centre: Tensor,
-    landmarks: Tensor,
+    affinity: "Affinity",
     whitening: Tensor,
-    floor: float,
     *,
     limited: bool,
     factor: Tensor,
@@ -130,10 +123,8 @@ def columns_backward(
 
     Args:
         features: (B, D, N).
-        centre: (B, D).
-        landmarks: (B, M, D + 2), as there.
+        affinity: to the landmarks.
         whitening: (B, M, M).
-        floor: the least logarithm.
         limited: whether columns were shortened to norm 1.
         factor: (B, M, N), the columns.
         scale: (B, N), what they were shortened by.
@@ -148,15 +139,15 @@ def columns_backward(
     """
     features, factor, right = map(_by_rows, (features, factor, gradient[-1]))
     left = gradient[0].contiguous() if len(gradient) == 2 else None
-    centre, landmarks, whitening, points = _contiguous(centre, landmarks, whitening, points)
+    centre, landmarks, whitening, points = _contiguous(affinity.centre, affinity.rows, whitening, points)
     scale, diagonal = _contiguous(scale, diagonal)
     (batch, size, pixels), marks = features.shape, factor.shape[1]
     sums = torch.empty(batch, marks * (marks + size + 1), dtype=torch.float64)
     _run(
         "backward", _threads(factor), pixels, batch, size, marks, *_place(features), centre.data_ptr(),
-        landmarks.data_ptr(), whitening.data_ptr(), floor, limited, *_place(factor), scale.data_ptr(), right.shape[1],
-        None if left is None else left.data_ptr(), *_place(right), diagonal.data_ptr(), points.data_ptr(),
-        out.data_ptr(), sums.data_ptr(),
+        landmarks.data_ptr(), whitening.data_ptr(), affinity.floor, limited, *_place(factor), scale.data_ptr(),
+        right.shape[1], None if left is None else left.data_ptr(), *_place(right), diagonal.data_ptr(),
+        points.data_ptr(), out.data_ptr(), sums.data_ptr(),
     )  # fmt: skip
     by_whitening, products = sums.split([marks * marks, marks * (size + 1)], dim=1)
     return by_whitening.unflatten(1, (marks, marks)), products.unflatten(1, (marks, size + 1))

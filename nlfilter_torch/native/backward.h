@@ -10,13 +10,8 @@ INLINE void NAME(receive)(const struct backward *task, long start, long width, f
         memcpy(target + k * PIXELS, NAME(fetch)(task->right + k * task->right_stride + start, width, 0.0f, edge),
                PIXELS * sizeof(float));
     }
-    for (long m = 0; task->left && m < columns->marks; m += ROWS) {
-        FLOATS sums[ROWS][VECTORS];
-        NAME(multiply)(task->left + m * task->rank, right, task->rank, sums);
-        for (int r = 0; r < ROWS; r++)
-            for (int v = 0; v < VECTORS; v++)
-                *(FLOATS *)(gradient + (m + r) * PIXELS + v * LANES) = sums[r][v];
-    }
+    if (task->left)
+        NAME(apply)(task->left, columns->marks, right, task->rank, gradient);
     if (!columns->limited)
         return;
     FLOATS along[VECTORS], scale[VECTORS];
@@ -51,13 +46,7 @@ INLINE void NAME(move)(const struct backward *task, long start, long width, cons
                        float *moved)
 {
     const long size = task->columns.size;
-    for (long k = 0; k < size + 1; k += ROWS) {
-        FLOATS sums[ROWS][VECTORS];
-        NAME(multiply)(task->points + k * task->columns.marks, slopes, task->columns.marks, sums);
-        for (int r = 0; r < ROWS; r++)
-            for (int v = 0; v < VECTORS; v++)
-                *(FLOATS *)(moved + (k + r) * PIXELS + v * LANES) = sums[r][v];
-    }
+    NAME(apply)(task->points, size + 1, slopes, task->columns.marks, moved);
     for (long k = 0; k < size; k++) {
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(moved + k * PIXELS + v * LANES) -= *(const FLOATS *)(features + k * PIXELS + v * LANES) *

@@ -1,4 +1,5 @@
-/* Columns of the Nystrom factor, its products, and landmarks, in single precision on processors of the x86-64 kind.
+/* Columns of the Nystrom factor, their derivatives, its products, and landmarks, in single precision on processors of
+ * the x86-64 kind.
  *
  * The same mathematics as in the files of Python that each part names. What they do with several passes over blocks of
  * memory happens here in the registers: distances, exponentials, whitening by a matrix of which the empty triangle is

@@ -59,6 +59,18 @@ INLINE void NAME(multiply)(const float *rows, const float *tile, long depth, FLO
     }
 }
 
+/* A tile (count, PIXELS) in whole blocks = a packed matrix (count, depth) times a tile (depth, PIXELS). */
+INLINE void NAME(apply)(const float *matrix, long count, const float *tile, long depth, float *out)
+{
+    for (long m = 0; m < count; m += ROWS) {
+        FLOATS sums[ROWS][VECTORS];
+        NAME(multiply)(matrix + m * depth, tile, depth, sums);
+        for (int r = 0; r < ROWS; r++)
+            for (int v = 0; v < VECTORS; v++)
+                *(FLOATS *)(out + (m + r) * PIXELS + v * LANES) = sums[r][v];
+    }
+}
+
 /* sums = rows of left times rows of right, lane by lane: `tiles` tiles of `length` pixels each, in which rows are
  * `stride` apart. */
 INLINE void NAME(correlate)(const float *left, long left_step, const float *right, long right_step, long tiles,
