@@ -82,15 +82,12 @@ class _Balance(torch.autograd.Function):
     def forward(
         ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, shard: Shard | None
     ) -> tuple[Tensor, Tensor, int]:
-        if completed:
-            scaling, total, residual, steps, inverse = newton.solve(factor, diagonal, tolerance, shard)
-        else:
-            scaling, total, residual, steps = chebyshev.solve(factor, diagonal, tolerance, shard)
-            inverse = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device)
-        ctx.save_for_backward(factor, diagonal, scaling, total, inverse)
+        solve = newton.solve if completed else chebyshev.solve
+        found = solve(factor, diagonal, tolerance, shard)
+        ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse)
         ctx.shard = shard
-        ctx.mark_non_differentiable(residual)
-        return scaling, residual, steps
+        ctx.mark_non_differentiable(found.residual)
+        return found.scaling, found.residual, found.sweeps
 
     @staticmethod
     @once_differentiable
