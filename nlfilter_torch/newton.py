@@ -30,6 +30,7 @@ LARGE = 64  # the part that the sample is at least: larger images have rarer pix
 GUESSES = 3  # steps of the first guess towards its fixed point; more gain nothing for pixels outside its sample
 REFINEMENTS = 3  # steps of Newton's method on the sample; after two the Jacobian still changes
 UNIFORM = 0.05  # of the sample is drawn uniformly, so that no pixel of it stands for more than 20 times its share
+EXCESS = 4e-5  # by which rounding may take the d of a pixel above 1
 LARGEST = 2.0  # bounds d while t is a guess; a larger one is left to the damped method
 MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
@@ -49,6 +50,43 @@ def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tens
     # Without a diagonal a negative sum has no root; the bound, below the rounding of 1 - |u|^2, keeps d finite.
     least = torch.finfo(half.dtype).eps / 4
     return torch.where(half < 0, (root - half) / diagonal.clamp(min=least), (root + half).clamp(min=least).reciprocal())
+
+
+def isolated(scaling: Tensor) -> Tensor:
+    """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
+
+    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1.
+    """
+    return scaling > 1 + EXCESS
+
+
+@dataclass(frozen=True, eq=False)
+class PixelScaling:
+    """What the scaling of any pixel of a balanced image is a function of, beside the pixel's own column.
+
+    Attributes:
+        moment: t, (B, M, 1).
+        completed: the kernel has a unit diagonal.
+        before: moments that found pixels to be isolated, before these were taken out.
+    """
+
+    moment: Tensor
+    completed: bool
+    before: tuple[Tensor, ...] = ()
+
+    def __call__(self, factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
+        """Scaling d and diagonal part r of W, (B, n), of pixels with columns (B, M, n) and (B, n).
+
+        A pixel that is isolated has d = 0 and r = 1.
+        """
+        scaling = scaling_from_moment(factor, diagonal, self.moment.to(factor))
+        remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
+        if not self.completed:
+            return scaling, remainder
+        alone = isolated(scaling)
+        for total in self.before:
+            alone = alone | isolated(scaling_from_moment(factor, diagonal, total.to(factor)))
+        return torch.where(alone, 0.0, scaling), torch.where(alone, 1.0, remainder)
 
 
 @dataclass(frozen=True)
@@ -252,7 +290,7 @@ def damped(factor: Tensor, diagonal: Tensor, start: Solution, tolerance: float, 
     """Balance by Newton's method on d itself, with an exact line search: it converges from any start.
 
     A balanced d is the one minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
-    whatever the signs of its entries. With d changing by ``s d x`` the step x solves ``(I + W) x = 1 - W 1``: one system
+    whatever the signs of its entries. With d changing by ``s d x`` the step x solves ``(I + W) x = 1 - W 1``, a system
     of M equations with the Jacobian J of all pixels. Along x the function is a quadratic and a sum of logarithms, whose
     minimum takes no further read of the factor.
     """
@@ -283,7 +321,7 @@ def damped(factor: Tensor, diagonal: Tensor, start: Solution, tolerance: float, 
 
 
 def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None) -> Tensor:
-    """The length s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, x and 1 - W 1 in (B, N)."""
+    """The s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
     # W 1 = 1 - lacking and W x = lacking - x make the quadratic known.
     linear = reduce_sum((step * (1 - lacking)).sum(1, keepdim=True), shard)
     square = reduce_sum((step * (lacking - step)).sum(1, keepdim=True), shard)

@@ -30,11 +30,13 @@ class Balancing:
 
     Attributes:
         scaling: d, (B, N), positive; differentiable in factor and diagonal.
+        moment: ``factor @ d``, (B, M, 1) in float64, without a gradient.
         residual: largest deviation of a row sum of W from 1, (B,).
         steps: sweeps over the factor that it took.
     """
 
     scaling: Tensor
+    moment: Tensor
     residual: Tensor
     steps: int
 
@@ -58,13 +60,13 @@ def balance(
         shard: of the image, where other ranks have the rest of it.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
+    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
     if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
         warn(
             f"balancing left row sums off by up to {residual.max().item():.1e}; "
             "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
         )
-    return Balancing(scaling, residual, int(steps))
+    return Balancing(scaling, total, residual, int(steps))
 
 
 class _Balance(torch.autograd.Function):
@@ -81,13 +83,13 @@ class _Balance(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, shard: Shard | None
-    ) -> tuple[Tensor, Tensor, int]:
+    ) -> tuple[Tensor, Tensor, Tensor, int]:
         solve = newton.solve if completed else chebyshev.solve
         found = solve(factor, diagonal, tolerance, shard)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse)
         ctx.shard = shard
-        ctx.mark_non_differentiable(found.residual)
-        return found.scaling, found.residual, found.sweeps
+        ctx.mark_non_differentiable(found.moment, found.residual)
+        return found.scaling, found.moment, found.residual, found.sweeps
 
     @staticmethod
     @once_differentiable

@@ -180,17 +180,14 @@ class Spectrum(RitzPairs):
 def compute_spectrum(
     factor: Tensor,
     scaling: Tensor,
-    diagonal: Tensor | None,
+    remainder: Tensor | None,
     size: tuple[int, int],
     rank: int | None,
     shard: Shard | None = None,
 ) -> Spectrum:
-    """Spectrum of ``W``; ``diagonal`` is None where W has no diagonal part."""
-    remainder = None if diagonal is None else scaling.square() * diagonal
+    """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
-    recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else sum_grams  # transforms of torch.func know no such class
-    grams = reduce_sum(sums(factor, scaling, remainder, 1 if remainder is None else 2), shard)
+    grams = reduce_sum(compute_grams(factor, scaling, remainder, 1 if remainder is None else 2), shard)
     pairs = RitzPairs.of_sums(grams, factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
@@ -237,6 +234,14 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
                 left = torch.mul(left, weights[:, :, block], out=weighted)
             total[:, j] += left @ rows.mT
     return total.sum(0, keepdim=True) if parts > 1 else total
+
+
+def compute_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
+    """:func:`sum_grams`, differentiable."""
+    recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
+    sums = _Grams.apply if recorded else sum_grams  # transforms of torch.func know no such class
+    grams: Tensor = sums(factor, scaling, remainder, count)
+    return grams
 
 
 class _Grams(torch.autograd.Function):
