@@ -20,6 +20,8 @@ ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop t
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
 SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
 STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it are left to the damped method
+SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
+STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it are left to the damped method
 LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
 
 
