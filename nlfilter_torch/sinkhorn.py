@@ -54,15 +54,17 @@ def balance(
     Args:
         factor: (B, M, N).
         diagonal: (B, N), non-negative.
-        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. A residual that ends above it
-            and above 1e-4 (1e-9 in float64) is told in a warning, on processors.
+        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a residual
+            that ends above it and above 1e-4 (1e-9 in float64) raises a warning.
         completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
         shard: of the image, where other ranks have the rest of it.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
     scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
     if factor.device.type == "cpu" and not bool((residual <= max(tolerance, ALARM[factor.dtype])).all()):
-        remedy = "raise photometric_bandwidth or num_landmarks" + (", or use completion='diagonal'" if not completed else "")
+        remedy = "raise photometric_bandwidth or num_landmarks" + (
+            ", or use completion='diagonal'" if not completed else ""
+        )
         warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
     return Balancing(scaling, total, residual, int(steps))
 
