@@ -106,8 +106,7 @@ class _Balance(torch.autograd.Function):
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
         grad_factor = outer_product(totals, torch.stack([-a, -scaling], dim=1).to(dtype))
-        grad_diagonal = (-a * scaling).to(dtype) if ctx.completed else None  # without completion it is a constant
-        return grad_factor, grad_diagonal, None, None, None
+        return grad_factor, (-a * scaling).to(dtype), None, None, None
 
 
 def _weighted_moment(factor: Tensor, weight: Tensor, shard: Shard | None, total: Tensor) -> Tensor:
