@@ -14,23 +14,23 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from nlfilter_torch import instruction_sets
 from nlfilter_torch.checks import is_transformed
 
 if TYPE_CHECKING:
     from nlfilter_torch.nystrom import Affinity
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
-LEVELS = ("none", "AVX2", "AVX-512")
+LEVELS = instruction_sets.NAMES
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
 
 
 def _load() -> ctypes.CDLL | None:
     """The compiled library, if the installation has one."""
-    path = Path(__file__).with_name("kernels.so")
-    if not path.exists():
+    library = instruction_sets.load_library()
+    if library is None:
         return None
-    library = ctypes.CDLL(str(path))
     shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
     share_threads(library, _openmp())
     planes: list[Any] = [_POINTER, _LONG, _LONG]  # (B, R, N) and their strides
@@ -64,7 +64,7 @@ def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
 
 
 _library = _load()
-level: int = _library.nlfilter_level() if _library else 0  # of LEVELS, what this processor and installation can do
+level = instruction_sets.level(_library)  # of LEVELS, what this processor and installation can do
 
 
 def suits(*tensors: Tensor) -> bool:
