@@ -8,112 +8,48 @@ broken. The cases depend on the seed alone.
 
 import argparse
 import json
-import math
-import multiprocessing
-import random
+import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from benchmarks.fuzz.cases import random_case
-from benchmarks.fuzz.checks import PROMISES, Figure, Findings, check_case
-from benchmarks.fuzz.functions import check_call, random_call
-from benchmarks.fuzz.pictures import check_picture, pictures
+from benchmarks.fuzz.checks import PROMISES, Figure
+from benchmarks.fuzz.pictures import pictures
+from benchmarks.fuzz.running import Check, Result, function_case, operator_case, picture_case, rank, results
 from nlfilter_torch.files import open_beside
 
 WORKERS = 2
-SHOWN = 10  # failures printed for each promise; the file has all
+SHOWN = 5  # kinds of warnings printed
 CASES = 1000
 
 
-@dataclass(frozen=True)
-class Result:
-    """One case: its number, what it was, its figures (the worst of each promise) and its warnings."""
-
-    number: int
-    what: str
-    figures: list[Figure]
-    warned: list[str]
-
-
-Check = Callable[[int], tuple[str, Findings]]
-
-
-def operator_case(seed: int, number: int) -> tuple[str, Findings]:
-    """Random case ``number``."""
-    case = random_case(random.Random(f"{seed}:{number}"))
-    return str(case), check_case(case)
-
-
-def picture_case(seed: int, number: int) -> tuple[str, Findings]:
-    """Case ``number`` of the pictures."""
-    picture = pictures(seed)[number]
-    return str(picture), check_picture(picture)
-
-
-def function_case(seed: int, number: int) -> tuple[str, Findings]:
-    """Random call ``number``."""
-    call = random_call(random.Random(f"{seed}:call:{number}"))
-    return str(call), check_call(call)
-
-
-def run(check: Check, number: int) -> Result:
-    """Check one case and keep the worst figure of each promise: the one that exceeds its limit most."""
-    what, findings = check(number)
-    worst: dict[str, Figure] = {}
-    for figure in findings.figures:
-        if figure.promise not in worst or _rank(figure) > _rank(worst[figure.promise]):
-            worst[figure.promise] = figure
-    return Result(number, what, list(worst.values()), findings.warned)
-
-
-def _rank(figure: Figure) -> tuple[bool, float]:
-    return figure.broken, figure.value - figure.limit if figure.value == figure.value else math.inf
-
-
-def results(check: Check, numbers: Iterable[int], workers: int) -> Iterator[Result]:
-    """Of all cases, in their order."""
-    if workers == 1:
-        yield from map(partial(run, check), numbers)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_one_thread) as executor:
-        yield from executor.map(partial(run, check), numbers, chunksize=8)
-
-
-def _one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 def report(found: list[Result], command: str) -> int:
-    """Print the table and the failures; the number of broken promises."""
+    """Print the table, and the first case of every kind of failure; the number of broken promises."""
     print(f"{'promise':62} {'cases':>6} {'broken':>6}  worst")
-    lines = []
+    kinds: dict[tuple[str, str], list[tuple[Result, Figure]]] = {}
     for promise in PROMISES:
         figures = [(result, figure) for result in found for figure in result.figures if figure.promise == promise]
         if not figures:
             continue
         broken = [(result, figure) for result, figure in figures if figure.broken]
-        _, worst = max(figures, key=lambda pair: _rank(pair[1]))
-        print(f"{promise:62} {len(figures):6d} {len(broken):6d}  {worst.value:.2g}, limit {worst.limit:g}")
-        lines += [(promise, *pair) for pair in broken[:SHOWN]]
-        if len(broken) > SHOWN:
-            lines.append((promise, None, len(broken) - SHOWN))
-    warned = Counter(text.split(";")[0].split(" by up to ")[0][:60] for result in found for text in result.warned)
-    for text, count in warned.most_common(5):
-        print(f"  warned {count} times: {text}")
-    for promise, result, figure in lines:
-        if result is None:
-            print(f"{promise}: {figure} more")
-        else:
-            print(f"{promise}: {figure.value:.3g} {figure.detail}\n  {command} --case {result.number}  # {result.what}")
-    return sum(figure.broken for result in found for figure in result.figures)
+        _, worst = max(figures, key=lambda pair: rank(pair[1]))
+        print(f"{promise:62} {len(figures):6d} {len(broken):6d}  {worst.value:.5g}, limit {worst.limit:g}")
+        for result, figure in broken:
+            kinds.setdefault((promise, re.sub(r"\d[\d.e+-]*|\(.*?\)", "#", figure.detail)), []).append((result, figure))
+    warned = Counter(
+        re.sub(r"\d[\d.e+-]*", "#", text.split(";")[0])[:100] for result in found for text in result.warned
+    )
+    for text, count in warned.most_common(SHOWN):
+        print(f"warned {count} times: {text}")
+    for (promise, _), failures in kinds.items():
+        result, figure = max(failures, key=lambda pair: rank(pair[1]))
+        print(f"{promise}, {len(failures)} such, worst {figure.value:.5g} {figure.detail}")
+        print(f"  {command} --case {result.number}  # {result.what}")
+    return sum(map(len, kinds.values()))
 
 
 def details(check: Check, number: int) -> int:

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.photographs import photograph
+from nlfilter_torch.landmarks import Sampling
 
 SIDE = 64
 CROPPED = ("astronaut", "camera", "chelsea", "coffee", "moon", "page", "rocket", "text")
-SAMPLINGS = ("kmeans", "uniform", "random")
+SAMPLINGS: tuple[Sampling, ...] = ("kmeans", "uniform", "random")
 ORDINARY = 1.5  # largest value of a guide for which an operator must always be found
 
 
@@ -179,7 +180,7 @@ def _repeated(rng: random.Random, channels: int, height: int, width: int) -> Ten
 def _smooth(rng: random.Random, channels: int, height: int, width: int) -> Tensor:
     rows, columns = _grid(height, width)
     waves = [torch.sin(rng.uniform(0, 0.4) * rows + rng.uniform(0, 0.4) * columns + rng.uniform(0, 6)) for _ in "abc"]
-    return 0.5 + sum(waves)[None] / 6
+    return 0.5 + torch.stack(waves).sum(0, keepdim=True) / 6
 
 
 def _any_noise(rng: random.Random, channels: int, height: int, width: int) -> Tensor:
@@ -189,11 +190,10 @@ def _any_noise(rng: random.Random, channels: int, height: int, width: int) -> Te
 
 def _photograph(rng: random.Random, channels: int, height: int, width: int) -> Tensor:
     picture = photograph(rng.choice(CROPPED))[0]
-    step = rng.choice((1, 2, 4))
-    rows, columns = picture.shape[1] // step, picture.shape[2] // step
-    top, left = rng.randint(0, rows - height), rng.randint(0, columns - width)
-    crop = picture[:, ::step, ::step][:, top : top + height, left : left + width]
-    return crop[torch.arange(channels) % len(crop)]
+    step = rng.choice((1, 2))
+    picture = picture[:, ::step, ::step]
+    top, left = rng.randint(0, picture.shape[1] - height), rng.randint(0, picture.shape[2] - width)
+    return picture[torch.arange(channels) % len(picture), top : top + height, left : left + width]
 
 
 CONTENTS = {

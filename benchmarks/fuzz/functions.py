@@ -145,7 +145,7 @@ def _responses(scene: Scene) -> Callable[[Tensor], Tensor]:
 
 
 def _wrong_response(scene: Scene) -> Any:
-    return scene.rng.choice((lambda x: None, lambda x: "text", lambda x: x[:, :1], lambda x: x / 0, None, 1.0))
+    return scene.rng.choice((lambda x: None, lambda x: "text", lambda x: x[:, :1], None, 1.0))
 
 
 def _layer(**options: Any) -> Tensor:
@@ -212,7 +212,8 @@ FUNCTIONS = {
     "fit_alpha": Function(
         nlf.fit_alpha,
         OPERATOR | {"image": _image(3), "target": _image(3)},
-        ORDER | {"mask": NEGATIVE["negative"], "ridge": _plain(0, 1), "shared": _one_of(True, False)}
+        ORDER
+        | {"mask": NEGATIVE["negative"], "ridge": _plain(0, 1), "shared": _one_of(True, False)}
         | {"rounding": _plain(0, 0.01)},
     ),
     "filter_frames": Function(
@@ -250,13 +251,16 @@ FUNCTIONS = {
     "abstract": Function(
         nlf.abstract,
         {"image": _image(1, 3)},
-        LOCAL | BANDWIDTH | {"power": _number(0, 2), "edges": _plain(0, 1), "edge_width": _short_side(0.5)}
+        LOCAL
+        | BANDWIDTH
+        | {"power": _number(0, 2), "edges": _plain(0, 1), "edge_width": _short_side(0.5)}
         | {"tones": _count(2, 9)},
     ),
     "defocus": Function(
         nlf.defocus,
         {"image": _image(1, 3), "focus_region": lambda scene: scene.mask(1)},
-        LOCAL | {"radius": _short_side(0.5), "aperture": _one_of("disc", "gaussian")}
+        LOCAL
+        | {"radius": _short_side(0.5), "aperture": _one_of("disc", "gaussian")}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "recolor": Function(
@@ -267,7 +271,8 @@ FUNCTIONS = {
     "colorize": Function(
         nlf.colorize,
         {"grey": _image(1)} | PAINTED,
-        LOCAL | {"method": _one_of("regression", "kmeans"), "strength": _number(0, 1), "time": _number(0.1, 5)}
+        LOCAL
+        | {"method": _one_of("regression", "kmeans"), "strength": _number(0, 1), "time": _number(0.1, 5)}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "NonlocalFilter": Function(
@@ -275,9 +280,11 @@ FUNCTIONS = {
     ),
     "NonlocalAffinity": Function(_affinity, {"image": _image(1, 3)}, FILTER | GUIDED | {"learn": _one_of(())}),
     "PolynomialSliders": Function(_sliders, OPERATOR | IMAGE | LIST, RESIDUAL | {"learn": _one_of((), ("alpha",))}),
-    "DiffusionMask": Function(_diffusion_module, SPECTRUM | REGION, NUMBERS | {"learn": _one_of((), ("time", "width"))}),
+    "DiffusionMask": Function(
+        _diffusion_module, SPECTRUM | REGION, NUMBERS | {"learn": _one_of((), ("time", "width"))}
+    ),
     "SegmentMask": Function(_segment_module, SPECTRUM | REGIONS, {"time": NUMBERS["time"]}),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -302,7 +309,8 @@ def random_call(rng: random.Random) -> Call:
     arguments |= {key: kind(scene) for key, kind in function.optional.items() if rng.random() < 0.4}
     if "num_landmarks" in function.optional:  # no more than pixels, as its default may be
         arguments.setdefault("num_landmarks", 16)
-    wrong = rng.choice(tuple(arguments)) if rng.random() < 0.5 else None
+    candidates = [key for key in arguments if "." not in name or key != "operator"]  # whose method it is
+    wrong = rng.choice(candidates) if candidates and rng.random() < 0.5 else None
     if wrong is not None:
         arguments[wrong] = _wrong_response(scene) if wrong == "response" else _wrong(rng, wrong, arguments[wrong])
     return Call(name, arguments, wrong)
@@ -384,4 +392,4 @@ def _shown(value: Any) -> str:
         return f"{str(value.dtype).removeprefix('torch.')}{tuple(value.shape)}" if value.numel() != 1 else str(value)
     if isinstance(value, nlf.NonlocalOperator | nlf.Spectrum | torch.Generator):
         return type(value).__name__
-    return repr(value)[:60]
+    return "a function" if callable(value) else repr(value)[:60]

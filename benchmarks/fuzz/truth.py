@@ -50,7 +50,8 @@ class Exact:
         if self.diagonal.shape[1] <= DENSE:
             values = torch.linalg.eigvalsh(self.dense())
             return values[:, 0], values[:, -1]
-        return self.diagonal.amin(1), torch.stack([_largest(*pair) for pair in zip(self.factor, self.diagonal)])
+        pairs = zip(self.factor, self.diagonal, strict=True)
+        return self.diagonal.amin(1), torch.stack([_largest(*pair) for pair in pairs])
 
 
 def _largest(factor: Tensor, diagonal: Tensor) -> Tensor:
@@ -67,8 +68,9 @@ def _largest(factor: Tensor, diagonal: Tensor) -> Tensor:
         inverse = (value - diagonal).reciprocal()
         values, vectors = torch.linalg.eigh((factor * inverse) @ factor.mT)
         m, x = values[-1], inverse * (vectors[:, -1] @ factor)
-        quotient = value + (m - 1) * m / x.square().sum().clamp(min=torch.finfo(torch.float64).tiny)
-        before, best = best, torch.maximum(best, quotient)
+        if not x.any():
+            break
+        before, best = best, torch.maximum(best, value + (m - 1) * m / x.square().sum())
         value = torch.maximum(best, floor + 1e-10 * (1 + floor.abs()))
         if best - before <= 1e-9 * best:
             break
