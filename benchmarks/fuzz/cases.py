@@ -13,6 +13,7 @@ from nlfilter_torch.landmarks import Sampling
 
 SIDE = 64
 CROPPED = ("astronaut", "camera", "chelsea", "coffee", "moon", "page", "rocket", "text")
+HARD = ("checkerboard", "stripes", "two-valued", "spikes", "ramp", "photograph")  # drawn more often
 SAMPLINGS: tuple[Sampling, ...] = ("kmeans", "uniform", "random")
 ORDINARY = 1.5  # largest value of a guide for which an operator must always be found
 
@@ -56,7 +57,7 @@ def random_case(rng: random.Random, side: int = SIDE) -> Case:
     dtype = rng.choice((torch.float32, torch.float32, torch.float64))
     names, images = zip(*(_content(rng, channels, height, width) for _ in range(batch)), strict=True)
     guide = torch.stack(images).to(dtype)
-    patch_size = rng.choice((1, 3, 5, 7))
+    patch_size = rng.choice((1, 1, 3, 5, 7))
     options: dict[str, Any] = {
         "patch_size": patch_size,
         "photometric_bandwidth": "auto" if rng.random() < 0.25 else _bandwidth(rng, 1e-3, 10.0, batch),
@@ -98,7 +99,7 @@ def _shown(value: object) -> str:
 
 def _content(rng: random.Random, channels: int, height: int, width: int) -> tuple[str, Tensor]:
     """What an image shows, and the image (C, H, W) in float64."""
-    name = rng.choice(tuple(CONTENTS))
+    name = rng.choice(HARD if rng.random() < 0.4 else tuple(CONTENTS))
     image = CONTENTS[name](rng, channels, height, width)
     return name, image.expand(channels, height, width).double()
 
