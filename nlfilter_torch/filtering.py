@@ -88,10 +88,10 @@ def polynomial_filter(
         image: y, (B, C, H, W).
         alpha: weights of the layers, fine to coarse, the last of the smooth layer: (k+1,), (B, k+1) per image, or
             (B, k+1, H, W) per pixel. Ones leave the image as it is.
-        residual: weight of what neither the eigenvectors explain nor W keeps, ``(1 - r) (y - V V^T y)`` with r the
-            operator's :attr:`~NonlocalOperator.diagonal_share` (zero without completion). None is alpha_1, which is
-            exactly eq. (12); 0.0 drops it, which is the paper's eq. (13) and Appendix B; 1.0 leaves it untouched, which
-            sharpens less noise. A number, or a tensor of shape () or (B,).
+        residual: weight of what the eigenvectors do not capture, ``y - V V^T y``. None is exactly eq. (12), which gives
+            it f(r), r being the operator's :attr:`~NonlocalOperator.diagonal_share`: alpha_1 without completion. 0.0
+            drops it, which is the paper's eq. (13) and Appendix B; 1.0 leaves it untouched, which sharpens less noise.
+            A number, or a tensor of shape () or (B,).
 
     Returns:
         (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in all of
@@ -114,19 +114,27 @@ def polynomial_filter(
     alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None:
-        explained = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
+        missed = image.to(filtered) - spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
         weight = replicate(residual, operator.shard)
-        # W passes a pixel like no other as r, close to 1, though no eigenvector in the span of the factor shows it.
-        missed = (1 - operator.diagonal_share) * (image.to(filtered) - explained)
-        filtered = filtered + residual_change(alpha, weight, missed)
+        filtered = filtered + residual_change(alpha, weight, missed, operator.diagonal_share)
     return filtered.to(image.dtype)
 
 
-def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor) -> Tensor:
-    """What ``missed`` (B, C, H, W) adds to a filtered image if its weight is to be another than alpha_1."""
-    finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
-    finest = finest.to(missed) if alpha.ndim == 4 else finest.to(missed).reshape(-1, 1, 1, 1)
-    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - finest) * missed
+def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor, remainder: Tensor) -> Tensor:
+    """What is added to a filtered image for ``missed``, the part that no eigenvector captures, to have its own weight.
+
+    W multiplies that part by r, as F annihilates it, so that the sliders have given it the weight f(r).
+
+    Args:
+        alpha: the sliders, of any shape that :func:`weigh_layers` takes.
+        residual: the weight it is to have.
+        missed: (B, C, H, W).
+        remainder: r, (B, 1, H, W).
+    """
+    entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
+    powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
+    gain = weigh_layers(layers_between(powers), alpha)
+    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - gain) * missed
 
 
 @full_precision

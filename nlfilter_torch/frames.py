@@ -17,7 +17,7 @@ from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import layers_between, residual_change, weigh_layers
 from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.newton import PixelScaling
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.thin import moment, spread
@@ -31,13 +31,13 @@ class FittedFilter:
 
     Attributes:
         kernel: landmarks, bandwidths and window.
-        balancing: sum of factor times scaling over the fitted image, (1, M, 1).
+        balancing: what the scaling of a pixel is a function of.
         moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
         explained: coefficients of the part of an image that the eigenvectors explain, (1, M, C).
     """
 
     kernel: Kernel
-    balancing: Tensor
+    balancing: PixelScaling
     moments: Tensor
     explained: Tensor
 
@@ -85,7 +85,7 @@ class FittedFilter:
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
         if residual is not None:
-            filtered = filtered + residual_change(alpha, residual, planes[:, count])
+            filtered = filtered + residual_change(alpha, residual, planes[:, count], planes[:, count + 1, :1])
         return filtered.to(image.dtype)
 
     def _planes(
@@ -98,7 +98,7 @@ class FittedFilter:
         by_rows: bool = False,
         missed: bool = False,
     ) -> Tensor:
-        """Layers (B, k+1, C, H, W) and, if asked for, what a residual weighs as one more, in the kernel's dtype."""
+        """Layers (B, k+1, C, H, W) and, if asked for, what they miss and r as two more, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
@@ -119,10 +119,10 @@ class FittedFilter:
         return torch.cat(planes, dim=-1).unflatten(-1, size)
 
     def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
-        """The same (B, k+1 or k+2, C, n) of pixels (B, C, n) with features (B, D, n)."""
+        """The same (B, k+1 or k+3, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
-        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor))
-        remainder = (scaling.square() * diagonal).unsqueeze(1)
+        scaling, remainder = self.balancing(factor, diagonal)
+        remainder = remainder.unsqueeze(1)
         smoothed = [image]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(torch.addcmul(spread(coefficients.mT, factor, scaling), remainder, smoothed[-1]))
@@ -130,7 +130,7 @@ class FittedFilter:
         if not missed:
             return layers
         explained = spread(self.explained.to(factor).mT, factor, scaling)
-        return torch.cat([layers, ((1 - remainder) * (image - explained)).unsqueeze(1)], dim=1)
+        return torch.cat([layers, torch.stack([image - explained, remainder.expand_as(image)], dim=1)], dim=1)
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:
@@ -170,7 +170,8 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = operator.scaling.unsqueeze(1)  # (1, 1, N)
-    balancing = moment(operator.factor, scaling, operator.shard)
+    # The moment of the factor itself has a gradient.
+    balancing = replace(operator.balancing, moment=moment(operator.factor, scaling, operator.shard))
     moments = torch.stack([moment(operator.factor, scaling * y, operator.shard) for y in before.unsqueeze(1)], dim=1)
     explained = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
     return FittedFilter(operator.kernel, balancing, moments, explained)

@@ -40,7 +40,7 @@ def _load() -> ctypes.CDLL | None:
     factor: list[Any] = [_LONG, _LONG, *planes]  # images, landmarks, (B, M, N)
     library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, *planes, _POINTER]
-    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _FLOAT, _POINTER, _POINTER]
+    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER]
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
@@ -177,29 +177,28 @@ def gather(images: Tensor, factor: Tensor) -> Tensor:
     return out
 
 
-def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, least: float, most: float) -> tuple[Tensor, Tensor]:
+def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, most: float) -> tuple[Tensor, Tensor]:
     """The scaling d of every pixel for a guess at its moment, and the moment that it has.
 
     Args:
         factor: (B, M, N).
         diagonal: (B, N).
         half: of the guess t, (B, M).
-        least: of half of u . t.
         most: of d.
 
     Returns:
         d (B, N), and factor @ d (B, M) in float64.
     """
-    return _sweep(factor, half, None, diagonal, least, most)
+    return _sweep(factor, half, None, diagonal, most)
 
 
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
     """``factor diag(weights) factor^T vector``, (B, M) in float64, of a factor (B, M, N), (B, N) and (B, M)."""
-    return _sweep(factor, vector, weights, None, 0.0, 0.0)[1]
+    return _sweep(factor, vector, weights, None, 0.0)[1]
 
 
 def _sweep(
-    factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, least: float, most: float
+    factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, most: float
 ) -> tuple[Tensor, Tensor]:
     factor = _by_rows(factor)
     batch, marks, pixels = factor.shape
@@ -208,7 +207,7 @@ def _sweep(
     out = factor.new_empty(batch, pixels)
     moment = factor.new_empty(batch, marks, dtype=torch.float64)
     _call(
-        "sweep", factor, row.data_ptr(), *(t if t is None else t.data_ptr() for t in (scaling, diagonal)), least, most,
+        "sweep", factor, row.data_ptr(), *(t if t is None else t.data_ptr() for t in (scaling, diagonal)), most,
         out.data_ptr(), moment.data_ptr(),
     )  # fmt: skip
     return out, moment
