@@ -81,12 +81,12 @@ def test_checks_notice_an_eigenvalue_above_one() -> None:
 
 
 def test_checks_notice_an_eigenvalue_below_zero() -> None:
-    diagonal = operator().diagonal.clone()
-    diagonal[0] -= 1.0
-    assert checks.EIGENVALUES in broken_promises(operator(diagonal=diagonal))
+    remainder = operator().remainder.clone()
+    remainder[0] -= 1.0
+    assert checks.EIGENVALUES in broken_promises(operator(remainder=remainder))
 
 
-@pytest.mark.parametrize("name", ["factor", "diagonal", "scaling", "residual"])
+@pytest.mark.parametrize("name", ["factor", "diagonal", "scaling", "remainder", "residual"])
 def test_checks_notice_what_is_not_finite(name: str) -> None:
     changed = getattr(operator(), name).clone()
     changed.view(-1)[0] = torch.nan

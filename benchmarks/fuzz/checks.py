@@ -22,7 +22,7 @@ ROW_SUMS = "row sums out of tolerance without a warning"
 EIGENVALUES = "eigenvalues outside [0, 1.0001]"
 REPORTED = "reported eigenvalues outside [0, 1]"
 ORTHONORMAL = "eigenvectors not orthonormal to 1e-3"
-DIAGNOSTICS = "diagnostics that are false"
+DIAGNOSTICS = "diagnostics or certificates that are false"
 PRODUCTS = "products that are not those of W"
 IDENTITY = "alpha = 1 changes the image"
 REFUSED = "errors on legal input"
@@ -160,7 +160,7 @@ def check_gradient(
 
 def check_operator(findings: Findings, operator: NonlocalOperator, image: Tensor, tolerance: float | None) -> bool:
     """Check an operator and what it does to an image (B, C, H, W); True if its numbers are finite."""
-    for name in ("factor", "diagonal", "scaling", "residual"):
+    for name in ("factor", "diagonal", "scaling", "remainder", "residual"):
         if not findings.finite(getattr(operator, name), name):
             return False
     exact, dtype = Exact.of(operator), operator.factor.dtype
@@ -173,6 +173,7 @@ def check_operator(findings: Findings, operator: NonlocalOperator, image: Tensor
     findings.note(EIGENVALUES, -least.min(), 1e-4, "smallest")
     findings.note(EIGENVALUES, most.max(), 1.0001, "largest")
     _check_spectrum(findings, operator, exact, most)
+    _check_certificate(findings, operator, errors, least, most)
 
     scale = most.clamp(min=1.0).max()
     precision = 1e-4 if dtype == torch.float32 else 1e-9
@@ -225,3 +226,19 @@ def _check_spectrum(findings: Findings, operator: NonlocalOperator, exact: Exact
         findings.note(DIAGNOSTICS, off[worst], 1e-3, f"{name} {true[worst]:.6g}, reported {reported[worst]:.6g}")
     sums = torch.tensor(told.row_sum_residual, dtype=torch.float64)
     _check_residual(findings, DIAGNOSTICS, exact.row_sum_errors(), sums, operator.factor.dtype)
+
+
+def _check_certificate(
+    findings: Findings, operator: NonlocalOperator, errors: Tensor, least: Tensor, most: Tensor
+) -> None:
+    """What :meth:`NonlocalOperator.certify` says: bounds that hold, and the upper one not far from the truth."""
+    told = operator.certify()
+    findings.note(DIAGNOSTICS, max(told.symmetry), ROUNDING[operator.factor.dtype], "certified symmetry")
+    sums = torch.tensor(told.row_sums, dtype=torch.float64)
+    _check_residual(findings, DIAGNOSTICS, errors, sums, operator.factor.dtype)
+    low, high = (
+        torch.tensor(getattr(told, f"{name}_eigenvalue"), dtype=torch.float64) for name in ("smallest", "largest")
+    )
+    detail = f"certified eigenvalues {low.min():.6g} to {high.max():.6g}, true {least.min():.6g} to {most.max():.6g}"
+    findings.note(DIAGNOSTICS, (low - least).max(), 1e-4, detail)
+    findings.note(DIAGNOSTICS, ((high - most).abs() / most.clamp(min=1.0)).max(), 1e-3, detail)

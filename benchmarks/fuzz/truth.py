@@ -26,12 +26,10 @@ class Exact:
     @staticmethod
     def of(operator: NonlocalOperator) -> "Exact":
         """W of an operator, for every image of its batch."""
-        scaling = operator.scaling.detach().double()
-        laziness = torch.as_tensor(getattr(operator, "laziness", 0.0)).detach().double().reshape(-1, 1)
-        return Exact(
-            operator.factor.detach().double() * scaling.unsqueeze(1),
-            scaling * (scaling * operator.diagonal.detach().double()) + laziness,
+        factor, scaling, remainder = (
+            t.detach().double() for t in (operator.factor, operator.scaling, operator.remainder)
         )
+        return Exact(factor * scaling.unsqueeze(1), remainder)
 
     def product(self, planes: Tensor) -> Tensor:
         """``W y`` for y (B, R, N)."""
