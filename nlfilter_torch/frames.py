@@ -12,7 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image, check_same_size
+from nlfilter_torch.checks import (
+    check_alpha,
+    check_image,
+    check_instance,
+    check_order,
+    check_photograph,
+    check_same_size,
+    check_weight,
+)
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import layers_between, residual_change, weigh_layers
@@ -160,7 +168,8 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
         >>> fitted.layers(image.roll(3, -1)[..., :10]).shape
         torch.Size([1, 4, 1, 24, 10])
     """
-    check_count(order, "order")
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_order(order)
     check_image(image, "image")
     if operator.factor.shape[0] != 1 or image.shape[0] != 1:
         raise ValueError(
@@ -207,7 +216,14 @@ def filter_frames(
         >>> [frame.shape for frame in edited]
         [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
     """
-    if not references:
+    check_alpha(alpha, dimensions=(1,))
+    if not isinstance(references, Sequence):
+        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
+    if not isinstance(frames, Iterable):
+        raise TypeError(f"frames must be images, got {type(frames).__name__}; pass a list or a generator")
+    if residual is not None:
+        check_weight(residual, "residual")
+    if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
     if len(references) > 1 and options.get("spatial_bandwidth") is not None:
         raise ValueError(
@@ -215,7 +231,7 @@ def filter_frames(
             "their coordinates would mean several places at once"
         )
     for frame in references:
-        check_image(frame, "references", batch=1)
+        check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
     # One above the other they are one image; the few patches across a seam are the price.
     tall = torch.cat([reduce_channels(frame, "luminance") for frame in references], dim=2)

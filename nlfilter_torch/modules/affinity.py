@@ -12,7 +12,8 @@ from nlfilter_torch.features import GuideChannels, unit_window
 from nlfilter_torch.landmarks import Sampling
 from nlfilter_torch.modules.learning import UnitWindow, check_learn, current, shown, start_or_positive
 from nlfilter_torch.nystrom import Completion
-from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.operator import NonlocalOperator, check_options, nonlocal_operator
+from nlfilter_torch.sharding import check_group
 
 LEARNABLE = ("photometric_bandwidth", "spatial_bandwidth", "patch_weights")
 
@@ -29,8 +30,7 @@ class NonlocalAffinity(nn.Module):
             neither pickled nor copied.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive; other options are checked
-            with the first guide.
+        TypeError, ValueError: if ``learn`` has another name, or an option is not one of :func:`nonlocal_operator`.
     """
 
     def __init__(
@@ -51,6 +51,16 @@ class NonlocalAffinity(nn.Module):
     ) -> None:
         super().__init__()
         names = check_learn(learn, LEARNABLE)
+        check_options(
+            num_landmarks=num_landmarks,
+            landmarks=landmarks,
+            completion=completion,
+            guide_channels=guide_channels,
+            tolerance=tolerance,
+            generator=generator,
+        )
+        check_group(group)
+        window = unit_window(patch_size, patch_weights)
         self.patch_size = patch_size
         self.num_landmarks = num_landmarks
         self.landmarks: Sampling = landmarks
@@ -76,10 +86,9 @@ class NonlocalAffinity(nn.Module):
         # Non-persistent: like the other options, it belongs to the constructor, not to what was learned.
         self.patch_weights: Tensor | UnitWindow | None
         if "patch_weights" in names:
-            self.patch_weights = UnitWindow(unit_window(patch_size, patch_weights))
+            self.patch_weights = UnitWindow(window)
         else:
-            given = None if patch_weights is None else unit_window(patch_size, patch_weights)
-            self.register_buffer("patch_weights", given, persistent=False)
+            self.register_buffer("patch_weights", None if patch_weights is None else window, persistent=False)
 
     def forward(self, guide: Tensor) -> NonlocalOperator:
         """Operator of a guide (B, C, H, W)."""

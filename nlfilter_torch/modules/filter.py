@@ -29,8 +29,8 @@ class NonlocalFilter(nn.Module):
         **options: of :func:`nonlocal_operator`.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive; other options are checked
-            with the first image.
+        TypeError, ValueError: if ``learn`` has another name, or ``alpha``, ``residual`` or an option is not as the two
+            layers take it.
 
     Example:
         >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), photometric_bandwidth=0.1, num_landmarks=30)
