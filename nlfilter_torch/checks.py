@@ -195,10 +195,16 @@ def _check_values(
 
 
 def _is_finite(value: float) -> bool:
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond the largest float
-        return False
+    return abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)  # torch takes no longer integers
+
+
+def check_pair(value: object, name: str) -> None:
+    """Raise unless ``value`` is a pair of integers that are not negative."""
+    if not isinstance(value, tuple | list) or not all(isinstance(v, int) and not isinstance(v, bool) for v in value):
+        raise TypeError(f"{name} must be a pair of ints, got {described(value)}; pass (0, 0) for none")
+    if len(value) != 2 or not all(0 <= v < 1 << 63 for v in value):
+        numbers = ", ".join(map(described, value))
+        raise ValueError(f"{name} must be two ints of at least 0, got ({numbers}); pass (0, 0) for none")
 
 
 def check_reach(value: float, name: str, size: tuple[int, int]) -> None:

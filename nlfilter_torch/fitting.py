@@ -20,6 +20,7 @@ from nlfilter_torch.checks import (
     check_number,
     check_order,
     check_same_size,
+    check_tensor,
 )
 from nlfilter_torch.filtering import detail_layers
 from nlfilter_torch.matrix_function import SymmetricMatrix
@@ -280,7 +281,14 @@ class _Problem:
             filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
             if mask is not None:
                 filtered = torch.lerp(target, filtered, mask.to(filtered))
-            value = loss(filtered, target) + self.ridge * change.square().sum()
+            found = loss(filtered, target)
+            check_tensor(found, "loss", "return a number that depends on the first image")
+            if found.numel() != 1 or not found.requires_grad:
+                raise ValueError(
+                    f"loss must return a single number with a gradient, got a tensor of shape {tuple(found.shape)}; "
+                    "compute it from the first image in torch"
+                )
+            value = found.sum() + self.ridge * change.square().sum()
             value.backward()
             return value
 

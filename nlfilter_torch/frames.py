@@ -17,8 +17,10 @@ from nlfilter_torch.checks import (
     check_image,
     check_instance,
     check_order,
+    check_pair,
     check_photograph,
     check_same_size,
+    check_tensor,
     check_weight,
 )
 from nlfilter_torch.colour import edit_luminance
@@ -89,6 +91,11 @@ class FittedFilter:
         ``by_rows`` works out one row after the other: the rounding of a product depends on its shape, which is then the
         same for tiles of any height.
         """
+        check_instance(by_rows, bool, "by_rows", "pass True or False")
+        check_tensor(image, "image", "convert it with torch.as_tensor")
+        check_alpha(alpha)
+        if residual is not None:
+            check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
         planes = self._planes(image, guide, origin, halo, by_rows=by_rows, missed=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
@@ -110,6 +117,10 @@ class FittedFilter:
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
+        check_pair(origin, "origin")
+        check_pair(halo, "halo")
+        if sum(halo) >= size[0]:
+            raise ValueError(f"halo must leave a row of the image's {size[0]}, got {tuple(halo)}; pass a taller tile")
         if guide is not None:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
@@ -219,7 +230,7 @@ def filter_frames(
     check_alpha(alpha, dimensions=(1,))
     if not isinstance(references, Sequence):
         raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
-    if not isinstance(frames, Iterable):
+    if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
         raise TypeError(f"frames must be images, got {type(frames).__name__}; pass a list or a generator")
     if residual is not None:
         check_weight(residual, "residual")

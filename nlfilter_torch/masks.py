@@ -25,6 +25,7 @@ from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.thin import moment, spread
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
+STEEPEST = 1e30  # pixels over width: no distance of 0 becomes NaN
 EXPLAINED = 0.005  # share of a region's kernel below which its place in the diffusion map is nearly the origin
 LOOKED_AT = 4096  # of a region's pixels
 ITERATIONS = 20  # of k-means, which starts close to its end
@@ -106,7 +107,7 @@ def diffusion_mask(
     # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
-    exponents = scale * distances
+    exponents = scale.clamp(max=STEEPEST) * distances
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = mask_of_exponents(inner, None if negative is None else outer)
     return mask.unflatten(2, spectrum.size).to(region.dtype)

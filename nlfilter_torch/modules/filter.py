@@ -74,6 +74,7 @@ class NonlocalFilter(nn.Module):
         Raises:
             TypeError, ValueError: if a tensor does not fit, or there are sliders for K regions but not K masks.
         """
+        check_image(image, "image")
         operator = self.affinity(image if guide is None else guide)
         if mask is not None:
             check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]))

@@ -56,7 +56,11 @@ class UnitWindow(nn.Module):
 
 def check_learn(learn: Collection[str], choices: Sequence[str]) -> frozenset[str]:
     """The names in ``learn``; raise ValueError if one of them is not among ``choices``."""
-    if not isinstance(learn, Collection) or any(not isinstance(name, str) for name in learn):
+    if (
+        not isinstance(learn, Collection)
+        or isinstance(learn, Tensor)
+        or any(not isinstance(name, str) for name in learn)
+    ):
         raise TypeError(f"learn must be a list of names, got {described(learn)}; choose from {', '.join(choices)}")
     names = frozenset([learn] if isinstance(learn, str) else learn)
     unknown = sorted(map(repr, names.difference(choices)))

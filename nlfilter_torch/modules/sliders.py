@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_alpha, check_weight, described
+from nlfilter_torch.checks import check_alpha, check_tensor, check_weight, described
 from nlfilter_torch.filtering import polynomial_filter, weigh_layers
 from nlfilter_torch.modules.learning import check_learn
 from nlfilter_torch.operator import NonlocalOperator
@@ -71,6 +71,11 @@ class PolynomialSliders(nn.Module):
 
     def combine(self, layers: Tensor, alpha: Tensor | None = None) -> Tensor:
         """The same, with ``residual`` alpha_1, from layers (B, k+1, C, H, W) of :func:`detail_layers` that are held."""
+        check_tensor(layers, "layers")
+        if layers.ndim != 5:
+            raise ValueError(
+                f"layers must have shape (B, k+1, C, H, W), got {tuple(layers.shape)}; take them from detail_layers"
+            )
         return weigh_layers(layers, self.alpha if alpha is None else alpha)
 
     def extra_repr(self) -> str:
