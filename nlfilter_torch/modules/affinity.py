@@ -6,11 +6,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.bandwidth import estimate_bandwidth
 from nlfilter_torch.checks import check_choice
 from nlfilter_torch.features import GuideChannels, unit_window
 from nlfilter_torch.landmarks import Sampling
-from nlfilter_torch.modules.learning import UnitWindow, check_learn, current, shown, start_or_positive
+from nlfilter_torch.modules.learning import Positive, UnitWindow, check_learn, current, shown, start_or_positive
 from nlfilter_torch.nystrom import Completion
 from nlfilter_torch.operator import NonlocalOperator, check_options, nonlocal_operator
 from nlfilter_torch.sharding import check_group
@@ -22,9 +21,8 @@ class NonlocalAffinity(nn.Module):
     """Guide to operator, a layer around :func:`nonlocal_operator`, whose options it takes.
 
     Args:
-        learn: what trains besides the network that makes the guide: any of ``"photometric_bandwidth"`` (of which
-            ``"auto"`` is then the start, image by image, and one factor trains), ``"spatial_bandwidth"`` (which must
-            have a number to start from) and ``"patch_weights"``. All stay positive.
+        learn: what trains besides the network that makes the guide: any of ``"photometric_bandwidth"`` and
+            ``"spatial_bandwidth"`` (which must have numbers to start from) and ``"patch_weights"``. All stay positive.
         **options: of :func:`nonlocal_operator`. A ``generator`` gives every call other landmarks; do not combine it
             with gradient checkpointing, which runs the layer twice and expects the same. A layer with a ``group`` is
             neither pickled nor copied.
@@ -70,11 +68,17 @@ class NonlocalAffinity(nn.Module):
         self.generator = generator
         self.group = group
 
-        self.automatic = isinstance(photometric_bandwidth, str)
+        self.photometric_bandwidth: float | Positive | Literal["auto"]
         if isinstance(photometric_bandwidth, str):
-            check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
-            photometric_bandwidth = 1.0  # a factor from here on
-        self.photometric_bandwidth = start_or_positive(photometric_bandwidth, "photometric_bandwidth", names)
+            check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
+            if "photometric_bandwidth" in names:
+                raise ValueError(
+                    "photometric_bandwidth must be a number to learn from, got 'auto'; "
+                    "pass the mean of estimate_bandwidth over a few guides"
+                )
+            self.photometric_bandwidth = photometric_bandwidth
+        else:
+            self.photometric_bandwidth = start_or_positive(photometric_bandwidth, "photometric_bandwidth", names)
         if spatial_bandwidth is None and "spatial_bandwidth" in names:
             raise ValueError(
                 "spatial_bandwidth must be a number of pixels to learn from, got None; "
@@ -92,16 +96,12 @@ class NonlocalAffinity(nn.Module):
 
     def forward(self, guide: Tensor) -> NonlocalOperator:
         """Operator of a guide (B, C, H, W)."""
-        photometric: float | Tensor | Literal["auto"] = current(self.photometric_bandwidth)
-        if self.automatic and isinstance(photometric, Tensor):
-            photometric = photometric * estimate_bandwidth(guide, guide_channels=self.guide_channels, group=self.group)
-        elif self.automatic:
-            photometric = "auto"
+        photometric = self.photometric_bandwidth
         weights = self.patch_weights
         return nonlocal_operator(
             guide,
             patch_size=self.patch_size,
-            photometric_bandwidth=photometric,
+            photometric_bandwidth=photometric if isinstance(photometric, str) else current(photometric),
             spatial_bandwidth=current(self.spatial_bandwidth),
             num_landmarks=self.num_landmarks,
             landmarks=self.landmarks,
@@ -115,11 +115,10 @@ class NonlocalAffinity(nn.Module):
 
     def extra_repr(self) -> str:
         """The options that decide what the operator does."""
-        photometric = shown(self.photometric_bandwidth)
-        if self.automatic:
-            photometric = "auto" if photometric == 1.0 else f"{photometric} * auto"
+        photometric = self.photometric_bandwidth
+        start = photometric if isinstance(photometric, str) else shown(photometric)
         return (
-            f"patch_size={self.patch_size}, photometric_bandwidth={photometric}, "
+            f"patch_size={self.patch_size}, photometric_bandwidth={start}, "
             f"spatial_bandwidth={shown(self.spatial_bandwidth)}, num_landmarks={self.num_landmarks}, "
             f"landmarks={self.landmarks!r}, completion={self.completion!r}, guide_channels={self.guide_channels!r}"
         )
