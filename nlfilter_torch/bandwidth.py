@@ -52,7 +52,7 @@ def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None)
         magnitude = gradients(guide, halo)
         count = magnitude[0].numel() if shard is None else guide.shape[1] * shard.pixels
         mean = reduce_sum(magnitude.sum((1, 2, 3), dtype=torch.float64), shard) / count
-        return bandwidth_of_gradient(mean).to(guide)
+        return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 
 def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:

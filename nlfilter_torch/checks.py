@@ -222,7 +222,7 @@ def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str
 
     Skipped where :func:`check_finite` is.
     """
-    given = torch.as_tensor(bandwidth).detach()
+    given = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
     if is_hidden(largest) or is_hidden(given):
         return
     limits = torch.finfo(largest.dtype)
