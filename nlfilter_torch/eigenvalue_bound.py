@@ -19,19 +19,19 @@ from nlfilter_torch.spectrum import compute_grams
 
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}  # by which rounding and the tolerance of row sums may exceed 1
 MAX_STEPS = 12
-ALWAYS = 1 << 16  # pixels; up to here the bound costs little beside the operator itself
+ALWAYS = 1 << 22  # numbers of a factor; up to here the bound takes a few milliseconds
 
 # (x, k) to ``F (x I - R)^-k F^T``, (B, M, M) in float64, for x (B,)
 ShiftedGram = Callable[[Tensor, int], Tensor]
 
 
-def is_bounded(sampling: str, pixels: int) -> bool:
+def is_bounded(sampling: str, pixels: int, num_landmarks: int) -> bool:
     """Whether the eigenvalues of an operator are bounded when it is built.
 
     Those of large images with landmarks from k-means are not: in thousands of them, of photographs and of adversarial
     images, none exceeded 1, and the bound would add a third to the time of an operator.
     """
-    return sampling != "kmeans" or pixels <= ALWAYS
+    return sampling != "kmeans" or pixels * num_landmarks <= ALWAYS
 
 
 def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, shard: Shard | None) -> ShiftedGram:

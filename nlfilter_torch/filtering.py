@@ -3,7 +3,16 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_count, check_image, check_same_size, check_shape
+from nlfilter_torch.checks import (
+    check_alpha,
+    check_image,
+    check_instance,
+    check_same_size,
+    check_shape,
+    check_tensor,
+    check_weight,
+    checked_response,
+)
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import reduce_sum, replicate
@@ -36,12 +45,12 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
         >>> layers.shape, bool((layers.sum(1) - image).abs().max() < 1e-5)
         (torch.Size([1, 3, 3, 24, 24]), True)
     """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     return _layers(operator, image, order).to(image.dtype)
 
 
 def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
     """The layers in the operator's dtype: differences of ``y, W y, ..., W^k y``."""
-    check_count(order, "order")
     powers = operator.powers(image, order)  # (B, k, C, H, W)
     first = image.to(powers).unsqueeze(1).expand(powers.shape[0], -1, -1, -1, -1)
     return layers_between(torch.cat([first, powers], dim=1))
@@ -98,8 +107,8 @@ def polynomial_filter(
         these and in the operator.
 
     Raises:
-        TypeError, ValueError: if ``image`` does not fit the operator, or ``alpha`` has fewer than two entries or
-            another shape.
+        TypeError, ValueError: if ``image`` does not fit the operator, ``alpha`` has fewer than two entries or another
+            shape, or ``residual`` is not finite or has another shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -109,7 +118,12 @@ def polynomial_filter(
         >>> crisp.shape
         torch.Size([1, 3, 24, 24])
     """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_tensor(image, "image", "convert it with torch.as_tensor")
     check_alpha(alpha)
+    if residual is not None:
+        batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
+        check_weight(residual, "residual", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
     alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
@@ -164,8 +178,9 @@ def spectral_filter(
         ``response``, with a finite gradient where eigenvalues meet.
 
     Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size, or
-            ``coefficients`` are not as many as it has.
+        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size,
+            ``coefficients`` are not as many as it has, ``response`` does not return a finite gain for every eigenvalue,
+            or ``residual`` is not finite or has another shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -177,6 +192,9 @@ def spectral_filter(
         >>> filtered.shape
         torch.Size([1, 1, 24, 24])
     """
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
+    response = checked_response(response, spectrum.support)
+    check_weight(residual, "residual", spectrum.factor.shape[0])
     if coefficients is None:
         coefficients = spectrum.coefficients(image)
     else:
@@ -209,6 +227,7 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
     """
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
     explained = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
     energy = reduce_sum(image.to(spectrum.factor).square().sum((1, 2, 3)), spectrum.shard)

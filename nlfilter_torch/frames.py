@@ -12,7 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image, check_same_size
+from nlfilter_torch.checks import (
+    check_alpha,
+    check_image,
+    check_instance,
+    check_order,
+    check_pair,
+    check_photograph,
+    check_same_size,
+    check_tensor,
+    check_weight,
+)
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import layers_between, residual_change, weigh_layers
@@ -81,6 +91,11 @@ class FittedFilter:
         ``by_rows`` works out one row after the other: the rounding of a product depends on its shape, which is then the
         same for tiles of any height.
         """
+        check_instance(by_rows, bool, "by_rows", "pass True or False")
+        check_tensor(image, "image", "convert it with torch.as_tensor")
+        check_alpha(alpha)
+        if residual is not None:
+            check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
         planes = self._planes(image, guide, origin, halo, by_rows=by_rows, missed=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
@@ -102,6 +117,10 @@ class FittedFilter:
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
+        check_pair(origin, "origin")
+        check_pair(halo, "halo")
+        if sum(halo) >= size[0]:
+            raise ValueError(f"halo must leave a row of the image's {size[0]}, got {tuple(halo)}; pass a taller tile")
         if guide is not None:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
@@ -160,7 +179,8 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
         >>> fitted.layers(image.roll(3, -1)[..., :10]).shape
         torch.Size([1, 4, 1, 24, 10])
     """
-    check_count(order, "order")
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_order(order)
     check_image(image, "image")
     if operator.factor.shape[0] != 1 or image.shape[0] != 1:
         raise ValueError(
@@ -208,7 +228,14 @@ def filter_frames(
         >>> [frame.shape for frame in edited]
         [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
     """
-    if not references:
+    check_alpha(alpha, dimensions=(1,))
+    if not isinstance(references, Sequence):
+        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
+    if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
+        raise TypeError(f"frames must be images, got {type(frames).__name__}; pass a list or a generator")
+    if residual is not None:
+        check_weight(residual, "residual")
+    if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
     if len(references) > 1 and options.get("spatial_bandwidth") is not None:
         raise ValueError(
@@ -216,7 +243,7 @@ def filter_frames(
             "their coordinates would mean several places at once"
         )
     for frame in references:
-        check_image(frame, "references", batch=1)
+        check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
     # One above the other they are one image; the few patches across a seam are the price.
     tall = torch.cat([reduce_channels(frame, "luminance") for frame in references], dim=2)

@@ -8,13 +8,20 @@ from torch import Tensor
 
 from nlfilter_torch.bandwidth import bandwidth_of_rows
 from nlfilter_torch.checks import (
-    check_bandwidth,
+    called_by_edit,
     check_choice,
     check_count,
     check_image,
+    check_instance,
+    check_number,
+    check_order,
     check_positive,
     check_same_size,
+    check_scale,
+    described,
+    is_hidden,
     warn,
+    warn_of_scale,
 )
 from nlfilter_torch.compilation import uncompiled
 from nlfilter_torch.eigenvalue_bound import is_bounded, largest_eigenvalue, limiter, shifted_gram
@@ -136,6 +143,7 @@ class NonlocalOperator:
     @full_precision
     def powers(self, image: Tensor, order: int) -> Tensor:
         """``W y, ..., W^k y`` as (B, k, C, H, W) in the operator's dtype; arguments and errors as :meth:`matmul`."""
+        check_order(order)
         check_image(image, "image")
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
@@ -242,6 +250,35 @@ class NonlocalOperator:
         )
 
 
+def check_options(
+    *,
+    num_landmarks: int,
+    landmarks: str,
+    completion: str,
+    guide_channels: str,
+    tolerance: float | None,
+    generator: torch.Generator | None,
+) -> None:
+    """Raise unless those options of :func:`nonlocal_operator` are right that can be checked without its guide."""
+    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    remedy = "choose one of these, and pass how many there are as num_landmarks"
+    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
+    check_choice(completion, "completion", ("diagonal", "none"))
+    check_count(num_landmarks, "num_landmarks")
+    if tolerance is not None:
+        check_number(tolerance, "tolerance", "pass a float or None")
+        check_positive(tolerance, "tolerance")
+    if generator is not None:
+        check_instance(generator, torch.Generator, "generator", "make one with torch.Generator()")
+
+
+def _is_small(bandwidth: float | Tensor | str) -> bool:
+    """Whether a photometric bandwidth is one for an image in [0, 1], or ``"auto"``."""
+    if isinstance(bandwidth, Tensor):
+        return not is_hidden(bandwidth) and bool((bandwidth.detach() < 1).all())
+    return isinstance(bandwidth, str) or bandwidth < 1
+
+
 @uncompiled
 @full_precision
 def nonlocal_operator(
@@ -266,8 +303,10 @@ def nonlocal_operator(
     (for k-means, the assignment of pixels to centroids) held.
 
     Args:
-        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network.
-        patch_size: p, odd; pixels outside the image are reflected.
+        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
+            channels with values above 16 is worth a warning, on processors, if the bandwidth is ``"auto"`` or below 1:
+            it is probably in [0, 255].
+        patch_size: p, odd, at most 101; pixels outside the image are reflected.
         photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
             shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
         spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
@@ -302,12 +341,22 @@ def nonlocal_operator(
         True
     """
     check_image(guide, "guide")
-    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"))
-    check_choice(completion, "completion", ("diagonal", "none"))
-    check_count(num_landmarks, "num_landmarks")
-    if tolerance is not None:
-        check_positive(tolerance, "tolerance")
+    check_options(
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        tolerance=tolerance,
+        generator=generator,
+    )
+    if isinstance(photometric_bandwidth, str):
+        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
+    else:
+        check_positive(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+    if _is_small(photometric_bandwidth) and not called_by_edit():
+        warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
     shard = meet(guide, group)
     size = (guide.shape[2], guide.shape[3])  # here
@@ -315,17 +364,18 @@ def nonlocal_operator(
     weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
     guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
     if isinstance(photometric_bandwidth, str):
-        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
         bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
     else:
-        check_bandwidth(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
         bandwidth = replicate(photometric_bandwidth, shard)
+    largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
+    check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
-        check_bandwidth(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+        farthest = torch.full_like(largest, max(height, width))
+        check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial_bandwidth = replicate(spatial_bandwidth, shard)
     if num_landmarks > height * width:
         warn(
-            f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; "
+            f"num_landmarks must be at most the number of pixels, {height * width}, got {described(num_landmarks)}; "
             "using every pixel"
         )
         num_landmarks = height * width
@@ -340,7 +390,7 @@ def nonlocal_operator(
     )
     points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator, shard)
     kernel = Kernel(weights, bandwidth, spatial_bandwidth, guide_channels, points, whitener(points), completion)
-    bounded = is_bounded(landmarks, height * width)
+    bounded = is_bounded(landmarks, height * width, num_landmarks)
     return assemble(features, kernel, size, tolerance=tolerance, bounded=bounded, shard=shard)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nlfilter_torch import native
 from nlfilter_torch.blocks import SWEPT, buffered_blocks, pixel_blocks, strip_count, strips
-from nlfilter_torch.checks import check_image, check_same_size
+from nlfilter_torch.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.precision import full_precision
@@ -68,8 +68,11 @@ class RitzPairs:
 
         Returns:
             Independent of the choice of eigenvectors; differentiable in the operator and in what ``response`` holds.
+
+        Raises:
+            TypeError, ValueError: if ``response`` does not return a finite gain for every eigenvalue.
         """
-        return self.root @ self.basis(response)
+        return self.root @ self.basis(checked_response(response, self.support))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +159,7 @@ class Spectrum(RitzPairs):
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
         """``V f(S) V^T y``, (B, C, H, W), for a response f and coefficients (B, C, M) of y: one read of the factor."""
+        check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
         weighted = total @ self.gain(response).mT

@@ -139,11 +139,12 @@ def fitted(rows: slice, group: Any, dtype: torch.dtype) -> Results:
 
 
 def layer(rows: slice, group: Any, dtype: torch.dtype) -> Results:
-    """The layer, with sliders for each of two regions, all that it has learning; bandwidths from "auto" on."""
+    """The layer, with sliders for each of two regions, all that it has learning."""
     image = torch.cat([picture(name, HEIGHT, WIDTH, dtype) for name in ("astronaut", "coffee")])[:, :, rows]
     learned = NonlocalFilter(
         alpha=((2.0, 1.5, 1.0), (0.5, 3.0, 1.1)),
         residual=1.0,
+        photometric_bandwidth=0.15,
         spatial_bandwidth=9.0,
         num_landmarks=12,
         learn=("alpha", "residual", "photometric_bandwidth", "spatial_bandwidth", "patch_weights"),

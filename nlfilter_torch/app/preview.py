@@ -87,7 +87,7 @@ def sampled_operator(
     kernel = Kernel(
         weights, bandwidth, detail.spatial_bandwidth, channels, points, whitener(points), completion="diagonal"
     )
-    return assemble(features, kernel, size, bounded=is_bounded(detail.sampling, features.shape[2]))
+    return assemble(features, kernel, size, bounded=is_bounded(detail.sampling, features.shape[2], count))
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,6 +186,6 @@ def _gather(
     if part is every:
         total = balance_by_passes(lambda: every("Balancing"), total, completed=completed)
     balancing = PixelScaling(total, completed)
-    if is_bounded(options.get("landmarks", "kmeans"), picture.pixels):
+    if is_bounded(options.get("landmarks", "kmeans"), picture.pixels, total.shape[1]):
         kernel = replace(kernel, limiter=limiter_by_passes(lambda: part("Bounding"), balancing))
     return kernel, balancing, sum_up(lambda: part("Summing up"), balancing, order)
