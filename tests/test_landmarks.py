@@ -5,7 +5,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch.landmarks import _sums_by_product, _sums_in_order, choose_landmarks
+from nlfilter_torch import landmarks
+from nlfilter_torch.landmarks import (
+    _pivots,
+    _sums_by_product,
+    _sums_in_order,
+    candidate_pixels,
+    choose_landmarks,
+    condense,
+)
 from nlfilter_torch.nystrom import nystrom_factor, whitener
 from tests.images import hard_images, photograph
 
@@ -107,6 +115,45 @@ def test_few_distinct_features_leave_the_landmarks_finite_and_usable(name: str, 
     factor, diagonal = nystrom_factor(x, landmarks, whitener(landmarks), "diagonal")
     assert factor.isfinite().all()
     assert diagonal.isfinite().all()
+
+
+@pytest.mark.parametrize(("count", "expected"), [(100, 6400), (512, 32768), (1000, 32768), (20_000, 40_000)])
+def test_candidates_stop_growing_with_the_landmarks(count: int, expected: int) -> None:
+    assert len(candidate_pixels((1000, 1000), count, "kmeans", seeded())) == expected
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(
+    dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x = 0.5 * cloud(2, 3000).to(dtype)
+    x[0, :, :300] *= 0.01  # many alike
+    x[0, :, 7:2900:1000] += 50.0 * torch.arange(1, 4)  # and three that are like no other
+
+    def residual() -> torch.Tensor:
+        pivots = _pivots(x, 300, seeded())
+        assert all(len(row.unique()) == 300 for row in pivots)
+        assert {7, 1007, 2007} <= set(pivots[0].tolist())
+        marks = condense(x, 300, seeded())
+        return nystrom_factor(x, marks, whitener(marks), "diagonal")[1].mean(1)
+
+    in_blocks = residual()
+    monkeypatch.setattr(landmarks, "DRAWN_SINGLY", 300)
+    assert (in_blocks < 1.25 * residual()).all()
+
+
+def test_starts_drawn_in_blocks_do_not_depend_on_the_batch() -> None:
+    x = cloud(2, 1000)
+    alone = torch.cat([_pivots(image, 300, seeded()) for image in x.split(1)])
+    assert torch.equal(_pivots(x, 300, seeded()), alone)
+
+
+def test_a_few_points_that_hold_all_of_the_residual_do_not_fill_a_block() -> None:
+    x = torch.zeros(1, 1, 1000, dtype=torch.float64)
+    x[0, 0, :5] = 50.0 * torch.arange(1, 6)
+    pivots = _pivots(x, 300, seeded())[0]
+    assert set(range(5)) <= set(pivots.tolist())
+    assert len(pivots.unique()) > 200
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)

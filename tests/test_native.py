@@ -179,6 +179,38 @@ def test_landmarks(level: int, batch: int, size: int, points: int, marks: int, m
     assert assignment.max() < max(marks // 2, 1) or marks <= 3
 
 
+@pytest.mark.parametrize(
+    "image",
+    [
+        torch.full((5, 8), 0.5),
+        torch.full((48, 64), 0.5),
+        ((torch.arange(16)[:, None] + torch.arange(24)) % 2).float(),
+        (torch.arange(24) % 4 / 4).expand(16, 24),
+        torch.rand(4, 6, generator=torch.Generator().manual_seed(0)).repeat(4, 4),
+    ],
+    ids=["constant", "large constant", "checkerboard", "stripes", "repeated patch"],
+)
+@pytest.mark.parametrize("spatial_bandwidth", [2.0, 5.0])
+@pytest.mark.parametrize("marks", [3, 10, 25])
+def test_ties_are_broken_by_one_rule(
+    level: int, image: torch.Tensor, spatial_bandwidth: float, marks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filtered = random(1, 1, *image.shape)
+
+    def build() -> tuple[torch.Tensor, torch.Tensor]:
+        operator = nonlocal_operator(
+            image[None, None],
+            photometric_bandwidth=0.1,
+            spatial_bandwidth=spatial_bandwidth,
+            num_landmarks=marks,
+            tolerance=1e-6,
+        )
+        return operator.kernel.landmarks, operator @ filtered
+
+    for found, expected in zip(build(), by_torch(monkeypatch, build), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+
 @pytest.mark.parametrize("pixels", [1, 300, 40_000])
 @pytest.mark.parametrize("marks", [1, 3, 50, 900])
 def test_weighted_moments(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:

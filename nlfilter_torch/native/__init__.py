@@ -41,7 +41,7 @@ def _load() -> ctypes.CDLL | None:
     library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, *planes, _POINTER]
     library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER]
-    library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, *[_POINTER] * 3]
+    library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     return library
@@ -213,13 +213,18 @@ def _sweep(
     return out, moment
 
 
-def lloyd(points: Tensor, start: Tensor, iterations: int) -> Tensor:
-    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M)."""
+def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M).
+
+    The first of those that are as near but for ``margin`` times the terms of which scores are the sums.
+    """
     points, start = points.contiguous(), start.contiguous()
     batch, size, count = points.shape
     nearest = torch.empty(batch, count, dtype=torch.int32)
-    arguments = (size, count, start.shape[2], iterations, points.data_ptr(), start.data_ptr(), nearest.data_ptr())
-    _run("lloyd", torch.get_num_threads(), batch, *arguments)
+    _run(
+        "lloyd", torch.get_num_threads(), batch, size, count, start.shape[2], iterations, margin, points.data_ptr(),
+        start.data_ptr(), nearest.data_ptr(),
+    )  # fmt: skip
     return nearest.long()
 
 

@@ -35,9 +35,9 @@ static void run_lloyd(struct work *work, long image, long piece, long first, lon
 }
 
 int nlfilter_lloyd(int level, int threads, long images, long size, long count, long marks, long iterations,
-                   const float *points, const float *start, int *nearest)
+                   float margin, const float *points, const float *start, int *nearest)
 {
-    struct lloyd task = {points, start, nearest, size, count, marks, iterations};
+    struct lloyd task = {points, start, nearest, size, count, marks, iterations, margin};
     struct work work = {.run = run_lloyd, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
                         .each = 1, .floats = (size + 1) * (2 * padded(marks, MOST_ROWS) + MOST_PIXELS)};
     return run_pieces(&work, threads);

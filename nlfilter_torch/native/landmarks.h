@@ -1,7 +1,7 @@
 /* The choice of landmarks; see landmarks.py. */
 
-/* The nearest of the packed centres (c, -|c|^2 / 2) to each of the points (D, S): where x . c - |c|^2 / 2 is largest;
- * and the sums (M, D + 1) of the points of each centre, with their number. */
+/* The nearest of the packed centres (c, -|c|^2 / 2) to each of the points (D, S): where x . c - |c|^2 / 2 is largest,
+ * the first of those that differ by rounding; and the sums (M, D + 1) of the points of each centre, with their number. */
 static TARGET void NAME(assign)(const struct lloyd *task, const float *points, const float *centres, float *tile,
                                 int *nearest, float *sums)
 {
@@ -14,19 +14,25 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
             memcpy(tile + k * PIXELS, points + k * count + start, width * sizeof(float));
             memset(tile + k * PIXELS + width, 0, (PIXELS - width) * sizeof(float));
         }
-        FLOATS best[VECTORS];
+        FLOATS bar[VECTORS], slack[VECTORS]; /* what a score must exceed to be better, and a part of by how much */
         INTS chosen[VECTORS];
         for (int v = 0; v < VECTORS; v++) {
-            best[v] = (FLOATS){0} - INFINITY;
+            bar[v] = (FLOATS){0} - INFINITY;
             chosen[v] = (INTS){0};
+            slack[v] = (FLOATS){0};
+            for (long k = 0; k < size; k++)
+                slack[v] += *(FLOATS *)(tile + k * PIXELS + v * LANES) * *(FLOATS *)(tile + k * PIXELS + v * LANES);
+            slack[v] *= task->margin;
         }
         for (long m = 0; m < task->marks; m += ROWS) {
             FLOATS scores[ROWS][VECTORS];
             NAME(multiply)(centres + m * (size + 1), tile, size + 1, scores);
             for (int r = 0; r < ROWS; r++)
                 for (int v = 0; v < VECTORS; v++) {
-                    const INTS better = scores[r][v] > best[v];
-                    best[v] = (FLOATS)(((INTS)scores[r][v] & better) | ((INTS)best[v] & ~better));
+                    const INTS better = scores[r][v] > bar[v];
+                    const FLOATS length = (FLOATS)((INTS)scores[r][v] & INT32_MAX);
+                    const FLOATS next = scores[r][v] + (slack[v] + task->margin * length);
+                    bar[v] = (FLOATS)(((INTS)next & better) | ((INTS)bar[v] & ~better));
                     chosen[v] = (((INTS){0} + (int)(m + r)) & better) | (chosen[v] & ~better);
                 }
         }

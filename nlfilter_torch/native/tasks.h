@@ -75,6 +75,7 @@ struct lloyd {
     const float *points, *start; /* (B, D, S), (B, D, M) */
     int *nearest;                /* (B, S) */
     long size, count, marks, iterations;
+    float margin; /* of scores that count as equal, relative to the terms of their sums */
 };
 
 /* What each instruction set computes, on pixels from first to last; see the files of the same names. */
