@@ -219,8 +219,8 @@ def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tens
     gram = SymmetricMatrix.of(grams[:, 0])
     kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
     root = gram.apply(torch.rsqrt, kept)
-    inner = gram.matrix @ gram.matrix + grams[:, 1:].sum(1)
-    projected = root @ inner @ root
+    # G^(-1/2) G^2 G^(-1/2) is G where it is kept; as a product it would be rounding in its smallest eigenvalues.
+    projected = gram.apply(lambda values: values, kept) + root @ grams[:, 1:].sum(1) @ root
     return root, (projected + projected.mT) / 2, kept.sum(1)
 
 
