@@ -52,16 +52,20 @@ def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None)
         magnitude = gradients(guide, halo)
         count = magnitude[0].numel() if shard is None else guide.shape[1] * shard.pixels
         mean = reduce_sum(magnitude.sum((1, 2, 3), dtype=torch.float64), shard) / count
-        return bandwidth_of_gradient(mean).to(guide)
+        return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 
 def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
     """Magnitude of the gradient (B, C, h, W) at the rows of a guide that lie between those of its halo."""
     # Central differences by slices take a twentieth of the time of a convolution, kornia's import not counted.
-    padded = F.pad(guide, (1, 1, 1, 1), mode="replicate")
+    padded = F.pad(guide / 2, (1, 1, 1, 1), mode="replicate")  # halved first: no finite value overflows
     down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-    return (down.square() + right.square()).sqrt()[:, :, halo[0] : guide.shape[2] - halo[1]] / 2
+    magnitude = (down.square() + right.square()).sqrt()
+    if magnitude.device.type != "cpu" or not bool(magnitude.sum().isfinite()):
+        # Cannot overflow, but on a processor the last digit may depend on the place of a pixel, and so on tiles.
+        magnitude = torch.hypot(down, right)
+    return magnitude[:, :, halo[0] : guide.shape[2] - halo[1]]
 
 
 def bandwidth_of_gradient(mean: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ A preview and the photograph it stands for are thus painted alike.
 """
 
 import re
+import reprlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.presets import is_number
+from nlfilter_torch.presets import is_within, shown
 
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 SMALLEST = 0.75  # pixels; the least radius, at which a dot still covers a pixel
@@ -49,21 +50,25 @@ class Stroke:
             ValueError: if ``value`` is no stroke.
         """
         if not isinstance(value, dict) or set(value) != {"points", "radius", "paint"}:
-            raise ValueError(f"{place} must hold strokes with points, radius and paint, got {value!r}; correct it")
+            raise ValueError(f"{place} must hold strokes with points, radius and paint, got {shown(value)}; correct it")
         points, radius, paint = value["points"], value["radius"], value["paint"]
         if not (isinstance(points, list) and points and all(map(_is_point, points))):
-            raise ValueError(f"points of a stroke in {place} must be pairs of numbers, got {points!r}; correct them")
-        if not (is_number(radius) and 0 < radius <= 1):
-            raise ValueError(f"radius of a stroke in {place} must be in (0, 1], got {radius!r}; correct it")
+            raise ValueError(
+                f"points of a stroke in {place} must be pairs of numbers, got {shown(points)}; correct them"
+            )
+        if not (is_within(radius, 0, 1) and radius > 0):
+            raise ValueError(f"radius of a stroke in {place} must be in (0, 1], got {shown(radius)}; correct it")
         is_colour = "colour" in words and isinstance(paint, str) and COLOUR.fullmatch(paint)
         if not is_colour and (paint not in words or paint == "colour"):
             wanted = ", ".join("a colour such as #c04020" if word == "colour" else word for word in words)
-            raise ValueError(f"paint of a stroke in {place} must be one of {wanted}, got {paint!r}; correct it")
+            raise ValueError(
+                f"paint of a stroke in {place} must be one of {wanted}, got {reprlib.repr(paint)}; correct it"
+            )
         return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), paint)
 
 
 def _is_point(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(is_number(v) and abs(v) <= 2 for v in value)
+    return isinstance(value, list) and len(value) == 2 and all(is_within(v, -2, 2) for v in value)
 
 
 def painted(strokes: Iterable[Stroke], word: str) -> tuple[Stroke, ...]:

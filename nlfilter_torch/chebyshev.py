@@ -11,13 +11,17 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
-from nlfilter_torch.newton import SMALLEST_AFFINITY, STALL
+from nlfilter_torch.newton import Solution, accepted, damped
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
 from nlfilter_torch.thin import gather, moment, spread
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
+SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
+STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it are left to the damped method
+SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
+STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it are left to the damped method
 LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
 
 
@@ -35,13 +39,11 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
 def _start(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
     total = moment(factor, torch.ones_like(diagonal).unsqueeze(1), shard).to(factor)
-    return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_AFFINITY).rsqrt()
+    return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_SUM).rsqrt()
 
 
-def solve(
-    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None
-) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Scaling (B, N), its moment (B, M, 1), its measured residual (B,), and the number of sweeps."""
+def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None) -> Solution:
+    """Balance any kernel: by Chebyshev's method where it converges, otherwise on processors by damped Newton steps."""
     scaling = _start(factor, diagonal, shard)
     total = moment(factor, scaling.unsqueeze(1), shard)
     move = torch.zeros_like(scaling)
@@ -66,4 +68,8 @@ def solve(
         if worst <= tolerance or stalled or sweeps == (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS):
             break
         scaling, total = following, next_total
-    return scaling, total, residual, sweeps
+    identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
+    found = Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
+    if not watched or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
+        return found
+    return damped(factor, diagonal, found, tolerance, shard)

@@ -6,18 +6,31 @@ Functions inside the package trust what they are given; only public functions ca
 import math
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+Response = Callable[[Tensor], Tensor]
+
+LARGEST_PATCH = 101  # features take its square times the memory of the guide
+LARGEST_ORDER = 1000  # each has a copy of the image
+FAR_OUTSIDE = 16.0  # of [0, 1]; brighter than what HDR pictures scaled to a white of 1 hold, darker than 8-bit ones
 
 
 def check_tensor(value: object, name: str, remedy: str = "convert it with torch.tensor") -> None:
     """Raise unless ``value`` is a tensor."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; {remedy}")
+
+
+def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
+    """Raise unless ``value`` is an instance of ``kind``."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be a {kind.__name__}, got {type(value).__name__}; {remedy}")
 
 
 def check_image(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
@@ -43,7 +56,7 @@ def check_image(image: Tensor, name: str, *, channels: int | None = None, batch:
 
 def check_finite(tensor: Tensor, name: str) -> None:
     """Raise if ``tensor`` holds NaN or infinity; skipped on accelerators (no synchronisation) and while compiling."""
-    if tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor):
+    if is_hidden(tensor):
         return
     values = tensor.detach()
     # Their sum tells in a tenth of the time that looking at each would take, unless finite ones overflow it.
@@ -56,11 +69,37 @@ def check_finite(tensor: Tensor, name: str) -> None:
 
 def check_unit_range(tensor: Tensor, name: str) -> None:
     """Raise unless all values are in [0, 1]; skipped where :func:`check_finite` is."""
-    if tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor):
+    if is_hidden(tensor):
         return
     low, high = tensor.detach().aminmax()
     if low < 0 or high > 1:
         raise ValueError(f"{name} must be in [0, 1], got values from {low:g} to {high:g}; scale or clamp it")
+
+
+def check_photograph(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
+    """:func:`check_image`, with a warning where values are far outside [0, 1], see :func:`warn_of_scale`."""
+    check_image(image, name, channels=channels, batch=batch)
+    warn_of_scale(image, name)
+
+
+def warn_of_scale(image: Tensor, name: str) -> None:
+    """Warn of an image of 1 or 3 channels with values above 16: its pixels are probably integers made into floats.
+
+    Skipped where :func:`check_finite` is. Other numbers of channels are feature maps, which may have any values, and
+    HDR pictures stay below.
+    """
+    if is_hidden(image) or image.shape[1] not in (1, 3):
+        return
+    largest = float(image.detach().max())
+    if largest > FAR_OUTSIDE:
+        warn(
+            f"{name} must be in [0, 1] or near it, got values up to {largest:g}; divide by the value of white, say 255"
+        )
+
+
+def is_hidden(tensor: Tensor) -> bool:
+    """Whether the values of a tensor are out of sight: on an accelerator, while compiling, or under a transform."""
+    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor)
 
 
 def is_transformed(tensor: Tensor) -> bool:
@@ -78,31 +117,94 @@ def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str
 
 
 def check_patch_size(patch_size: int) -> None:
-    """Raise unless ``patch_size`` is an odd positive integer."""
+    """Raise unless ``patch_size`` is an odd positive integer, and not so large that the features take all memory."""
     if isinstance(patch_size, bool) or not isinstance(patch_size, int):
         raise TypeError(f"patch_size must be an int, got {type(patch_size).__name__}; pass 1, 3, 5, ...")
     if patch_size < 1 or patch_size % 2 == 0:
-        raise ValueError(f"patch_size must be odd and at least 1, got {patch_size}; try {abs(patch_size) // 2 * 2 + 1}")
+        remedy = f"try {min(abs(patch_size) // 2 * 2 + 1, LARGEST_PATCH)}"
+        raise ValueError(f"patch_size must be odd and at least 1, got {described(patch_size)}; {remedy}")
+    if patch_size > LARGEST_PATCH:
+        raise ValueError(
+            f"patch_size must be at most {LARGEST_PATCH}, got {described(patch_size)}; reduce the image instead"
+        )
 
 
-def check_choice(value: str, name: str, choices: Sequence[str]) -> None:
+def check_choice(value: str, name: str, choices: Sequence[str], remedy: str = "choose one of these") -> None:
     """Raise unless ``value`` is one of ``choices``."""
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}; choose one of these")
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {described(value)}; {remedy}")
 
 
-def check_positive(value: float | Tensor, name: str) -> None:
-    """Raise unless ``value`` (a number, or a tensor on the CPU) is positive and finite everywhere."""
-    if isinstance(value, Tensor):
-        if value.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(value):
-            return
-        detached = value.detach()
-        if not bool(((detached > 0) & torch.isfinite(detached)).all()):
-            raise ValueError(f"{name} must be positive and finite, got {detached.tolist()}; clamp or reparametrise it")
-    elif isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a positive number")
-    elif not (value > 0 and math.isfinite(value)):
-        raise ValueError(f"{name} must be positive and finite, got {value}; pass a positive number")
+def described(value: object) -> str:
+    """A value of any type on one line of an error."""
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"an integer of {value.bit_length()} bits"
+    return repr(value) if value is None or isinstance(value, str | int | float) else type(value).__name__
+
+
+def check_number(value: object, name: str, remedy: str = "pass a float") -> None:
+    """Raise unless ``value`` is a number, rather than a tensor of them."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{name} must be a number, got {type(value).__name__}; {remedy}")
+
+
+def check_positive(value: float | Tensor, name: str, batch: int | None = None) -> None:
+    """Raise unless ``value`` is positive and finite; see :func:`_check_values`."""
+    _check_values(value, name, batch, "positive and finite", lambda v: v > 0, "pass a positive number")
+
+
+def check_not_negative(value: float | Tensor, name: str, remedy: str, batch: int | None = None) -> None:
+    """Raise unless ``value`` is at least 0 and finite; see :func:`_check_values`."""
+    _check_values(value, name, batch, "at least 0 and finite", lambda v: v >= 0, remedy)
+
+
+def check_weight(value: float | Tensor, name: str, batch: int | None = None) -> None:
+    """Raise unless ``value`` is finite; see :func:`_check_values`."""
+    _check_values(value, name, batch, "finite", lambda v: v == v, "1.0 changes nothing")
+
+
+def check_share(value: float | Tensor, name: str, batch: int | None = None, *, below: bool = False) -> None:
+    """Raise unless ``value`` is in [0, 1], or in [0, 1) where ``below``; see :func:`_check_values`."""
+    inside = (lambda v: (v >= 0) & (v < 1)) if below else (lambda v: (v >= 0) & (v <= 1))
+    _check_values(value, name, batch, f"in [0, 1{')' if below else ']'}", inside, "clamp it")
+
+
+def _check_values(
+    value: object, name: str, batch: int | None, wanted: str, inside: Callable[[Any], Any], remedy: str
+) -> None:
+    """Raise unless ``value`` is a finite number ``inside`` a range, or a tensor of such with shape () or (batch,).
+
+    The values of a tensor are looked at where :func:`check_finite` would.
+    """
+    if not isinstance(value, Tensor):
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number")
+        if not (inside(value) and _is_finite(value)):
+            raise ValueError(f"{name} must be {wanted}, got {described(value)}; {remedy}")
+        return
+    if value.dtype == torch.bool or value.dtype.is_complex:
+        raise TypeError(f"{name} must be a number or a tensor of real numbers, got {value.dtype}; convert it")
+    if value.numel() != 1 and (batch is None or tuple(value.shape) != (batch,)):
+        shapes = "()" if batch is None else f"() or ({batch},)"
+        raise ValueError(f"{name} must be a number or have shape {shapes}, got {tuple(value.shape)}; reshape it")
+    if is_hidden(value):
+        return
+    values = value.detach()
+    if not bool((inside(values) & torch.isfinite(values)).all()):
+        raise ValueError(f"{name} must be {wanted}, got {values.tolist()}; {remedy}")
+
+
+def _is_finite(value: float) -> bool:
+    return abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)  # torch takes no longer integers
+
+
+def check_pair(value: object, name: str) -> None:
+    """Raise unless ``value`` is a pair of integers that are not negative."""
+    if not isinstance(value, tuple | list) or not all(isinstance(v, int) and not isinstance(v, bool) for v in value):
+        raise TypeError(f"{name} must be a pair of ints, got {described(value)}; pass (0, 0) for none")
+    if len(value) != 2 or not all(0 <= v < 1 << 63 for v in value):
+        numbers = ", ".join(map(described, value))
+        raise ValueError(f"{name} must be two ints of at least 0, got ({numbers}); pass (0, 0) for none")
 
 
 def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
@@ -110,25 +212,45 @@ def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
     most = max(min(size) / 2, 2.0)  # a default for large images is none too large for tiny ones
     if not value <= most:
         raise ValueError(
-            f"{name} must be at most half the short side of the image, {most:g} pixels, got {value:g}; lower it"
+            f"{name} must be at most half the short side of the image, {most:g} pixels, got {described(value)}; "
+            "lower it"
         )
 
 
-def check_bandwidth(value: float | Tensor, name: str, batch: int) -> None:
-    """Raise unless ``value`` is one positive bandwidth, or one for every image of the batch."""
-    check_positive(value, name)
-    if isinstance(value, Tensor) and value.numel() != 1 and tuple(value.shape) != (batch,):
+def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str) -> None:
+    """Raise if a bandwidth is so small beside the ``largest`` magnitudes (B,) of what it divides that squares overflow.
+
+    Skipped where :func:`check_finite` is.
+    """
+    given = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
+    if is_hidden(largest) or is_hidden(given):
+        return
+    limits = torch.finfo(largest.dtype)
+    # Features are subtracted from each other, squared and added up, with a margin for the gradients.
+    smallest = (largest.double() / (limits.max**0.5 / 64)).clamp(min=4 * limits.tiny)
+    given = given.double().reshape(-1).expand_as(smallest)
+    if bool((given < smallest).any()):
+        worst = int((given / smallest).argmin())
+        least = 1.06 * float(smallest[worst])  # two digits of it are enough
         raise ValueError(
-            f"{name} must be a number or have shape () or ({batch},), got {tuple(value.shape)}; reshape it"
+            f"{name} must be at least {least:.2g} for {what} up to {float(largest[worst]):.2g}, "
+            f"got {float(given[worst]):.2g}; raise it"
         )
 
 
-def check_count(value: int, name: str) -> None:
-    """Raise unless ``value`` is a positive integer."""
+def check_count(value: int, name: str, *, least: int = 1, most: int | None = None) -> None:
+    """Raise unless ``value`` is an integer from ``least``, 1 if left out, to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"{name} must be an int, got {type(value).__name__}; pass a positive integer")
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1, got {value}; pass a positive integer")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {described(value)}; pass a positive integer")
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be at most {most}, got {described(value)}; lower it")
+
+
+def check_order(order: int) -> None:
+    """Raise unless ``order`` is a number of products with W that memory holds."""
+    check_count(order, "order", most=LARGEST_ORDER)
 
 
 def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) -> None:
@@ -136,6 +258,55 @@ def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) 
     check_tensor(tensor, name, remedy)
     if tensor.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}; {remedy}")
+
+
+def check_coefficients(coefficients: Tensor, factor: Tensor) -> None:
+    """Raise unless coefficients (b, C, M) in float64 fit a factor (B, M, N)."""
+    check_tensor(coefficients, "coefficients", "take spectrum.coefficients of an image")
+    batch, marks, _ = factor.shape
+    shape = tuple(coefficients.shape)
+    if coefficients.ndim != 3 or shape[2] != marks or 0 in shape or (shape[0] != batch and 1 not in (batch, shape[0])):
+        raise ValueError(
+            f"coefficients must have shape ({batch}, C, {marks}), got {shape}; take spectrum.coefficients of an image"
+        )
+    if coefficients.dtype != torch.float64:
+        raise TypeError(f"coefficients must be of dtype torch.float64, got {coefficients.dtype}; convert them")
+    check_finite(coefficients, "coefficients")
+
+
+def checked_response(response: Response, support: Tensor) -> Response:
+    """An elementwise function of eigenvalues, with a check of what it returns.
+
+    Args:
+        response: from eigenvalues (B, R) to as many gains.
+        support: (B, M) bool, which eigenvalues count.
+    """
+    if not callable(response):
+        raise TypeError(
+            f"response must be a function of the eigenvalues, got {type(response).__name__}; "
+            "pass one such as torch.sqrt"
+        )
+    remedy = "return one gain for every eigenvalue"
+
+    def checked(eigenvalues: Tensor) -> Tensor:
+        gains = response(eigenvalues)
+        check_tensor(gains, "response", remedy)
+        if gains.dtype.is_complex:
+            raise TypeError(f"response must be real, got {gains.dtype}; {remedy}")
+        try:
+            fits = torch.broadcast_shapes(gains.shape, eigenvalues.shape) == eigenvalues.shape
+        except RuntimeError:
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"response must return a tensor of the shape {tuple(eigenvalues.shape)} of its argument, "
+                f"got {tuple(gains.shape)}; {remedy}"
+            )
+        if eigenvalues.shape == support.shape:
+            check_finite(torch.where(support, gains.detach(), 0), "response")
+        return gains
+
+    return checked
 
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
@@ -158,6 +329,20 @@ def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None
 def warn(message: str) -> None:
     """Warn at the line that called this package, however many wrappers and modules lie between."""
     level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("nlfilter_torch", "torch"):
+    while frame.f_back is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, stacklevel=level)
+
+
+def called_by_edit() -> bool:
+    """Whether an edit of photographs called, which has looked at its image itself."""
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
+        if _module(frame).startswith(("nlfilter_torch.edits", "nlfilter_torch.frames")):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", ""))

@@ -1,11 +1,14 @@
 """EXIF blocks: what they say of a picture's orientation, and the picture turned upright."""
 
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, TiffImagePlugin
 
 PREFIX = b"Exif\0\0"
+FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point at a table of further ones
 # (transpose, turn upside down, mirror), in that order, for each orientation of the EXIF standard.
 _TURNS = {
     1: (False, False, False),
@@ -32,17 +35,70 @@ def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
     return channels[:: -1 if upside_down else 1, :: -1 if mirror else 1]
 
 
-def split(exif: Image.Exif) -> tuple[int, bytes | None]:
+def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
     """The orientation, and the rest as a block that says "upright"; None where there is nothing to say.
 
-    The sizes that some cameras note are swapped if the picture is to be turned on its side.
+    The sizes that some cameras note are swapped if the picture is to be turned on its side. ``read`` gives the block.
+    Fields that make no sense are left out: they are no reason to refuse a picture.
     """
-    orientation = int(exif.get(ExifTags.Base.Orientation, 1))
-    if set(exif) <= {ExifTags.Base.Orientation}:
-        return orientation, None
-    exif[ExifTags.Base.Orientation] = 1
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    width, height = ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight
-    if orientation >= 5 and width in details and height in details:
-        details[width], details[height] = details[height], details[width]
-    return orientation, exif.tobytes()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Pillow, about damaged blocks
+        try:
+            exif = read()
+            fields = dict(exif)
+        except Exception:  # Pillow has no common class for what can be wrong with a block
+            return 1, None
+        orientation = orientation_of(fields.get(ExifTags.Base.Orientation))
+        if set(fields) <= {ExifTags.Base.Orientation}:
+            return orientation, None
+        exif[ExifTags.Base.Orientation] = 1
+        folders: dict[int, dict[int, Any]] = {
+            code: folder for code in FOLDERS if code in fields and (folder := _folder(exif, code))
+        }
+        width, height = ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight
+        details = folders.get(ExifTags.IFD.Exif, {})
+        if orientation >= 5 and width in details and height in details:
+            details[width], details[height] = details[height], details[width]
+        try:
+            return orientation, exif.tobytes()
+        except Exception:  # which field it was, Pillow does not say
+            return orientation, _sound(fields, folders).tobytes()
+
+
+def orientation_of(value: Any) -> int:
+    """An orientation of the EXIF standard, 1 to 8; 1, upright, for what is none.
+
+    >>> orientation_of(6), orientation_of("upside down")
+    (6, 1)
+    """
+    return int(value) if isinstance(value, int) and value in _TURNS else 1
+
+
+def _folder(exif: Image.Exif, code: int) -> dict[int, Any]:
+    try:
+        return exif.get_ifd(code)
+    except Exception:
+        return {}
+
+
+def _sound(fields: dict[int, Any], folders: dict[int, dict[int, Any]]) -> Image.Exif:
+    """A block of those fields that can be written."""
+    block = Image.Exif()
+    for code, value in fields.items():
+        if code not in FOLDERS and is_writable(code, value):
+            block[code] = value
+    block[ExifTags.Base.Orientation] = 1
+    for code, folder in folders.items():
+        block.get_ifd(code).update({key: value for key, value in folder.items() if is_writable(key, value)})
+    return block
+
+
+def is_writable(code: int, value: Any) -> bool:
+    """Whether Pillow can write a field with that value."""
+    table = TiffImagePlugin.ImageFileDirectory_v2()
+    try:
+        table[code] = value
+        table.tobytes()
+    except Exception:
+        return False
+    return True

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.blocks import large_empty
-from nlfilter_torch.checks import check_finite, check_patch_size, check_tensor
+from nlfilter_torch.checks import LARGEST_PATCH, check_finite, check_patch_size, check_tensor
 from nlfilter_torch.differentiation import Gradients, once_differentiable
 
 GuideChannels = Literal["luminance", "all"]
@@ -28,13 +28,19 @@ def patch_window(patch_size: int) -> Tensor:
 
 def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
     """The weights of the patch (p, p), of unit sum."""
+    check_patch_size(patch_size)
     if patch_weights is None:
-        check_patch_size(patch_size)
         return patch_window(patch_size)
     check_tensor(patch_weights, "patch_weights")
+    if patch_weights.dtype.is_complex or patch_weights.dtype == torch.bool:
+        raise TypeError(f"patch_weights must be real numbers, got {patch_weights.dtype}; convert them")
     if patch_weights.ndim != 2 or patch_weights.shape[0] != patch_weights.shape[1] or patch_weights.shape[0] % 2 == 0:
         raise ValueError(
             f"patch_weights must have shape (p, p) with odd p, got {tuple(patch_weights.shape)}; crop or pad them"
+        )
+    if len(patch_weights) > LARGEST_PATCH:
+        raise ValueError(
+            f"patch_weights must have at most {LARGEST_PATCH} rows, got {len(patch_weights)}; reduce the image instead"
         )
     check_finite(patch_weights, "patch_weights")
     if patch_weights.device.type == "cpu" and not bool((patch_weights >= 0).all() & (patch_weights.sum() > 0)):

@@ -5,11 +5,14 @@ Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil); nothing else in
 
 import io
 import os
+import re
 import secrets
+import shutil
+import sys
 import warnings
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Container, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -25,6 +28,9 @@ from torch import Tensor
 from nlfilter_torch import exif as exif_tags
 from nlfilter_torch import tiff
 
+if sys.platform != "win32":
+    import fcntl
+
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
 
@@ -38,6 +44,8 @@ DEPTHS: dict[str, tuple[str, ...]] = {
     "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
 }
 ENCODING: dict[str, dict[str, object]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WebP": {"lossless": True}}
+PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # what name_beside gives
+unfinished: set[Path] = set()  # files that are being written; command lines look at it when they are interrupted
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".tif": "TIFF", ".tiff": "TIFF"}
 
 
@@ -116,8 +124,13 @@ def first_bytes(path: Path) -> bytes:
         raise FileNotFoundError(f"{path} does not exist; check the name and the folder")
     if path.is_dir():
         raise ValueError(f"{path} is a folder, not an image file; name a file in it")
-    with path.open("rb") as stream:
-        head = stream.read(32)
+    if not path.is_file():  # to open a pipe would be to wait for someone who writes to it
+        raise ValueError(f"{path} is a pipe, a socket or a device, not a file; save the picture in a file first")
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(32)
+    except PermissionError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}; ask its owner, or copy it") from error
     if not head:
         raise ValueError(f"{path} is empty; copy it again from where it came")
     return head
@@ -195,9 +208,13 @@ def check_type(path: str | Path, depth: str, alpha: bool) -> str:
 
 def check_file(path: str | Path) -> None:
     """Raise ValueError unless a file can be made at ``path``."""
-    path = Path(path)
+    path = link_target(path)
+    if path.is_symlink():
+        raise ValueError(f"{path} is a symbolic link that leads back to itself; choose another name")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; add a file name to it")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is a pipe, a socket or a device, not a file; choose another name")
     _check_parent(path)
 
 
@@ -227,25 +244,79 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
     >>> [file.name for file in folder.iterdir()]
     ['note.txt']
     """
-    path = Path(path)
+    path = link_target(path)
     # Opened by hand, not by tempfile: the file must get the usual permissions, and live on the same file system.
     beside = name_beside(path)
+    unfinished.add(beside)
     try:
-        with beside.open("x+b") as stream:
-            yield stream
-        beside.replace(path)
+        remove_stale(path.parent, {path.name})
+        with ExitStack() as claim:
+            with beside.open("x+b") as stream:
+                claim.enter_context(claimed(beside))
+                yield stream
+            beside.replace(path)
     except OSError as error:
         if error.filename not in (None, str(beside)) or error.errno is None:
             raise
         # A full disk, a quota, or no right to make files: the system says what, but not where.
         raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # no file, or a name that is too long for one
+            beside.unlink()
+        unfinished.discard(beside)
+
+
+def link_target(path: str | Path) -> Path:
+    """Where what is written to ``path`` goes: the same path, or what a symbolic link there points at."""
+    path = Path(path)
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def name_beside(path: Path) -> Path:
     """A name in the same folder that nothing else has, and that no one takes for a finished file."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+
+
+@contextmanager
+def claimed(part: Path) -> Iterator[None]:
+    """Keep :func:`remove_stale` of other processes away from a file or folder as long as the block lasts."""
+    if sys.platform == "win32":  # where no one can remove an open file
+        yield
+        return
+    handle = os.open(part, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _is_claimed(part: Path) -> bool:
+    if sys.platform == "win32":
+        return False
+    try:
+        handle = os.open(part, os.O_RDONLY)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+    return False
+
+
+def remove_stale(folder: Path, names: Container[str]) -> None:
+    """Remove what processes that were killed had begun to write in a folder under some names."""
+    for part in folder.glob(".*.part"):
+        if PART.fullmatch(part.name) and part.name[1:].rsplit(".", 2)[0] in names and not _is_claimed(part):
+            if part.is_dir():
+                shutil.rmtree(part, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    part.unlink()
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:
@@ -273,6 +344,7 @@ def _read_by_pillow(
         with warnings.catch_warnings():
             # Pillow's own guard against huge pictures knows nothing of this machine's memory; check_memory does.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
             image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP"])
     except Image.DecompressionBombError as error:
         raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
@@ -286,7 +358,7 @@ def _read_by_pillow(
             raise ValueError(f"{path} is an animation of {frames} frames; save one of them as a picture")
         check_memory(path, *image.size, bytes_per_pixel, memory)
         try:
-            orientation, exif = exif_tags.split(image.getexif())
+            orientation, exif = exif_tags.split(image.getexif)
             if image.format == "PNG" and head[24] == 16:  # the bit depth in its header; Pillow would keep 8 of them
                 channels = imagecodecs.png_decode(path.read_bytes())
             else:

@@ -3,7 +3,16 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_count, check_image, check_same_size, check_shape
+from nlfilter_torch.checks import (
+    check_alpha,
+    check_image,
+    check_instance,
+    check_same_size,
+    check_shape,
+    check_tensor,
+    check_weight,
+    checked_response,
+)
 from nlfilter_torch.operator import NonlocalOperator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import reduce_sum, replicate
@@ -36,12 +45,12 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
         >>> layers.shape, bool((layers.sum(1) - image).abs().max() < 1e-5)
         (torch.Size([1, 3, 3, 24, 24]), True)
     """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     return _layers(operator, image, order).to(image.dtype)
 
 
 def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
     """The layers in the operator's dtype: differences of ``y, W y, ..., W^k y``."""
-    check_count(order, "order")
     powers = operator.powers(image, order)  # (B, k, C, H, W)
     first = image.to(powers).unsqueeze(1).expand(powers.shape[0], -1, -1, -1, -1)
     return layers_between(torch.cat([first, powers], dim=1))
@@ -88,18 +97,18 @@ def polynomial_filter(
         image: y, (B, C, H, W).
         alpha: weights of the layers, fine to coarse, the last of the smooth layer: (k+1,), (B, k+1) per image, or
             (B, k+1, H, W) per pixel. Ones leave the image as it is.
-        residual: weight of what neither the eigenvectors explain nor W keeps, ``(1 - r) (y - V V^T y)`` with r the
-            operator's :attr:`~NonlocalOperator.diagonal_share` (zero without completion). None is alpha_1, which is
-            exactly eq. (12); 0.0 drops it, which is the paper's eq. (13) and Appendix B; 1.0 leaves it untouched, which
-            sharpens less noise. A number, or a tensor of shape () or (B,).
+        residual: weight of what neither the eigenvectors capture nor W keeps, ``(1 - r) (y - V V^T y)`` with r the
+            operator's :attr:`~NonlocalOperator.diagonal_share` (zero without completion). None is exactly eq. (12),
+            which gives it f(r) of eq. (14), alpha_1 without completion; 0.0 drops it, which is the paper's eq. (13) and
+            Appendix B; 1.0 leaves it untouched, which sharpens less noise. A number, or a tensor of shape () or (B,).
 
     Returns:
         (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in all of
         these and in the operator.
 
     Raises:
-        TypeError, ValueError: if ``image`` does not fit the operator, or ``alpha`` has fewer than two entries or
-            another shape.
+        TypeError, ValueError: if ``image`` does not fit the operator, ``alpha`` has fewer than two entries or another
+            shape, or ``residual`` is not finite or has another shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -109,24 +118,38 @@ def polynomial_filter(
         >>> crisp.shape
         torch.Size([1, 3, 24, 24])
     """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_tensor(image, "image", "convert it with torch.as_tensor")
     check_alpha(alpha)
+    if residual is not None:
+        batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
+        check_weight(residual, "residual", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
     alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None:
-        explained = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
+        captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
         weight = replicate(residual, operator.shard)
-        # W passes a pixel like no other as r, close to 1, though no eigenvector in the span of the factor shows it.
-        missed = (1 - operator.diagonal_share) * (image.to(filtered) - explained)
-        filtered = filtered + residual_change(alpha, weight, missed)
+        filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
     return filtered.to(image.dtype)
 
 
-def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor) -> Tensor:
-    """What ``missed`` (B, C, H, W) adds to a filtered image if its weight is to be another than alpha_1."""
-    finest = alpha[0] if alpha.ndim == 1 else alpha[:, :1]
-    finest = finest.to(missed) if alpha.ndim == 4 else finest.to(missed).reshape(-1, 1, 1, 1)
-    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - finest) * missed
+def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor, remainder: Tensor) -> Tensor:
+    """What is added to a filtered image for ``missed``, the part that no eigenvector captures, to have its own weight.
+
+    W multiplies that part by r, as F annihilates it, so that the sliders have given it the weight f(r). The share r of
+    it stays as it is: W keeps a pixel like no other, though no eigenvector captures it.
+
+    Args:
+        alpha: the sliders, of any shape that :func:`weigh_layers` takes.
+        residual: the weight it is to have.
+        missed: (B, C, H, W).
+        remainder: r, (B, 1, H, W).
+    """
+    entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
+    powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
+    gain = weigh_layers(layers_between(powers), alpha)
+    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - gain) * (1 - remainder) * missed
 
 
 @full_precision
@@ -155,8 +178,9 @@ def spectral_filter(
         ``response``, with a finite gradient where eigenvalues meet.
 
     Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size, or
-            ``coefficients`` are not as many as it has.
+        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size,
+            ``coefficients`` are not as many as it has, ``response`` does not return a finite gain for every eigenvalue,
+            or ``residual`` is not finite or has another shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -168,6 +192,9 @@ def spectral_filter(
         >>> filtered.shape
         torch.Size([1, 1, 24, 24])
     """
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
+    response = checked_response(response, spectrum.support)
+    check_weight(residual, "residual", spectrum.factor.shape[0])
     if coefficients is None:
         coefficients = spectrum.coefficients(image)
     else:
@@ -200,6 +227,7 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
     """
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
     explained = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
     energy = reduce_sum(image.to(spectrum.factor).square().sum((1, 2, 3)), spectrum.shard)

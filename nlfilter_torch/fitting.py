@@ -13,7 +13,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image, check_same_size
+from nlfilter_torch.checks import (
+    check_image,
+    check_instance,
+    check_not_negative,
+    check_number,
+    check_order,
+    check_same_size,
+    check_tensor,
+)
 from nlfilter_torch.filtering import detail_layers
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator import NonlocalOperator
@@ -84,9 +92,13 @@ def fit_alpha(
         >>> [round(a, 2) for a in fit_alpha(operator, image, edited, order=2)[0].tolist()]
         [3.0, 1.0, 1.2]
     """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_instance(shared, bool, "shared", "pass True or False")
+    if loss is not None and not callable(loss):
+        raise TypeError(f"loss must be a function of two images, got {type(loss).__name__}; pass it or None")
     if loss is not None:
         check_whole(operator.shard, "a loss")
-    check_count(order, "order")
+    check_order(order)
     check_image(image, "image")
     check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
     check_same_size(image, operator.size, "image", "operator")
@@ -114,10 +126,8 @@ def fit_alpha(
 
 
 def _check_not_negative(value: float, name: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{name} must be a number, got {type(value).__name__}; pass 0.0 or more")
-    if not (value >= 0 and math.isfinite(value)):
-        raise ValueError(f"{name} must be at least 0 and finite, got {value}; 0.0 is plain least squares")
+    check_number(value, name, "pass 0.0 or more")
+    check_not_negative(value, name, "0.0 is plain least squares")
 
 
 def _is_rounded(target: Tensor, shard: Shard | None) -> bool:
@@ -271,7 +281,14 @@ class _Problem:
             filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
             if mask is not None:
                 filtered = torch.lerp(target, filtered, mask.to(filtered))
-            value = loss(filtered, target) + self.ridge * change.square().sum()
+            found = loss(filtered, target)
+            check_tensor(found, "loss", "return a number that depends on the first image")
+            if found.numel() != 1 or not found.requires_grad:
+                raise ValueError(
+                    f"loss must return a single number with a gradient, got a tensor of shape {tuple(found.shape)}; "
+                    "compute it from the first image in torch"
+                )
+            value = found.sum() + self.ridge * change.square().sum()
             value.backward()
             return value
 

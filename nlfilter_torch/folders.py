@@ -21,7 +21,7 @@ from queue import LifoQueue
 
 import torch
 
-from nlfilter_torch.files import SUFFIXES, check_folder, open_beside
+from nlfilter_torch.files import SUFFIXES, check_folder, open_beside, remove_stale
 
 RECORD = ".nlfilter-batch.json"  # in the folder for the output: the settings of what is in it
 DEATHS = 3  # deaths for each worker, without a file done in between, after which it is not the files' fault
@@ -117,7 +117,7 @@ def edit_folder(
         begin: called with the name of every file that ended.
         tally: counts the files as they end, so that it is right when this is interrupted, too.
     """
-    _remove_leftovers(paths, target)
+    remove_stale(target, {path.name for path in paths})
     jobs = [path for path in paths if not (target / path.name).exists()]
     tally.skipped += len(paths) - len(jobs)
     tally.left += len(jobs)
@@ -138,14 +138,6 @@ def edit_folder(
             if deaths >= DEATHS * workers:
                 tell(f"{deaths} workers died one after the other; no other file is begun")
                 return
-
-
-def _remove_leftovers(paths: Sequence[Path], target: Path) -> None:
-    """Take away what killed runs had begun to write under these names."""
-    names = {path.name for path in paths}
-    for part in target.glob(".*.part"):
-        if part.name[1:].rsplit(".", 2)[0] in names:
-            part.unlink(missing_ok=True)
 
 
 def _outcomes(
@@ -192,7 +184,9 @@ def _outcomes(
 
 def _begin(threads: int) -> None:
     """Set a worker up."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is for the main process to stop
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # it is for the main process to stop
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     torch.set_num_threads(threads)
     # A worker that waits for work would not notice that the main process was killed, and wait for ever.
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -12,12 +12,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image, check_same_size
+from nlfilter_torch.checks import (
+    check_alpha,
+    check_image,
+    check_instance,
+    check_order,
+    check_pair,
+    check_photograph,
+    check_same_size,
+    check_tensor,
+    check_weight,
+)
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import layers_between, residual_change, weigh_layers
 from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.newton import PixelScaling
 from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.thin import moment, spread
@@ -31,13 +41,13 @@ class FittedFilter:
 
     Attributes:
         kernel: landmarks, bandwidths and window.
-        balancing: sum of factor times scaling over the fitted image, (1, M, 1).
+        balancing: what the scaling of a pixel is a function of.
         moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
         explained: coefficients of the part of an image that the eigenvectors explain, (1, M, C).
     """
 
     kernel: Kernel
-    balancing: Tensor
+    balancing: PixelScaling
     moments: Tensor
     explained: Tensor
 
@@ -81,11 +91,16 @@ class FittedFilter:
         ``by_rows`` works out one row after the other: the rounding of a product depends on its shape, which is then the
         same for tiles of any height.
         """
+        check_instance(by_rows, bool, "by_rows", "pass True or False")
+        check_tensor(image, "image", "convert it with torch.as_tensor")
+        check_alpha(alpha)
+        if residual is not None:
+            check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
         planes = self._planes(image, guide, origin, halo, by_rows=by_rows, missed=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
         if residual is not None:
-            filtered = filtered + residual_change(alpha, residual, planes[:, count])
+            filtered = filtered + residual_change(alpha, residual, planes[:, count], planes[:, count + 1, :1])
         return filtered.to(image.dtype)
 
     def _planes(
@@ -98,10 +113,14 @@ class FittedFilter:
         by_rows: bool = False,
         missed: bool = False,
     ) -> Tensor:
-        """Layers (B, k+1, C, H, W) and, if asked for, what a residual weighs as one more, in the kernel's dtype."""
+        """Layers (B, k+1, C, H, W) and, if asked for, what they miss and r as two more, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
+        check_pair(origin, "origin")
+        check_pair(halo, "halo")
+        if sum(halo) >= size[0]:
+            raise ValueError(f"halo must leave a row of the image's {size[0]}, got {tuple(halo)}; pass a taller tile")
         if guide is not None:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
@@ -119,10 +138,10 @@ class FittedFilter:
         return torch.cat(planes, dim=-1).unflatten(-1, size)
 
     def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
-        """The same (B, k+1 or k+2, C, n) of pixels (B, C, n) with features (B, D, n)."""
+        """The same (B, k+1 or k+3, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
-        scaling = scaling_from_moment(factor, diagonal, self.balancing.to(factor))
-        remainder = (scaling.square() * diagonal).unsqueeze(1)
+        scaling, remainder = self.balancing(factor, diagonal)
+        remainder = remainder.unsqueeze(1)
         smoothed = [image]
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(torch.addcmul(spread(coefficients.mT, factor, scaling), remainder, smoothed[-1]))
@@ -130,7 +149,7 @@ class FittedFilter:
         if not missed:
             return layers
         explained = spread(self.explained.to(factor).mT, factor, scaling)
-        return torch.cat([layers, ((1 - remainder) * (image - explained)).unsqueeze(1)], dim=1)
+        return torch.cat([layers, torch.stack([image - explained, remainder.expand_as(image)], dim=1)], dim=1)
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:
@@ -160,7 +179,8 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
         >>> fitted.layers(image.roll(3, -1)[..., :10]).shape
         torch.Size([1, 4, 1, 24, 10])
     """
-    check_count(order, "order")
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_order(order)
     check_image(image, "image")
     if operator.factor.shape[0] != 1 or image.shape[0] != 1:
         raise ValueError(
@@ -170,7 +190,8 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = operator.scaling.unsqueeze(1)  # (1, 1, N)
-    balancing = moment(operator.factor, scaling, operator.shard)
+    # The moment of the factor itself has a gradient.
+    balancing = replace(operator.balancing, moment=moment(operator.factor, scaling, operator.shard))
     moments = torch.stack([moment(operator.factor, scaling * y, operator.shard) for y in before.unsqueeze(1)], dim=1)
     explained = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
     return FittedFilter(operator.kernel, balancing, moments, explained)
@@ -207,7 +228,14 @@ def filter_frames(
         >>> [frame.shape for frame in edited]
         [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
     """
-    if not references:
+    check_alpha(alpha, dimensions=(1,))
+    if not isinstance(references, Sequence):
+        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
+    if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
+        raise TypeError(f"frames must be images, got {type(frames).__name__}; pass a list or a generator")
+    if residual is not None:
+        check_weight(residual, "residual")
+    if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
     if len(references) > 1 and options.get("spatial_bandwidth") is not None:
         raise ValueError(
@@ -215,7 +243,7 @@ def filter_frames(
             "their coordinates would mean several places at once"
         )
     for frame in references:
-        check_image(frame, "references", batch=1)
+        check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
     # One above the other they are one image; the few patches across a seam are the price.
     tall = torch.cat([reduce_channels(frame, "luminance") for frame in references], dim=2)

@@ -25,6 +25,7 @@ class Kernel:
         landmarks: (B, D, M).
         whitening: (B, M, M).
         completion: ``"diagonal"`` or ``"none"``.
+        limiter: (B, M, M) that the factor is multiplied by so that no eigenvalue of W exceeds 1, or None.
     """
 
     patch_weights: Tensor
@@ -34,6 +35,7 @@ class Kernel:
     landmarks: Tensor
     whitening: Tensor
     completion: Completion
+    limiter: Tensor | None = None
 
     def columns(
         self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0)
@@ -50,7 +52,8 @@ class Kernel:
 
     def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
-        return nystrom_factor(features, self.landmarks, self.whitening, self.completion)
+        factor, diagonal = nystrom_factor(features, self.landmarks, self.whitening, self.completion)
+        return factor if self.limiter is None else self.limiter @ factor, diagonal
 
     def features(self, guide: Tensor, *, origin: tuple[int, int], halo: tuple[int, int]) -> Tensor:
         """Features (B, D, N) of the same pixels."""

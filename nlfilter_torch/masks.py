@@ -9,11 +9,12 @@ from nlfilter_torch.blocks import CACHED, block_length
 from nlfilter_torch.checks import (
     check_finite,
     check_image,
+    check_instance,
     check_positive,
     check_same_size,
     check_tensor,
     check_unit_range,
-    is_transformed,
+    is_hidden,
     warn,
 )
 from nlfilter_torch.filtering import polynomial_filter
@@ -24,6 +25,7 @@ from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.thin import moment, spread
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
+STEEPEST = 1e30  # pixels over width: no distance of 0 becomes NaN
 EXPLAINED = 0.005  # share of a region's kernel below which its place in the diffusion map is nearly the origin
 LOOKED_AT = 4096  # of a region's pixels
 ITERATIONS = 20  # of k-means, which starts close to its end
@@ -46,7 +48,8 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     Raises:
         TypeError, ValueError: if ``time`` is not positive.
     """
-    check_positive(time, "time")
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
+    check_positive(time, "time", spectrum.factor.shape[0])
     gain = spectrum.eigenvalues[:, 1:].pow(torch.as_tensor(time).to(spectrum.factor).reshape(-1, 1))
     return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * spectrum.pixels**0.5
 
@@ -90,9 +93,10 @@ def diffusion_mask(
         >>> mask.shape, bool(((mask > 0) & (mask <= 1)).all())
         (torch.Size([1, 1, 24, 24]), True)
     """
-    check_positive(time, "time")
-    check_positive(width, "width")
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     weights = region_weights(spectrum, region)  # (B, K, N)
+    check_positive(time, "time", spectrum.factor.shape[0])
+    check_positive(width, "width", max(spectrum.factor.shape[0], weights.shape[0]))
     _warn_of_unlike(spectrum, weights)
     exponent = torch.as_tensor(replicate(time, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
@@ -103,7 +107,7 @@ def diffusion_mask(
     # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
-    exponents = scale * distances
+    exponents = scale.clamp(max=STEEPEST) * distances
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = mask_of_exponents(inner, None if negative is None else outer)
     return mask.unflatten(2, spectrum.size).to(region.dtype)
@@ -112,7 +116,7 @@ def diffusion_mask(
 @torch.no_grad()
 def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
     """Warn of a region (B, K, N) like no landmark: all pixels that the landmarks miss have the coordinates 0."""
-    if weights.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(weights):
+    if is_hidden(weights):
         return
     for columns, regions in zip(spectrum.factor, weights.expand(len(spectrum.factor), -1, -1), strict=True):
         for number, region in enumerate(regions):
@@ -195,7 +199,8 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         TypeError, ValueError: if ``regions`` does not fit, is negative or holds an empty one, or ``time`` is not
             positive.
     """
-    check_positive(time, "time")
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
+    check_positive(time, "time", spectrum.factor.shape[0])
     exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions").expand(len(spectrum.factor), -1, -1)  # (B, K, N)
@@ -300,6 +305,8 @@ def filter_regions(
         >>> torch.equal(edited[..., 6:], image[..., 6:]), torch.equal(edited[..., :6], image[..., :6])
         (True, False)
     """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_image(image, "image")
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_same_size(masks, operator.size, "masks", "operator")
     alpha = replicate(alpha, operator.shard)

@@ -83,7 +83,10 @@ class SymmetricMatrix:
             points = points.detach().requires_grad_()
             flat = points.flatten(1)
             total = function(flat).sum()
-            return torch.autograd.grad(total, points)[0] if total.requires_grad else torch.zeros_like(points)
+            if not total.requires_grad:
+                return torch.zeros_like(points)
+            # A function that is constant may still hold parameters.
+            return torch.autograd.grad(total, points, allow_unused=True, materialize_grads=True)[0]
 
 
 class _SpectralFunction(torch.autograd.Function):

@@ -18,31 +18,75 @@ from torch import Tensor
 
 from nlfilter_torch import native
 from nlfilter_torch.blocks import SWEPT, pixel_blocks
+from nlfilter_torch.landmarks import stratified
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
-from nlfilter_torch.thin import gather, spread
+from nlfilter_torch.spectrum import sum_grams
+from nlfilter_torch.thin import gather, moment, spread
 
-PER_LANDMARK = (32, 160)  # pixels of the sample, least and most: its Jacobian is then within 18 or 8 % of the true one
+PER_LANDMARK = (8, 32, 160)  # pixels of the sample: its Jacobian is then within 35, 18 or 8 % of the true one
 EXPLORED = 8192  # pixels that the first guess comes from, at most
 SHARE = 8  # the part of the pixels that either is, between these bounds
-LARGE = 64  # the part that the sample is at least: four times the pixels have rarer ones, and take no sweep more for it
-GUESSES = 3  # steps that it takes towards their fixed point; more gain nothing for the pixels that are not among them
-REFINEMENTS = 3  # steps of Newton's method on the sample; with two the inverse is that of a t still on its way
-GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly and on no period of the image
-LARGEST = 2.0  # K has a unit diagonal and its entries are not negative but for errors, so that no d exceeds 1
-SMALLEST_AFFINITY = 1e-12  # keeps the plain method, whose affinities may be negative, finite
+LARGE = 64  # the part that the sample is at least: larger images have rarer pixels
+GUESSES = 3  # steps of the first guess towards its fixed point; more gain nothing for pixels outside its sample
+REFINEMENTS = 3  # steps of Newton's method on the sample; after two the Jacobian still changes
+UNIFORM = 0.05  # of the sample is drawn uniformly, so that no pixel of it stands for more than 20 times its share
+EXCESS = 4e-5  # by which rounding may take the d of a pixel above 1
+LARGEST = 2.0  # bounds d while t is a guess; a larger one is left to the damped method
 MAX_SWEEPS = 12
-ACCELERATOR_SWEEPS = 5  # on an accelerator a look at the residual would stop the queue
+ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
 ROUGH = 0.2  # a sweep that gains less than a factor of five asks for another sample
-STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it have met rounding
+MAX_STEPS = 50  # of the damped method, which needs about ten from any start
+SMALL_STEP = 0.1  # relative change of d below which full steps converge quadratically
 
 
 def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
     """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
 
-    A pixel's equation is ``d (u . total + diagonal d) = 1``, so 1/d is the positive root of a quadratic.
+    A pixel's equation is ``d (u . total + diagonal d) = 1``. Its positive root is formed without cancellation whichever
+    sign ``u . total`` has; approximate affinities may be negative.
     """
-    half = spread((total / 2).mT, factor).squeeze(1).clamp_(min=SMALLEST_AFFINITY)
-    return (torch.addcmul(diagonal, half, half).sqrt() + half).reciprocal()
+    half = spread((total / 2).mT, factor).squeeze(1)
+    root = torch.addcmul(diagonal, half, half).sqrt()
+    # Without a diagonal a negative sum has no root; the bound, below the rounding of 1 - |u|^2, keeps d finite.
+    least = torch.finfo(half.dtype).eps / 4
+    return torch.where(half < 0, (root - half) / diagonal.clamp(min=least), (root + half).clamp(min=least).reciprocal())
+
+
+def isolated(scaling: Tensor) -> Tensor:
+    """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
+
+    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1.
+    """
+    return scaling > 1 + EXCESS
+
+
+@dataclass(frozen=True, eq=False)
+class PixelScaling:
+    """What the scaling of any pixel of a balanced image is a function of, beside the pixel's own column.
+
+    Attributes:
+        moment: t, (B, M, 1).
+        completed: the kernel has a unit diagonal.
+        before: moments that found pixels to be isolated, before these were taken out.
+    """
+
+    moment: Tensor
+    completed: bool
+    before: tuple[Tensor, ...] = ()
+
+    def __call__(self, factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
+        """Scaling d and diagonal part r of W, (B, n), of pixels with columns (B, M, n) and (B, n).
+
+        A pixel that is isolated has d = 0 and r = 1.
+        """
+        scaling = scaling_from_moment(factor, diagonal, self.moment.to(factor))
+        remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
+        if not self.completed:
+            return scaling, remainder
+        alone = isolated(scaling)
+        for total in self.before:
+            alone = alone | isolated(scaling_from_moment(factor, diagonal, total.to(factor)))
+        return torch.where(alone, 0.0, scaling), torch.where(alone, 1.0, remainder)
 
 
 @dataclass(frozen=True)
@@ -82,12 +126,14 @@ class Sample:
 
     def residual(self, total: Tensor, found: Tensor) -> Tensor:
         """Largest deviation of a row sum from 1 among the sample, (B,), where d(total) has the moment ``found``."""
-        return row_residual(self.factor, self.scaling(total), total - found, self.shard)
+        # Where d is the root for the total, row sums lack d u . (total - found).
+        lacking = spread((total - found).to(self.factor).mT, self.factor, self.scaling(total))
+        return reduce_max(lacking.abs().amax((1, 2)), self.shard)
 
 
-def row_residual(factor: Tensor, scaling: Tensor, error: Tensor, shard: Shard | None = None) -> Tensor:
-    """Largest ``|d u . error|``, (B,): what row sums lack where d is the root for a total that is off by ``error``."""
-    return reduce_max(spread(error.to(factor).mT, factor, scaling).abs().amax((1, 2)), shard)
+def row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor, found: Tensor) -> Tensor:
+    """Row sums (B, N) of W for any scaling d whose moment ``factor @ d`` is ``found``."""
+    return scaling * (spread(found.to(factor).mT, factor).squeeze(1) + diagonal * scaling)
 
 
 def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None) -> tuple[Sample, Tensor]:
@@ -95,7 +141,8 @@ def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: 
     if 2 * count >= factor.shape[2]:
         return Sample(factor, diagonal, torch.ones_like(diagonal), shard), scaling
     slope = scaling.square()
-    leverage = slope * (1 - diagonal) / (1 + slope * diagonal) + 1e-12  # |u|^2 is 1 - c
+    leverage = slope * (1 - diagonal) / (1 + slope * diagonal)  # |u|^2 is 1 - c
+    leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
     summed = leverage.double().cumsum(1)
     ticks = (torch.arange(count, dtype=torch.float64, device=factor.device) + 0.5) / count
     chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
@@ -110,8 +157,8 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     few, rest = factor, diagonal
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
-        steps = torch.arange(count, dtype=torch.float64, device=factor.device) * GOLDEN
-        chosen = (steps.frac() * pixels).long().sort().values
+        # One at random from every stretch: a fixed stride would meet the periods of a texture.
+        chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
         few, rest = factor.gather(2, chosen.expand(*factor.shape[:2], -1)), diagonal[:, chosen]
     sample = Sample(few, rest, torch.full_like(rest, pixels / few.shape[2]), shard)
     sums = spread(sample.moment(torch.ones_like(rest)).to(few).mT, few).squeeze(1) + rest
@@ -125,7 +172,7 @@ def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None)
     """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
     half = (total / 2).squeeze(2).to(factor)
     if native.suits(factor, diagonal, half):
-        scaling, found = native.sweep(factor, diagonal, half, SMALLEST_AFFINITY, LARGEST)
+        scaling, found = native.sweep(factor, diagonal, half, LARGEST)
         return scaling, reduce_sum(found.unsqueeze(2), shard)
     scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
     row = total.to(factor)
@@ -136,39 +183,157 @@ def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None)
     return scaling, reduce_sum(found, shard)
 
 
-def solve(
-    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None
-) -> tuple[Tensor, Tensor, Tensor, int, Tensor]:
-    """Scaling (B, N), its moment (B, M, 1) and residual (B,), the sweeps, and an estimate of J^-1, (B, M, M)."""
+@dataclass(frozen=True)
+class Solution:
+    """Result of balancing.
+
+    Attributes:
+        scaling: d, (B, N), positive.
+        moment: ``factor @ d``, (B, M, 1) in float64.
+        residual: largest deviation of a row sum of this very scaling from 1, (B,).
+        sweeps: over the factor.
+        inverse: of J, to a few per cent, (B, M, M) in float64.
+    """
+
+    scaling: Tensor
+    moment: Tensor
+    residual: Tensor
+    sweeps: int
+    inverse: Tensor
+
+
+def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None) -> Solution:
+    """Balance a kernel with a unit diagonal, quickly where sweeps converge and by damped steps where they do not.
+
+    On a processor the result has a residual of at most ``tolerance`` or of rounding, unless no scaling balances the
+    kernel. On an accelerator a fixed number of sweeps is taken, as reading a residual would stall its queue.
+    """
+    found = _quasi_newton(factor, diagonal, tolerance, shard)
+    if factor.device.type != "cpu" or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
+        return found
+    return damped(factor, diagonal, found, tolerance, shard)
+
+
+def accepted(factor: Tensor, tolerance: float, shard: Shard | None) -> float:
+    """The residual that balancing aims at: the tolerance, or what rounding leaves of it in a large image."""
+    pixels = factor.shape[2] if shard is None else shard.pixels
+    # |u . t| is formed from terms of up to |u| |t|, and |t|^2 is at most the number of pixels.
+    return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
+
+
+def _quasi_newton(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None) -> Solution:
+    """Newton's method with the Jacobian of a sample, updated by what the sweeps show of the true one (BFGS)."""
     watched = factor.device.type == "cpu"
-    least, most = (bound * factor.shape[1] // (1 if shard is None else len(shard.rows)) for bound in PER_LANDMARK)
-    count = max(min(factor.shape[2] // SHARE, max(most, factor.shape[2] // LARGE)), least)  # of the sample, here
-    scaling, found = _sweep(factor, diagonal, _guess(factor, diagonal, shard), shard)
-    total = found
-    worst, slow, gain = 1.0, 0, 1.0
+    marks, pixels = factor.shape[1:]
+    ranks = 1 if shard is None else len(shard.rows)
+    least, usual, most = (bound * marks // ranks for bound in PER_LANDMARK)
+    count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
+    total = _guess(factor, diagonal, shard)
+    scaling, found = _sweep(factor, diagonal, total, shard)
+    worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), marks, marks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
+        before, error = total, total - found
         if gain > ROUGH if watched else sweeps < 3:
             sample, part = _draw(factor, diagonal, scaling, count, shard)
             # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
-            error = found - sample.moment(part)
+            bias = found - sample.moment(part)
+            total = found
             for _ in range(REFINEMENTS):
                 part = sample.scaling(total)
                 # J is positive definite; its Cholesky factor, unlike batched LU in MKL, withstands several threads.
                 lower = torch.linalg.cholesky_ex(sample.jacobian(part)).L
-                total = total - torch.cholesky_solve(total - sample.moment(part) - error, lower)
+                total = total - torch.cholesky_solve(total - sample.moment(part) - bias, lower)
             inverse = torch.cholesky_inverse(lower)
         else:
-            total = total - inverse @ (total - found)
+            total = total - inverse @ error
         scaling, found = _sweep(factor, diagonal, total, shard)
+        inverse = _updated(inverse, total - before, total - found - error)
         if not watched:
             continue
         previous, worst = worst, sample.residual(total, found).max().item()
         gain = worst / previous
-        slow = slow + 1 if gain > 0.5 else 0
-        if worst <= tolerance or (worst < STALL and slow > 1):
-            residual = row_residual(factor, scaling, total - found, shard)
-            if slow > 1 or bool((residual <= tolerance).all()):
+        slow = slow + 1 if not gain <= 0.5 else 0
+        if worst <= tolerance or slow > 1:
+            measured = _measure(factor, diagonal, scaling, total, found, shard)
+            if slow > 1 or bool((measured[1] <= tolerance).all()):
                 break
     else:
-        residual = row_residual(factor, scaling, total - found, shard)
-    return scaling, found, residual, sweeps, inverse
+        measured = _measure(factor, diagonal, scaling, total, found, shard)
+    return Solution(scaling, found, measured[0], sweeps, inverse)
+
+
+def _measure(
+    factor: Tensor, diagonal: Tensor, scaling: Tensor, total: Tensor, found: Tensor, shard: Shard | None
+) -> tuple[Tensor, Tensor]:
+    """Largest deviation of a row sum from 1, (B,): as measured, and as d = d(total) would have it without rounding."""
+    rows = spread(torch.cat([found, total - found], dim=2).to(factor).mT, factor)  # (B, 2, N): one read of the factor
+    sums = scaling * (rows[:, 0] + diagonal * scaling)
+    return _largest(sums - 1, shard), _largest(scaling * rows[:, 1], shard)
+
+
+def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """BFGS: an inverse (B, M, M) that takes the change of ``t - factor @ d(t)`` (B, M, 1) to the step in t."""
+    curvature = (step * change).sum(1, keepdim=True)  # positive, as the Jacobian is
+    rho = torch.where(curvature > 0, 1 / curvature, torch.zeros_like(curvature))
+    moved = inverse @ change
+    scale = rho * (1 + rho * (change * moved).sum(1, keepdim=True))
+    cross = rho * moved @ step.mT
+    return inverse - cross - cross.mT + scale * step @ step.mT
+
+
+def _largest(values: Tensor, shard: Shard | None) -> Tensor:
+    """Largest magnitude among values (B, N), (B,); infinite where one is not finite."""
+    return reduce_max(values.abs().nan_to_num(nan=torch.inf).amax(1), shard)
+
+
+def damped(factor: Tensor, diagonal: Tensor, start: Solution, tolerance: float, shard: Shard | None) -> Solution:
+    """Balance by Newton's method on d itself, with an exact line search: it converges from any start.
+
+    A balanced d is the one minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
+    whatever the signs of its entries. With d changing by ``s d x`` the step x solves ``(I + W) x = 1 - W 1``, a system
+    of M equations with the Jacobian J of all pixels. Along x the function is a quadratic and a sum of logarithms, whose
+    minimum takes no further read of the factor.
+    """
+    tiny = torch.finfo(factor.dtype).tiny
+    usable = start.scaling.isfinite() & (start.scaling > 0)
+    scaling = torch.where(usable, start.scaling, torch.ones_like(start.scaling))
+    goal, best, slow = accepted(factor, tolerance, shard), start, 0
+    for steps in range(1, MAX_STEPS + 1):
+        total = moment(factor, scaling.unsqueeze(1), shard)
+        lacking = 1 - row_sums(factor, diagonal, scaling, total)
+        share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
+        gram = reduce_sum(sum_grams(factor, scaling * share.sqrt(), None, 1)[:, 0], shard)
+        lower = torch.linalg.cholesky_ex(gram + torch.eye(gram.shape[1], dtype=gram.dtype, device=gram.device)).L
+        residual = _largest(lacking, shard)
+        found = Solution(scaling, total, residual, start.sweeps + 3 * steps, torch.cholesky_inverse(lower))
+        slow = 0 if bool((residual.max() < 0.5 * best.residual.max()).all()) else slow + 1
+        if bool(residual.max() <= best.residual.max()):
+            best = found
+        right = moment(factor, (scaling * (share * lacking)).unsqueeze(1), shard)
+        affinity = spread(torch.cholesky_solve(right, lower).to(factor).mT, factor, scaling).squeeze(1)
+        step = share * (lacking - affinity)
+        small = bool(_largest(step, shard).max() < SMALL_STEP)
+        if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
+            break
+        length = 1.0 if small else _line_search(step.double(), lacking.double(), shard)
+        scaling = (scaling * (1 + length * step)).clamp(min=tiny).to(factor)
+    return best
+
+
+def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None) -> Tensor:
+    """The s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
+    # W 1 = 1 - lacking and W x = lacking - x make the quadratic known.
+    linear = reduce_sum((step * (1 - lacking)).sum(1, keepdim=True), shard)
+    square = reduce_sum((step * (lacking - step)).sum(1, keepdim=True), shard)
+    longest = reduce_max((-step).amax(1, keepdim=True), shard).clamp(min=1e-12).reciprocal()  # where a d reaches zero
+    low, high = torch.zeros_like(longest), 0.999 * longest
+    length = torch.minimum(torch.ones_like(high), 0.5 * high)
+    for _ in range(40):
+        ratio = step / (1 + length * step)
+        slope = linear + length * square - reduce_sum(ratio.sum(1, keepdim=True), shard)
+        bend = square + reduce_sum(ratio.square().sum(1, keepdim=True), shard)
+        low, high = torch.where(slope < 0, length, low), torch.where(slope < 0, high, length)
+        following = length - slope / bend
+        inside = (following > low) & (following < high)
+        length = torch.where(inside, following, (low + high) / 2)
+    return length

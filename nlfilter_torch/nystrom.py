@@ -23,6 +23,7 @@ JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, w
 SMALLEST_EXPONENT = -40.0
 PLAIN_EXPONENT = -60.0  # without completion small affinities are all that links such pixels, and balancing raises them
 LOG2_E = math.log2(math.e)
+CANCELLATION = 1e-2  # error of a squared distance in float32 from which distances are formed in float64
 
 
 def whitener(landmarks: Tensor) -> Tensor:
@@ -57,10 +58,24 @@ def nystrom_factor(
     return factor, diagonal
 
 
+def cancels(landmarks: Tensor) -> bool:
+    """Whether ``|x|^2 + |z|^2 - 2 x z`` loses distances to the landmarks (B, D, M) in float32, as at tiny bandwidths.
+
+    False on accelerators, which would have to wait for the answer.
+    """
+    if landmarks.dtype != torch.float32 or landmarks.device.type != "cpu":
+        return False
+    largest = (landmarks - landmarks.mean(dim=2, keepdim=True)).square().sum(1).max()
+    return not float(largest) * torch.finfo(torch.float32).eps < CANCELLATION
+
+
 class Affinity:
     """Affinities of blocks of features to the landmarks, written into one buffer after the other.
 
     A fresh tensor for every block would cost more in page faults than the exponential does.
+
+    Attributes:
+        exact: distances are formed in float64; see :func:`cancels`.
     """
 
     def __init__(self, landmarks: Tensor, complete: bool) -> None:
@@ -68,11 +83,13 @@ class Affinity:
         self.floor = LOG2_E * (SMALLEST_EXPONENT if complete else PLAIN_EXPONENT)
         self.centre = landmarks.mean(dim=2, keepdim=True)  # distances are formed near the origin, where they are exact
         self.landmarks = landmarks - self.centre  # (B, D, M)
+        self.exact = cancels(landmarks)
+        points = self.landmarks.double() if self.exact else self.landmarks
         # -|x - z|^2 is one product, (2 z, -|z|^2, -1) with (x, 1, |x|^2).
-        norms = self.landmarks.square().sum(1, keepdim=True)
-        rows = torch.cat([2.0 * self.landmarks, -norms, -torch.ones_like(norms)], dim=1)
+        norms = points.square().sum(1, keepdim=True)
+        rows = torch.cat([2.0 * points, -norms, -torch.ones_like(norms)], dim=1)
         self.rows = LOG2_E * rows.mT  # (B, M, D + 2)
-        self.columns = landmarks.new_empty(0, 0, 0)
+        self.columns = points.new_empty(0, 0, 0)
 
     def __call__(self, features: Tensor, out: Tensor) -> tuple[Tensor, Tensor]:
         """The affinities (B, M, n) of features (B, D, n), in ``out``, and the features relative to the centre.
@@ -81,9 +98,12 @@ class Affinity:
         """
         batch, size, count = features.shape
         if self.columns.shape[2] != count:
-            self.columns = features.new_ones(batch, size + 2, count)
+            self.columns = self.rows.new_ones(batch, size + 2, count)
         centred = torch.sub(features, self.centre, out=self.columns[:, :size])
         torch.sum(centred.square(), 1, out=self.columns[:, size + 1])
+        if self.exact:
+            exponents = torch.bmm(self.rows, self.columns).clamp_(self.floor, 0.0)
+            return out.copy_(exponents).exp2_(), centred.to(features)
         return torch.bmm(self.rows, self.columns, out=out).clamp_(self.floor, 0.0).exp2_(), centred
 
 
@@ -97,8 +117,8 @@ class _NystromFactor(torch.autograd.Function):
         batch, _, pixels = features.shape
         factor = large_empty((batch, landmarks.shape[2], pixels), features)
         norms = features.new_ones(batch, pixels)  # |u|^2
-        fill = _fill_natively if native.suits(features, landmarks, whitening) else _fill
-        fill(features, landmarks, whitening, complete, factor, norms)
+        natively = native.suits(features, landmarks, whitening) and not cancels(landmarks)
+        (_fill_natively if natively else _fill)(features, landmarks, whitening, complete, factor, norms)
         diagonal, scale = (1.0 - norms).clamp_(min=0.0), norms.clamp_(min=1.0).rsqrt_()
         ctx.save_for_backward(features, landmarks, whitening, factor, scale)
         ctx.complete = complete
@@ -109,7 +129,8 @@ class _NystromFactor(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, whitening, factor, scale = ctx.saved_tensors
-        if native.suits(features, landmarks, whitening, factor, scale, grad_diagonal, *factors_of(grad_factor)):
+        tensors = (features, landmarks, whitening, factor, scale, grad_diagonal, *factors_of(grad_factor))
+        if native.suits(*tensors) and not cancels(landmarks):
             inputs = (features, landmarks, whitening)
             return *_backward_natively(*inputs, factor, scale, ctx.complete, grad_factor, grad_diagonal), None
         grad_features = large_empty(features.shape, features)

@@ -1,6 +1,6 @@
 """Guide to operator: the filter W as an object. Paper: Sec. II."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -8,19 +8,28 @@ from torch import Tensor
 
 from nlfilter_torch.bandwidth import bandwidth_of_rows
 from nlfilter_torch.checks import (
-    check_bandwidth,
+    called_by_edit,
     check_choice,
     check_count,
     check_image,
+    check_instance,
+    check_number,
+    check_order,
     check_positive,
     check_same_size,
+    check_scale,
+    described,
+    is_hidden,
     warn,
+    warn_of_scale,
 )
 from nlfilter_torch.compilation import uncompiled
+from nlfilter_torch.eigenvalue_bound import is_bounded, largest_eigenvalue, limiter, shifted_gram
 from nlfilter_torch.features import GuideChannels, extract_features, reduce_channels, unit_window
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.landmarks import Sampling, choose_landmarks
-from nlfilter_torch.nystrom import Completion, nystrom_factor, whitener
+from nlfilter_torch.newton import PixelScaling, isolated, row_sums
+from nlfilter_torch.nystrom import Completion, whitener
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
 from nlfilter_torch.sharding import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
@@ -28,6 +37,7 @@ from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import Spectrum, compute_spectrum
 from nlfilter_torch.thin import moment, spread
 
+ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
 
 
@@ -43,7 +53,7 @@ class Diagnostics:
         balancing_steps: sweeps over the factor that balancing took.
         row_sum_residual: largest deviation of a row sum from 1.
         smallest_row_sum: the least row sum of the kernel before balancing; the plain method fails as it nears zero.
-        largest_eigenvalue: of the operator as it is, not clamped; 1 in theory.
+        largest_eigenvalue: an upper bound, as :meth:`NonlocalOperator.certify` has it.
         eigenvector_residual: largest ||W v - lambda v|| over the unit eigenvectors.
         orthogonality: largest deviation of V V^T from the identity.
         diagonal_share: mean of the diagonal part r of W: how much of a pixel the landmarks leave to itself.
@@ -62,12 +72,31 @@ class Diagnostics:
     diagonal_share: list[float]
 
 
+@dataclass(frozen=True)
+class Certificate:
+    """What an operator keeps of its promises, measured; lists with one entry per image.
+
+    Attributes:
+        symmetry: difference of ``x^T W y`` and ``y^T W x`` for random images x and y, relative to their lengths.
+        row_sums: largest deviation of a row sum from 1.
+        smallest_eigenvalue: a lower bound of the eigenvalues: the smallest r, since the rest of W is positive
+            semi-definite.
+        largest_eigenvalue: an upper bound of the eigenvalues; exactly 1 where none exceeds 1 but for rounding.
+    """
+
+    symmetry: list[float]
+    row_sums: list[float]
+    smallest_eigenvalue: list[float]
+    largest_eigenvalue: list[float]
+
+
 @dataclass(frozen=True, eq=False)
 class NonlocalOperator:
-    """The symmetric, doubly stochastic filter ``W = diag(d) (U^T U + diag(c)) diag(d)`` of an image, never formed.
+    """The symmetric, doubly stochastic filter ``W = diag(d) U^T U diag(d) + diag(r)`` of an image, never formed.
 
     Made by :func:`nonlocal_operator`. Every pixel is linked to every other one through M landmarks; W has unit row sums
-    and its eigenvalues lie in [0, 1].
+    and its eigenvalues lie in [0, 1]. Affinities that pass through few landmarks may be negative. A pixel whose
+    affinities to all others sum to less than zero keeps its value; eigenvalues that would exceed 1 are set to 1.
 
     Attributes:
         factor: U, (B, M, N), pixels last.
@@ -75,7 +104,9 @@ class NonlocalOperator:
         scaling: d, (B, N), positive.
         size: (H, W).
         kernel: the recipe of factor and diagonal, for the pixels of other guides.
-        residual: largest deviation of a row sum from 1 when balancing stopped, (B,).
+        remainder: r, (B, N), the diagonal part of W.
+        balancing: what the scaling of other pixels is a function of.
+        residual: largest deviation of a row sum of W from 1, (B,).
         balancing_steps: sweeps over the factor that balancing took.
         shard: of the image, where other ranks have the rest of it; everything above is then what is here.
     """
@@ -85,6 +116,8 @@ class NonlocalOperator:
     scaling: Tensor
     size: tuple[int, int]
     kernel: Kernel
+    remainder: Tensor
+    balancing: PixelScaling
     residual: Tensor
     balancing_steps: int
     shard: Shard | None = None
@@ -110,17 +143,17 @@ class NonlocalOperator:
     @full_precision
     def powers(self, image: Tensor, order: int) -> Tensor:
         """``W y, ..., W^k y`` as (B, k, C, H, W) in the operator's dtype; arguments and errors as :meth:`matmul`."""
+        check_order(order)
         check_image(image, "image")
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
-        planes = apply_powers(self.factor, self.scaling, self.diagonal, folded, order, self.shard)
+        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.shard)
         return unfold_batch(planes, image.shape[0], self.size)
 
     @property
     def diagonal_share(self) -> Tensor:
-        """What W takes of a pixel's own value for want of pixels like it, r = d^2 c in [0, 1] as (B, 1, H, W)."""
-        share = self.scaling * (self.scaling * self.diagonal)  # in this order: without completion d^2 may overflow
-        return share.unflatten(1, self.size).unsqueeze(1)
+        """What W takes of a pixel's own value for want of pixels like it, r in [0, 1] as (B, 1, H, W)."""
+        return self.remainder.unflatten(1, self.size).unsqueeze(1)
 
     def row_sums(self) -> Tensor:
         """(B, 1, H, W), one everywhere to :attr:`residual`."""
@@ -140,8 +173,8 @@ class NonlocalOperator:
             raise ValueError(
                 f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
             )
-        kernel = self.factor.mT @ self.factor + torch.diag_embed(self.diagonal)
-        return self.scaling.unsqueeze(2) * kernel * self.scaling.unsqueeze(1)
+        scaled = self.factor * self.scaling.unsqueeze(1)  # F first: without completion U may be too small to square
+        return scaled.mT @ scaled + torch.diag_embed(self.remainder)
 
     @uncompiled
     @full_precision
@@ -156,14 +189,42 @@ class NonlocalOperator:
         """
         if rank is not None:
             check_count(rank, "rank")
-        diagonal = self.diagonal if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(self.factor, self.scaling, diagonal, self.size, rank, self.shard)
+        remainder = self.remainder if self.kernel.completion == "diagonal" else None
+        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.shard)
+
+    @full_precision
+    @torch.no_grad()
+    def certify(self) -> "Certificate":
+        """Measure whether W is what it promises to be, for the price of a spectrum's Gram matrix and three products.
+
+        Example:
+            >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
+            >>> certificate = nonlocal_operator(guide, num_landmarks=20).certify()
+            >>> certificate.row_sums[0] < 1e-4 and certificate.symmetry[0] < 1e-6
+            True
+            >>> 0 <= certificate.smallest_eigenvalue[0] and certificate.largest_eigenvalue[0] < 1.0001
+            True
+        """
+        batch, generator = self.factor.shape[0], torch.Generator().manual_seed(0)
+        images = torch.randn(1, 2, *self.size, generator=generator, dtype=torch.float64).to(self.factor)
+        x, y = images.expand(batch, -1, -1, -1).split(1, dim=1)
+        products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().sum((2, 3))
+        inner = reduce_sum(products, self.shard)
+        lengths = reduce_sum(images.double().square().sum((0, 2, 3)), self.shard)
+        highest, lowest = (reduce_max((sign * self.remainder).amax(1), self.shard) for sign in (1, -1))
+        gram = shifted_gram(self.factor, self.scaling, self.remainder, self.shard)
+        return Certificate(
+            symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
+            row_sums=reduce_max((self.row_sums() - 1).abs().amax((1, 2, 3)), self.shard).tolist(),
+            smallest_eigenvalue=(-lowest).tolist(),
+            largest_eigenvalue=largest_eigenvalue(gram, highest, self.factor.dtype).tolist(),
+        )
 
     @full_precision
     @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
         """Measure how good the operator is. Costs several times as much as the spectrum."""
-        spectrum = self.spectrum()
+        spectrum, certificate = self.spectrum(), self.certify()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]
         image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
@@ -180,13 +241,42 @@ class NonlocalOperator:
             rank=spectrum.support.sum(1).tolist(),
             photometric_bandwidth=bandwidth.tolist(),
             balancing_steps=self.balancing_steps,
-            row_sum_residual=reduce_max((self.row_sums() - 1).abs().amax((1, 2, 3)), self.shard).tolist(),
+            row_sum_residual=certificate.row_sums,
             smallest_row_sum=(-reduce_max(-kernel_sums.amin(1), self.shard)).tolist(),
-            largest_eigenvalue=spectrum.largest.tolist(),
+            largest_eigenvalue=certificate.largest_eigenvalue,
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(reduce_sum(flat @ flat.mT, self.shard) - occupied).abs().amax((1, 2)).tolist(),
             diagonal_share=(reduce_sum(self.diagonal_share.sum((1, 2, 3)), self.shard) / spectrum.pixels).tolist(),
         )
+
+
+def check_options(
+    *,
+    num_landmarks: int,
+    landmarks: str,
+    completion: str,
+    guide_channels: str,
+    tolerance: float | None,
+    generator: torch.Generator | None,
+) -> None:
+    """Raise unless those options of :func:`nonlocal_operator` are right that can be checked without its guide."""
+    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    remedy = "choose one of these, and pass how many there are as num_landmarks"
+    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
+    check_choice(completion, "completion", ("diagonal", "none"))
+    check_count(num_landmarks, "num_landmarks")
+    if tolerance is not None:
+        check_number(tolerance, "tolerance", "pass a float or None")
+        check_positive(tolerance, "tolerance")
+    if generator is not None:
+        check_instance(generator, torch.Generator, "generator", "make one with torch.Generator()")
+
+
+def _is_small(bandwidth: float | Tensor | str) -> bool:
+    """Whether a photometric bandwidth is one for an image in [0, 1], or ``"auto"``."""
+    if isinstance(bandwidth, Tensor):
+        return not is_hidden(bandwidth) and bool((bandwidth.detach() < 1).all())
+    return isinstance(bandwidth, str) or bandwidth < 1
 
 
 @uncompiled
@@ -213,8 +303,10 @@ def nonlocal_operator(
     (for k-means, the assignment of pixels to centroids) held.
 
     Args:
-        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network.
-        patch_size: p, odd; pixels outside the image are reflected.
+        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
+            channels with values above 16 is worth a warning, on processors, if the bandwidth is ``"auto"`` or below 1:
+            it is probably in [0, 255].
+        patch_size: p, odd, at most 101; pixels outside the image are reflected.
         photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
             shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
         spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
@@ -249,12 +341,22 @@ def nonlocal_operator(
         True
     """
     check_image(guide, "guide")
-    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"))
-    check_choice(completion, "completion", ("diagonal", "none"))
-    check_count(num_landmarks, "num_landmarks")
-    if tolerance is not None:
-        check_positive(tolerance, "tolerance")
+    check_options(
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        tolerance=tolerance,
+        generator=generator,
+    )
+    if isinstance(photometric_bandwidth, str):
+        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
+    else:
+        check_positive(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+    if _is_small(photometric_bandwidth) and not called_by_edit():
+        warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
     shard = meet(guide, group)
     size = (guide.shape[2], guide.shape[3])  # here
@@ -262,17 +364,18 @@ def nonlocal_operator(
     weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
     guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
     if isinstance(photometric_bandwidth, str):
-        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
         bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
     else:
-        check_bandwidth(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
         bandwidth = replicate(photometric_bandwidth, shard)
+    largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
+    check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
-        check_bandwidth(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+        farthest = torch.full_like(largest, max(height, width))
+        check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial_bandwidth = replicate(spatial_bandwidth, shard)
     if num_landmarks > height * width:
         warn(
-            f"num_landmarks must be at most the number of pixels, {height * width}, got {num_landmarks}; "
+            f"num_landmarks must be at most the number of pixels, {height * width}, got {described(num_landmarks)}; "
             "using every pixel"
         )
         num_landmarks = height * width
@@ -287,15 +390,54 @@ def nonlocal_operator(
     )
     points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator, shard)
     kernel = Kernel(weights, bandwidth, spatial_bandwidth, guide_channels, points, whitener(points), completion)
-    factor, diagonal = nystrom_factor(features, points, kernel.whitening, completion)
-    balancing = balance(factor, diagonal, tolerance=tolerance, completed=completion == "diagonal", shard=shard)
+    bounded = is_bounded(landmarks, height * width, num_landmarks)
+    return assemble(features, kernel, size, tolerance=tolerance, bounded=bounded, shard=shard)
+
+
+def assemble(
+    features: Tensor,
+    kernel: Kernel,
+    size: tuple[int, int],
+    *,
+    bounded: bool,
+    tolerance: float | None = None,
+    shard: Shard | None = None,
+) -> NonlocalOperator:
+    """The operator of pixels with features (B, D, N); ``bounded``, on processors, keeps its eigenvalues at most 1."""
+    factor, diagonal = kernel.factor(features)
+    completed, watched = kernel.completion == "diagonal", factor.device.type == "cpu"
+    balancing = balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard)
+    before: list[Tensor] = []
+    while completed and watched and len(before) < ROUNDS:
+        alone = isolated(balancing.scaling.detach())
+        if not bool(reduce_max(alone.any().to(factor), shard)):
+            break
+        before.append(balancing.moment)
+        factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
+        balancing = balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard)
+    scaling, residual = balancing.scaling, balancing.residual
+    remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
+    if bounded and watched:
+        limit = limiter(shifted_gram(factor, scaling, remainder, shard), balancing.moment, factor.dtype)
+        if limit is not None:
+            factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
+            before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
+            residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,
-        scaling=balancing.scaling,
+        scaling=scaling,
         size=size,
         kernel=kernel,
-        residual=balancing.residual,
+        remainder=remainder,
+        balancing=PixelScaling(balancing.moment, completed, tuple(before)),
+        residual=residual,
         balancing_steps=balancing.steps,
         shard=shard,
     )
+
+
+def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, shard: Shard | None) -> Tensor:
+    """Largest deviation of a row sum from 1, (B,)."""
+    sums = row_sums(factor, diagonal, scaling, moment(factor, scaling.unsqueeze(1), shard))
+    return reduce_max((sums - 1).abs().amax(1), shard)

@@ -5,16 +5,23 @@ presets that have a name.
 """
 
 import json
-import math
+import reprlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
-from nlfilter_torch.edits.enhance import enhance
+#: Ranges of what presets and options hold: beyond them nothing useful is left, and numbers overflow.
+GAINS = (-1e6, 1e6)  # of sliders
+BANDWIDTHS = (0.01, 1e6)  # photometric, in grey levels of 255
+DISTANCES = (0.01, 1e6)  # spatial bandwidths, in pixels
+MAX_SLIDERS = 100
+MAX_PATCH = 99  # pixels
+MAX_LANDMARKS = 10_000
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class Preset:
     landmarks: int = 100
     sampling: str = "kmeans"
 
-    def apply(self, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    def apply(self, image: "Tensor", *, generator: "torch.Generator | None" = None) -> "Tensor":
         """Edit a photograph as ``nlfilter-torch detail --preset`` does.
 
         Args:
@@ -51,10 +58,15 @@ class Preset:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or an entry leaves its range.
 
         Example:
+            >>> import torch
             >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
             >>> PRESETS["crisp"].apply(image).shape
             torch.Size([1, 3, 24, 24])
         """
+        import torch
+
+        from nlfilter_torch.edits.enhance import enhance
+
         return enhance(image, torch.tensor(self.alpha), generator=generator, **self.options())
 
     def options(self) -> dict[str, Any]:
@@ -99,12 +111,7 @@ class Preset:
         Raises:
             ValueError: if ``text`` is no JSON object, or an entry is missing, unknown or not of its kind.
         """
-        try:
-            entries = json.loads(text)
-        except ValueError as error:
-            raise ValueError(
-                f"{name} is no preset: it is not JSON ({error}); make one with nlfilter-torch fit"
-            ) from error
+        entries = parse_json(text, name, "make one with nlfilter-torch fit")
         if not isinstance(entries, dict) or "alpha" not in entries:
             raise ValueError(f"{name} is no preset: it has no entry alpha; make one with nlfilter-torch fit")
         for entry, value in entries.items():
@@ -112,7 +119,7 @@ class Preset:
                 raise ValueError(f"{name} must hold no other entries than {', '.join(ENTRIES)}, got {entry}; remove it")
             wanted, is_valid = ENTRIES[entry]
             if not is_valid(value):
-                raise ValueError(f"{entry} in {name} must be {wanted}, got {json.dumps(value)}; correct it")
+                raise ValueError(f"{entry} in {name} must be {wanted}, got {shown(value)}; correct it")
         return Preset(**entries | {"alpha": tuple(map(float, entries["alpha"]))})
 
 
@@ -163,25 +170,63 @@ def find_preset(name: str) -> Preset:
     return Preset.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
 
 
-def is_number(value: Any) -> bool:
-    """Whether a value of JSON is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def parse_json(text: str, name: str, remedy: str) -> Any:
+    """What the text of the file ``name`` holds.
+
+    Raises:
+        ValueError: if it is not JSON, or nested deeper than Python can follow.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
+        raise ValueError(f"{name} is no preset: {reason}; {remedy}") from error
 
 
-def is_count(value: Any) -> bool:
-    """Whether a value of JSON is a positive whole number."""
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+def shown(value: Any) -> str:
+    """A value of JSON for a message, however long or deeply nested it is.
+
+    >>> shown({"a": None}), shown([0] * 100)
+    ('{"a": null}', '[0, 0, 0, 0, 0, 0, ...]')
+    """
+    short = reprlib.repr(value)
+    try:
+        text = json.dumps(value)
+    except RecursionError:
+        return short
+    return text if len(text) <= 80 else short
+
+
+def is_within(value: Any, low: float, high: float) -> bool:
+    """Whether a value of JSON is a number in a range of finite ends; NaN is not."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+
+
+def is_count(value: Any, most: int) -> bool:
+    """Whether a value of JSON is a whole number from 1 to ``most``."""
+    return isinstance(value, int) and is_within(value, 1, most)
+
+
+def is_sliders(value: Any) -> bool:
+    """Whether a value of JSON is a list of sliders."""
+    return isinstance(value, list) and 2 <= len(value) <= MAX_SLIDERS and all(is_within(v, *GAINS) for v in value)
 
 
 # What each entry must be, in words and as a test.
 ENTRIES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "alpha": (
-        "a list of at least two numbers",
-        lambda v: isinstance(v, list) and len(v) > 1 and all(map(is_number, v)),
+        f"a list of 2 to {MAX_SLIDERS} numbers, none beyond {GAINS[1]:.0f}",
+        is_sliders,
     ),
-    "bandwidth": ('a positive number of grey levels or "auto"', lambda v: v == "auto" or (is_number(v) and v > 0)),
-    "spatial_bandwidth": ("a positive number of pixels or null", lambda v: v is None or (is_number(v) and v > 0)),
-    "patch_size": ("an odd positive number", lambda v: is_count(v) and v % 2 == 1),
-    "landmarks": ("a positive number", is_count),
+    "bandwidth": (
+        f'a positive number of grey levels, from {BANDWIDTHS[0]:g} to {BANDWIDTHS[1]:.0f}, or "auto"',
+        lambda v: v == "auto" or is_within(v, *BANDWIDTHS),
+    ),
+    "spatial_bandwidth": (
+        f"a positive number of pixels, from {DISTANCES[0]:g} to {DISTANCES[1]:.0f}, or null",
+        lambda v: v is None or is_within(v, *DISTANCES),
+    ),
+    "patch_size": (f"an odd number from 1 to {MAX_PATCH}", lambda v: is_count(v, MAX_PATCH) and v % 2 == 1),
+    "landmarks": (f"a whole number from 1 to {MAX_LANDMARKS}", lambda v: is_count(v, MAX_LANDMARKS)),
     "sampling": ('"kmeans", "uniform" or "random"', lambda v: v in ("kmeans", "uniform", "random")),
 }

@@ -1,4 +1,4 @@
-"""Products with ``W = F^T F + diag(r)``, where F = factor diag(d) and r = d^2 diagonal. Paper: eq. (13)."""
+"""Products with ``W = F^T F + diag(r)``, where F = factor diag(d). Paper: eq. (13)."""
 
 from typing import Any
 
@@ -11,14 +11,14 @@ from nlfilter_torch.thin import moment, spread
 
 
 def apply_powers(
-    factor: Tensor, scaling: Tensor, diagonal: Tensor, image: Tensor, order: int, shard: Shard | None = None
+    factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int, shard: Shard | None = None
 ) -> Tensor:
     """``W y, W^2 y, ..., W^k y``.
 
     Args:
         factor: (B, M, N).
         scaling: d, (B, N).
-        diagonal: (B, N) of the kernel, before scaling.
+        remainder: r, (B, N).
         image: y, (B, C, N).
         order: k, at least 1.
         shard: of the image, where other ranks have the rest of it.
@@ -27,7 +27,6 @@ def apply_powers(
         (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
         as the operator needs no gradient.
     """
-    remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, shard)  # type: ignore[no-untyped-call]
         return result

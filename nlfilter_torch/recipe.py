@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from nlfilter_torch.brush import Stroke
-from nlfilter_torch.presets import Preset, find_preset
+from nlfilter_torch.presets import Preset, find_preset, parse_json, shown
 from nlfilter_torch.steps import NONE, Abstract, Colorize, Defocus, Detail, Recolor, Step
 
 
@@ -104,10 +104,7 @@ class Recipe:
         Raises:
             ValueError: if ``text`` is no JSON object, or an entry is unknown or not of its kind.
         """
-        try:
-            entries = json.loads(text)
-        except ValueError as error:
-            raise ValueError(f"{name} is no preset: it is not JSON ({error}); save one in the editor") from error
+        entries = parse_json(text, name, "save one in the editor")
         if isinstance(entries, dict) and "alpha" in entries:
             return Recipe(Detail.of(Preset.from_json(text, name)))
         if not isinstance(entries, dict) or not set(entries) <= set(STEPS):
@@ -154,12 +151,12 @@ def _lines(step: Any) -> str:
 def _read(kind: Any, entries: Any, place: str) -> Any:
     """A step from what JSON holds."""
     if not isinstance(entries, dict):
-        raise ValueError(f"{place} must hold entries in braces, got {entries!r}; correct it")
+        raise ValueError(f"{place} must hold entries in braces, got {shown(entries)}; correct it")
     values: dict[str, Any] = {}
     for entry, value in entries.items():
         if entry == "strokes" and kind.PAINTS:
             if not isinstance(value, list):
-                raise ValueError(f"strokes of {place} must be a list, got {value!r}; correct them")
+                raise ValueError(f"strokes of {place} must be a list, got {shown(value)}; correct them")
             values[entry] = tuple(Stroke.from_entries(stroke, kind.PAINTS, place) for stroke in value)
             continue
         if entry not in kind.VALID:
@@ -167,7 +164,7 @@ def _read(kind: Any, entries: Any, place: str) -> Any:
             raise ValueError(f"{place} must hold no other entries than {', '.join(known)}, got {entry}; remove it")
         wanted, is_valid = kind.VALID[entry]
         if not is_valid(value):
-            raise ValueError(f"{entry} of {place} must be {wanted}, got {json.dumps(value)}; correct it")
+            raise ValueError(f"{entry} of {place} must be {wanted}, got {shown(value)}; correct it")
         values[entry] = tuple(map(float, value)) if isinstance(value, list) else value
     if kind is Detail:
         values.setdefault("alpha", NONE)

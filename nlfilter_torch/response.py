@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha
+from nlfilter_torch.checks import FLOATING, check_alpha, check_finite, check_tensor
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
@@ -25,6 +25,10 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
         >>> polynomial_response(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 1.0, 1.0, 1.5]))
         tensor([3.0000, 2.0625, 1.5000])
     """
+    check_tensor(eigenvalues, "eigenvalues")
+    if eigenvalues.dtype not in FLOATING:
+        raise TypeError(f"eigenvalues must be of a floating-point dtype, got {eigenvalues.dtype}; convert them")
+    check_finite(eigenvalues, "eigenvalues")
     check_alpha(alpha, dimensions=(1, 2))
     weights = alpha.to(eigenvalues)
     gain = weights[..., -1:]  # Horner's scheme from the coarsest layer down

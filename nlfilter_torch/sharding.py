@@ -69,13 +69,9 @@ def meet(guide: Tensor, group: Any) -> Shard | None:
         TypeError: if ``group`` is no process group that this process belongs to.
         ValueError: if the guides differ in more than their number of rows.
     """
+    check_group(group)
     if group is None:
         return None
-    if not dist.is_available() or not isinstance(group, dist.ProcessGroup):
-        raise TypeError(
-            f"group must be a process group of torch.distributed with this process in it, got {type(group).__name__}; "
-            "pass torch.distributed.group.WORLD after torch.distributed.init_process_group"
-        )
     batch, channels, height, width = guide.shape
     own = [height, batch, channels, width, torch.finfo(guide.dtype).bits]
     shapes = [part.tolist() for part in _gather(torch.tensor(own, device=guide.device), group)]
@@ -86,6 +82,17 @@ def meet(guide: Tensor, group: Any) -> Shard | None:
                 f"rank 0, got {shape[1:]} on rank {rank}; cut one image into rows"
             )
     return Shard(group, tuple(shape[0] for shape in shapes), width)
+
+
+def check_group(group: Any) -> None:
+    """Raise TypeError unless ``group`` is None or a process group that this process belongs to."""
+    if group is None:
+        return
+    if not dist.is_available() or not isinstance(group, dist.ProcessGroup):
+        raise TypeError(
+            f"group must be a process group of torch.distributed with this process in it, got {type(group).__name__}; "
+            "pass torch.distributed.group.WORLD after torch.distributed.init_process_group"
+        )
 
 
 def reduce_sum(tensor: Tensor, shard: Shard | None) -> Tensor:

@@ -18,7 +18,7 @@ from nlfilter_torch.sharding import Shard, reduce_sum
 from nlfilter_torch.thin import gather, moment, spread
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-ALARM = 1e-3  # a residual that balancing ends above is worth a warning
+ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}  # a residual that is worth a warning, unless it was asked for
 # Conjugate gradients gain a factor 5.8 a step or more: so many steps, or a residual below the rounding of the dtype.
 SOLVE_STEPS = {torch.float32: 10, torch.float64: 24}
 SOLVED = {torch.float32: 1e-7, torch.float64: 1e-16}
@@ -30,11 +30,13 @@ class Balancing:
 
     Attributes:
         scaling: d, (B, N), positive; differentiable in factor and diagonal.
+        moment: ``factor @ d``, (B, M, 1) in float64, without a gradient.
         residual: largest deviation of a row sum of W from 1, (B,).
         steps: sweeps over the factor that it took.
     """
 
     scaling: Tensor
+    moment: Tensor
     residual: Tensor
     steps: int
 
@@ -52,19 +54,19 @@ def balance(
     Args:
         factor: (B, M, N).
         diagonal: (B, N), non-negative.
-        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. The iteration also stops
-            where rounding keeps the residual from falling, and warns if that is above 1e-3.
+        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a residual
+            that ends above it and above 1e-4 (1e-9 in float64) raises a warning.
         completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
         shard: of the image, where other ranks have the rest of it.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
-    if factor.device.type == "cpu" and not bool((residual <= ALARM).all()):
-        warn(
-            f"balancing left row sums off by up to {residual.max().item():.1e}; "
-            "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
+    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
+    if factor.device.type == "cpu" and not bool((residual <= max(tolerance, ALARM[factor.dtype])).all()):
+        remedy = "raise photometric_bandwidth or num_landmarks" + (
+            ", or use completion='diagonal'" if not completed else ""
         )
-    return Balancing(scaling, residual, int(steps))
+        warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
+    return Balancing(scaling, total, residual, int(steps))
 
 
 class _Balance(torch.autograd.Function):
@@ -81,29 +83,30 @@ class _Balance(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, shard: Shard | None
-    ) -> tuple[Tensor, Tensor, int]:
-        if completed:
-            scaling, total, residual, steps, inverse = newton.solve(factor, diagonal, tolerance, shard)
-        else:
-            scaling, total, residual, steps = chebyshev.solve(factor, diagonal, tolerance, shard)
-            inverse = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device)
-        ctx.save_for_backward(factor, diagonal, scaling, total, inverse)
-        ctx.shard = shard
-        ctx.mark_non_differentiable(residual)
-        return scaling, residual, steps
+    ) -> tuple[Tensor, Tensor, Tensor, int]:
+        solve = newton.solve if completed else chebyshev.solve
+        found = solve(factor, diagonal, tolerance, shard)
+        ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse)
+        ctx.shard, ctx.completed = shard, completed
+        ctx.mark_non_differentiable(found.moment, found.residual)
+        return found.scaling, found.moment, found.residual, found.sweeps
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling, total, inverse = ctx.saved_tensors
+        dtype = factor.dtype
+        if not ctx.completed:  # d may be 1e25 without completion, its square too large for float32
+            factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
         right = moment(factor, (weight * grad).unsqueeze(1), ctx.shard)
         solution = _conjugate_gradients(factor, weight, right, inverse, ctx.shard)
         affinity = spread(solution.to(factor).mT, factor).squeeze(1)
         a = scaling * scaling * share * (grad - affinity)
-        totals = torch.cat([total, solution], dim=2).to(factor)  # (B, M, 2)
-        return outer_product(totals, torch.stack([-a, -scaling], dim=1)), -a * scaling, None, None, None
+        totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
+        grad_factor = outer_product(totals, torch.stack([-a, -scaling], dim=1).to(dtype))
+        return grad_factor, (-a * scaling).to(dtype), None, None, None
 
 
 def _weighted_moment(factor: Tensor, weight: Tensor, shard: Shard | None, total: Tensor) -> Tensor:

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import native
-from nlfilter_torch.blocks import buffered_blocks, strip_count, strips
-from nlfilter_torch.checks import check_image, check_same_size
+from nlfilter_torch.blocks import SWEPT, buffered_blocks, pixel_blocks, strip_count, strips
+from nlfilter_torch.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.differentiation import once_differentiable
 from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.precision import full_precision
@@ -24,8 +24,10 @@ from nlfilter_torch.products import fold_batch, unfold_batch
 from nlfilter_torch.sharding import Shard, reduce_sum
 from nlfilter_torch.thin import moment, spread
 
-# Directions of G below this are rounding: float32 eigenvectors from above it are orthonormal to 1e-3.
+# Directions of G below this are rounding.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
+# Where the inverse eigenvalues of G sum to more, some are so small that sums in float32 cost orthogonality.
+WEAK = 3e3
 # Eigenvalues this close to 1 count as 1 when the constant vector is picked out of their eigenspace.
 CLUSTER = {torch.float32: 1e-3, torch.float64: 1e-8}
 
@@ -66,8 +68,11 @@ class RitzPairs:
 
         Returns:
             Independent of the choice of eigenvectors; differentiable in the operator and in what ``response`` holds.
+
+        Raises:
+            TypeError, ValueError: if ``response`` does not return a finite gain for every eigenvalue.
         """
-        return self.root @ self.basis(response)
+        return self.root @ self.basis(checked_response(response, self.support))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +159,7 @@ class Spectrum(RitzPairs):
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
         """``V f(S) V^T y``, (B, C, H, W), for a response f and coefficients (B, C, M) of y: one read of the factor."""
+        check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
         weighted = total @ self.gain(response).mT
@@ -180,18 +186,19 @@ class Spectrum(RitzPairs):
 def compute_spectrum(
     factor: Tensor,
     scaling: Tensor,
-    diagonal: Tensor | None,
+    remainder: Tensor | None,
     size: tuple[int, int],
     rank: int | None,
     shard: Shard | None = None,
 ) -> Spectrum:
-    """Spectrum of ``W``; ``diagonal`` is None where W has no diagonal part."""
-    remainder = None if diagonal is None else scaling.square() * diagonal
+    """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
-    recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else sum_grams  # transforms of torch.func know no such class
-    grams = reduce_sum(sums(factor, scaling, remainder, 1 if remainder is None else 2), shard)
-    pairs = RitzPairs.of_sums(grams, factor.dtype)
+    count = 1 if remainder is None else 2
+    pairs = RitzPairs.of_sums(reduce_sum(compute_grams(factor, scaling, remainder, count), shard), factor.dtype)
+    checked = factor.dtype == torch.float32 and factor.device.type == "cpu"
+    if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
+        grams = compute_grams(factor, scaling, remainder, count, exact=True)
+        pairs = RitzPairs.of_sums(reduce_sum(grams, shard), factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
@@ -239,13 +246,34 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
     return total.sum(0, keepdim=True) if parts > 1 else total
 
 
+def compute_grams(
+    factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, *, exact: bool = False
+) -> Tensor:
+    """:func:`sum_grams`, differentiable; ``exact`` works in float64."""
+    recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
+    sums = _Grams.apply if recorded else _exact_or_quick  # transforms of torch.func know no such class
+    grams: Tensor = sums(factor, scaling, remainder, count, exact)
+    return grams
+
+
+def _exact_or_quick(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, exact: bool) -> Tensor:
+    """:func:`sum_grams`, in float64 if ``exact``, some pixels at a time."""
+    if not exact:
+        return sum_grams(factor, scaling, remainder, count)
+    total = factor.new_zeros(())
+    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+        part = None if remainder is None else remainder[:, block].double()
+        total = total + sum_grams(factor[:, :, block].double(), scaling[:, block].double(), part, count)
+    return total
+
+
 class _Grams(torch.autograd.Function):
     """:func:`sum_grams` with a gradient that keeps none of its blocks."""
 
     @staticmethod
-    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
+    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, exact: bool) -> Tensor:
         ctx.save_for_backward(factor, scaling, remainder)
-        return sum_grams(factor, scaling, remainder, count)
+        return _exact_or_quick(factor, scaling, remainder, count, exact)
 
     @staticmethod
     @once_differentiable
@@ -264,4 +292,4 @@ class _Grams(torch.autograd.Function):
                 pulled.addcmul_(weighted, remainder[:, None, block])
             grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
             grad_factor[:, :, block] = pulled.mul_(d)
-        return grad_factor, grad_scaling, grad_remainder, None
+        return grad_factor, grad_scaling, grad_remainder, None, None

@@ -22,7 +22,7 @@ from nlfilter_torch.edits.recolor import Recoloring
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import detail_layers, weigh_layers
 from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.presets import ENTRIES, Preset, is_number
+from nlfilter_torch.presets import ENTRIES, Preset, is_count, is_sliders, is_within
 
 Valid = tuple[str, Callable[[Any], bool]]  # what an entry must be, in words and as a test
 
@@ -35,7 +35,7 @@ def seeded() -> torch.Generator:
 
 
 def _within(low: float, high: float) -> Valid:
-    return f"a number from {low:g} to {high:g}", lambda value: is_number(value) and low <= value <= high
+    return f"a number from {low:g} to {high:g}", lambda value: is_within(value, low, high)
 
 
 class Step(Protocol):
@@ -100,7 +100,7 @@ class Detail:
     VALID: ClassVar[dict[str, Valid]] = ENTRIES | {
         "inside": (
             "a list of as many numbers as alpha",
-            lambda v: isinstance(v, list) and len(v) > 1 and all(map(is_number, v)),
+            is_sliders,
         ),
         "spread": _within(0.05, 20),
     }
@@ -273,7 +273,7 @@ class Abstract(FilterStep):
         "width": _within(0.1, 20),
         "tones": (
             "a whole number from 2 to 64, or null",
-            lambda v: v is None or (is_number(v) and v == int(v) and 2 <= v <= 64),
+            lambda v: v is None or (is_count(v, 64) and v >= 2),
         ),
     }
 

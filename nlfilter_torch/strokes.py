@@ -14,7 +14,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_positive, check_same_size, check_tensor, check_unit_range
+from nlfilter_torch.checks import (
+    check_image,
+    check_instance,
+    check_positive,
+    check_same_size,
+    check_share,
+    check_tensor,
+    check_unit_range,
+)
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
 from nlfilter_torch.spectrum import RitzPairs, Spectrum
@@ -66,6 +74,7 @@ def propagate_strokes(
         >>> propagate_strokes(spectrum, strokes, painted)[0, 0, 2, ::5].round(decimals=1).abs()
         tensor([0., 0., 1., 1.])
     """
+    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     shard = spectrum.shard
     batch = spectrum.factor.shape[0]
     check_tensor(strokes, "strokes")
@@ -75,9 +84,9 @@ def propagate_strokes(
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum")
     check_painted(stroke_mask, shard=shard)
-    check_share(strength, "strength")
-    check_share(reach, "reach", below=True)
-    check_positive(smoothness, "smoothness")
+    check_share(strength, "strength", images)
+    check_share(reach, "reach", batch, below=True)
+    check_positive(smoothness, "smoothness", images)
 
     strength, reach, smoothness = (replicate(value, shard) for value in (strength, reach, smoothness))
     factor = spectrum.factor
@@ -236,18 +245,6 @@ def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shar
             f"{name} must hold a painted pixel in every image, got none in image(s) "
             f"{empty.nonzero().squeeze(1).tolist()}; paint at least one"
         )
-
-
-def check_share(value: float | Tensor, name: str, *, below: bool = False) -> None:
-    """Raise unless ``value`` (a number, or a tensor on the CPU) is in [0, 1], or in [0, 1) where ``below``."""
-    if not isinstance(value, Tensor | float | int):
-        raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number in [0, 1]")
-    values = torch.as_tensor(value).detach()
-    if values.device.type != "cpu":
-        return
-    inside = (values >= 0) & ((values < 1) if below else (values <= 1))
-    if not bool(inside.all()):
-        raise ValueError(f"{name} must be in [0, 1{')' if below else ']'}, got {values.tolist()}; clamp it")
 
 
 def _per_image(value: float | Tensor, like: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """TIFF files in and out, by tifffile: any depth, profile and EXIF carried."""
 
+import logging
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -13,9 +14,10 @@ from PIL import ExifTags, Image, TiffImagePlugin
 from nlfilter_torch import exif as exif_tags
 
 # Tags that describe the photograph; the others describe how the file stores it, and are written anew.
-_DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
-_FOLDERS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # tags that point at a table of further tags
+_DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)
 _ORIENTATION = int(ExifTags.Base.Orientation)
+# tifffile logs what it finds wrong with a file. Without a handler Python would print it before the error says the same.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 TILE = 256  # side of the tiles of a picture that is written by rows
 CLASSIC = 4_000_000_000  # bytes of pixels, compressed or not, that a TIFF file of the usual kind is trusted with
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
@@ -79,8 +81,8 @@ def notes(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes
     tags = file.pages.first.tags
     orientation, profile = tags.get(_ORIENTATION), tags.get(34675)
     return (
-        1 if orientation is None else int(orientation.value),
-        None if profile is None else bytes(profile.value),
+        1 if orientation is None else exif_tags.orientation_of(orientation.value),
+        profile.value if profile is not None and isinstance(profile.value, bytes) else None,
         None if file.is_bigtiff else _read_exif(path),
     )
 
@@ -147,8 +149,12 @@ def _write(
     tags = Image.Exif()
     if exif is not None:
         tags.load(exif)
-    text = [(code, "s", 0, str(tags[code]), True) for code in _DESCRIPTIVE if code in tags and code not in _FOLDERS]
-    folders = {code: folder for code in _FOLDERS if (folder := tags.get_ifd(code))}
+    text = [
+        (code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True)  # as Pillow has decoded it
+        for code in _DESCRIPTIVE
+        if code in tags and code not in exif_tags.FOLDERS
+    ]
+    folders = {code: folder for code in exif_tags.FOLDERS if (folder := tags.get_ifd(code))}
     # tifffile does not write tables of its own, so a tag of the number below keeps each one's place in the order.
     places = [(code - 1, "I", 1, 0, True) for code in folders]
     start = stream.tell()
@@ -180,7 +186,8 @@ def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder
     """Append a table of tags and make the tag at ``position`` the one that points at it."""
     table = TiffImagePlugin.ImageFileDirectory_v2(ifh=(b"II*\0" if order == "<" else b"MM\0*") + bytes(4))
     for key, value in folder.items():
-        table[key] = value
+        if exif_tags.is_writable(key, value):
+            table[key] = value
     end = stream.seek(0, 2)
     stream.write(bytes(end % 2))  # tables begin on even offsets
     offset = end + end % 2
@@ -190,13 +197,17 @@ def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder
 
 
 def _read_exif(path: Path) -> bytes | None:
-    exif = Image.Exif()
     with path.open("rb") as stream:
-        exif.load_from_fp(stream)
-        for code in list(exif):
-            if code not in _DESCRIPTIVE and code != _ORIENTATION:
-                del exif[code]
-        return exif_tags.split(exif)[1]
+
+        def read() -> Image.Exif:
+            exif = Image.Exif()
+            exif.load_from_fp(stream)
+            for code in list(exif):
+                if code not in _DESCRIPTIVE and code != _ORIENTATION:
+                    del exif[code]
+            return exif
+
+        return exif_tags.split(read)[1]
 
 
 def _unmultiplied(channels: NDArray[Any]) -> NDArray[Any]:

@@ -264,7 +264,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         tally.done, tally.left = 1, 1
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlfilter_torch.cli.batch.edit_folder", interrupt)
+    monkeypatch.setattr("nlfilter_torch.folders.edit_folder", interrupt)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 130
     captured = capsys.readouterr()
     told = "nlfilter-torch: the same command does the rest\nnlfilter-torch: interrupted; no file is half written\n"
@@ -276,7 +276,7 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     """A preset and options reach the edit and the record; cores are shared among workers and local ranks."""
     fill(tmp_path / "in", 9)
     seen = {}
-    monkeypatch.setattr("nlfilter_torch.cli.batch.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args))
+    monkeypatch.setattr("nlfilter_torch.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args))
     monkeypatch.setattr("nlfilter_torch.cli.batch._cores", lambda: 12)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     arguments = ["batch", str(tmp_path / "in"), str(tmp_path / "out"), "--preset", "smooth", "--seed", "5"]
@@ -318,7 +318,7 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ("--memory", 0),
     ):
         assert options[0].strip("-").replace("-", "_") in refused(capsys, source, target, *options).replace("-", "_")
-    assert "--spatial-bandwidth must be positive" in refused(capsys, source, target, "--spatial-bandwidth", 0)
+    assert "'--spatial-bandwidth': " in refused(capsys, source, target, "--spatial-bandwidth", 0)
     assert not target.exists()
 
     fill(target, 1)

@@ -180,7 +180,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         (["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels, such as 20, or auto, got '0'"),
         (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),
         (["--bandwidth", "inf"], "--bandwidth must be a positive number of grey levels"),
-        (["--spatial-bandwidth", "-2"], "spatial_bandwidth must be positive and finite, got -2"),
+        (["--spatial-bandwidth", "-2"], "Invalid value for '--spatial-bandwidth': "),
         (["--patch-size", "4"], "patch_size must be odd and at least 1, got 4; try 5"),
         (["--landmarks", "0"], "Invalid value for '--landmarks': "),
         (["--sampling", "best"], "Invalid value for '--sampling': 'best' is not one of"),

@@ -157,9 +157,18 @@ def test_residual_is_the_weight_of_what_the_eigenvectors_miss(completion: str) -
     assert missed.abs().max() > 1e-3
     assert bool((operator.diagonal_share > 1e-3).any()) == (completion == "diagonal")
     by_default = polynomial_filter(operator, image, double(ALPHA))
+    gain = polynomial_response(operator.diagonal_share.flatten(1), double(ALPHA)).view_as(operator.diagonal_share)
     for weight in (0.0, 1.0, ALPHA[0]):
         found = polynomial_filter(operator, image, double(ALPHA), residual=weight)
-        torch.testing.assert_close(found, by_default + (weight - ALPHA[0]) * missed, atol=1e-9, rtol=0)
+        torch.testing.assert_close(found, by_default + (weight - gain) * missed, atol=1e-9, rtol=0)
+
+
+def test_a_residual_of_one_moves_no_pixel_far() -> None:
+    """Pixels that W keeps in part were weighed twice: at 3 by the sliders, and once more by their residual."""
+    image = picture("rocket", 96, 96)
+    operator = build(image)
+    found = polynomial_filter(operator, image, double((3.0, 3.0, 4.0, 1.05)), residual=1.0)
+    assert ((found - image).abs() > 0.5).float().mean() < 1e-3
 
 
 @pytest.mark.parametrize("residual", [None, 0.0, 1.0])

@@ -12,9 +12,9 @@ from nlfilter_torch import (
     NonlocalAffinity,
     NonlocalFilter,
     PolynomialSliders,
+    SegmentMask,
     detail_layers,
     diffusion_mask,
-    estimate_bandwidth,
     nonlocal_operator,
     polynomial_filter,
 )
@@ -46,19 +46,6 @@ def test_learning_starts_from_the_function() -> None:
     operator = nonlocal_operator(image(), spatial_bandwidth=9.0, **OPTIONS)
     expected = polynomial_filter(operator, image(), torch.tensor(ALPHA), residual=ALPHA[0])
     torch.testing.assert_close(everything()(image()), expected, atol=1e-5, rtol=0)
-
-
-def test_automatic_bandwidth_learns_a_factor() -> None:
-    layer = NonlocalFilter(ALPHA, learn=("photometric_bandwidth",), num_landmarks=20)
-    expected = NonlocalFilter(ALPHA, num_landmarks=20)(image())
-    torch.testing.assert_close(layer(image()), expected, atol=1e-5, rtol=0)
-    with torch.no_grad():
-        layer.affinity.photometric_bandwidth.logarithm += math.log(1.5)
-    wider = nonlocal_operator(image(), photometric_bandwidth=1.5 * estimate_bandwidth(image()), num_landmarks=20)
-    torch.testing.assert_close(
-        layer(image()), polynomial_filter(wider, image(), torch.tensor(ALPHA)), atol=1e-5, rtol=0
-    )
-    assert "photometric_bandwidth=1.5 * auto" in repr(layer)
 
 
 def test_learned_numbers_are_shown_as_they_are() -> None:
@@ -146,6 +133,33 @@ def test_held_layers_take_sliders_of_a_call() -> None:
             ValueError,
             "photometric_bandwidth must be one of 'auto'",
         ),
+        (
+            lambda: NonlocalFilter(learn="photometric_bandwidth"),
+            ValueError,
+            "photometric_bandwidth must be a number to learn from, got 'auto'; pass",
+        ),
+        (lambda: NonlocalFilter(landmarks=48), ValueError, "landmarks must be one of .*, got 48; .* num_landmarks"),
+        (lambda: NonlocalAffinity(landmarks=48), ValueError, "landmarks must be one of .*, got 48; .* num_landmarks"),
+        (lambda: NonlocalFilter(num_landmarks="48"), TypeError, "num_landmarks must be an int, got str"),
+        (lambda: NonlocalFilter(patch_size=4), ValueError, "patch_size must be odd"),
+        (lambda: NonlocalFilter(patch_size=100001), ValueError, "patch_size must be at most 101, got 100001"),
+        (lambda: NonlocalFilter(completion="all"), ValueError, "completion must be one of"),
+        (lambda: NonlocalFilter(guide_channels="rgb"), ValueError, "guide_channels must be one of"),
+        (lambda: NonlocalFilter(tolerance=0.0), ValueError, "tolerance must be positive"),
+        (lambda: NonlocalFilter(tolerance=torch.tensor(1e-5)), TypeError, "tolerance must be a number, got Tensor"),
+        (lambda: NonlocalFilter(generator=1), TypeError, "generator must be a Generator, got int"),
+        (lambda: NonlocalFilter(group="all"), TypeError, "group must be a process group"),
+        (lambda: NonlocalFilter(patch_weights=torch.ones(2, 2)), ValueError, "patch_weights must have shape"),
+        (lambda: NonlocalFilter(residual=math.nan), ValueError, "residual must be finite, got nan"),
+        (lambda: NonlocalFilter(residual="all"), TypeError, "residual must be a number or a tensor, got str"),
+        (lambda: NonlocalFilter(learn=3), TypeError, "learn must be a list of names, got 3"),
+        (
+            lambda: NonlocalFilter("1, 1"),
+            TypeError,
+            "alpha must be numbers or rows of equal length of them, got '1, 1'",
+        ),
+        (lambda: DiffusionMask(time="long"), TypeError, "time must be a number or a tensor, got str"),
+        (lambda: SegmentMask(time=-1.0), ValueError, "time must be positive"),
         (lambda: NonlocalFilter(spatial_bandwidth=-3.0), ValueError, "spatial_bandwidth must be positive"),
         (lambda: NonlocalFilter(learn="spatial_bandwidth"), ValueError, "spatial_bandwidth must be a number of pixels"),
         (lambda: NonlocalFilter(patch_size=4, learn="patch_weights"), ValueError, "patch_size must be odd"),

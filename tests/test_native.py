@@ -363,7 +363,7 @@ def test_installing_goes_on_without_a_compiler(compiler: str, tmp_path: Path, mo
 
 
 def test_without_the_library_torch_does_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(native, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(native.instruction_sets, "__file__", str(tmp_path / "instruction_sets.py"))
     assert native._load() is None
     image = random(1, 1, 20, 20).sigmoid()
     with_kernels = nonlocal_operator(image, num_landmarks=20).matmul(image)

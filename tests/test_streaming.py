@@ -286,7 +286,7 @@ def test_report_tells_every_stage_and_its_end() -> None:
     seen: list[tuple[str, int, int]] = []
     streamed(cat(40, 60), sample=1000, num_landmarks=20, tile_rows=25, report=lambda *step: seen.append(step))
     stages = list(dict.fromkeys(stage for stage, _, _ in seen))
-    assert stages == ["Looking", "Sampling", "Balancing", "Summing up", "Filtering"]
+    assert stages == ["Looking", "Sampling", "Balancing", "Bounding", "Summing up", "Filtering"]
     assert seen[-3:] == [("Filtering", 0, 40), ("Filtering", 25, 40), ("Filtering", 40, 40)]
 
 

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from nlfilter_torch.bandwidth import estimate_bandwidth
 from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.eigenvalue_bound import is_bounded
 from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, unit_window
 from nlfilter_torch.filtering import detail_layers
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.landmarks import choose_landmarks
-from nlfilter_torch.nystrom import nystrom_factor, whitener
-from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.nystrom import whitener
+from nlfilter_torch.operator import NonlocalOperator, assemble, nonlocal_operator
 from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import Spectrum
 from nlfilter_torch.steps import Detail, FilterStep
 
@@ -87,9 +87,7 @@ def sampled_operator(
     kernel = Kernel(
         weights, bandwidth, detail.spatial_bandwidth, channels, points, whitener(points), completion="diagonal"
     )
-    factor, diagonal = nystrom_factor(features, points, kernel.whitening, kernel.completion)
-    balancing = balance(factor, diagonal)
-    return NonlocalOperator(factor, diagonal, balancing.scaling, size, kernel, balancing.residual, balancing.steps)
+    return assemble(features, kernel, size, bounded=is_bounded(detail.sampling, features.shape[2], count))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,18 @@ from nlfilter_torch.cli import interrupts
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status."""
-    with interrupts.heeded():
-        try:
+    try:
+        with interrupts.heeded():
             from nlfilter_torch.cli.application import run
-        except ModuleNotFoundError as error:
-            sys.stderr.write(
-                f"nlfilter-torch: the command line needs {error.name}, which is not installed; "
-                "install it with: pip install 'nlfilter-torch[cli]'\n"
-            )
-            return 2
-        return run(arguments)
+
+            return run(arguments)
+    except KeyboardInterrupt:
+        return interrupts.tell()
+    except interrupts.Ended as ended:
+        return ended.status
+    except ModuleNotFoundError as error:
+        sys.stderr.write(
+            f"nlfilter-torch: the command line needs {error.name}, which is not installed; "
+            "install it with: pip install 'nlfilter-torch[cli]'\n"
+        )
+        return 2

@@ -3,36 +3,35 @@
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.abstract import abstract as edit
-from nlfilter_torch.files import Photograph
+from nlfilter_torch.cli import options
 
 Power = Annotated[
     float,
-    typer.Option(min=0.0, metavar="K", help="How much detail goes: 0 none, 0.1 all but outlines, 1 much more."),
+    typer.Option(
+        min=0.0, max=10.0, metavar="K", help="How much detail goes: 0 none, 0.1 all but outlines, 1 much more."
+    ),
 ]
 Edges = Annotated[
     float, typer.Option(min=0.0, max=1.0, metavar="0...1", help="Darkness of lines along edges: 0 draws none.")
 ]
-EdgeWidth = Annotated[float, typer.Option(metavar="PIXELS", help="Width of these lines.")]
+EdgeWidth = Annotated[float, typer.Option(min=0.1, metavar="PIXELS", help="Width of these lines.")]
 Tones = Annotated[
-    int | None, typer.Option(min=2, metavar="N", help="Reduce brightness to so many tones. Left out: no such steps.")
+    int | None,
+    typer.Option(min=2, max=64, metavar="N", help="Reduce brightness to so many tones. Left out: no such steps."),
 ]
 
 
 def abstract(
     source: options.Source,
-    target: Target,
+    target: options.Target,
     power: Power = 0.1,
     edges: Edges = 0.0,
     edge_width: EdgeWidth = 1.0,
     tones: Tones = None,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     landmarks: options.Landmarks = 200,
     seed: options.Seed = 0,
 ) -> None:
@@ -42,6 +41,11 @@ def abstract(
 
     Like a comic: `nlfilter-torch abstract in.jpg out.jpg --edges 1 --tones 8 --bandwidth 50`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.edits.abstract import abstract as edit
+    from nlfilter_torch.files import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)

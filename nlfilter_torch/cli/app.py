@@ -5,8 +5,6 @@ from typing import Annotated
 
 import typer
 
-from nlfilter_torch.files import check_folder
-
 Image = Annotated[
     Path | None, typer.Argument(metavar="[IMAGE]", help="A photograph to begin with: PNG, JPEG, TIFF or WebP.")
 ]
@@ -39,6 +37,8 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
 
     Example: `nlfilter-torch app photo.jpg`
     """
+    from nlfilter_torch.files import check_folder
+
     folder = out if out is not None else image.parent if image is not None else Path.cwd()
     check_folder(folder)
     if not folder.is_dir():

@@ -1,12 +1,15 @@
 """The verbs put together, and what happens when one of them is given something it cannot use."""
 
+import math
+import reprlib
 import sys
 import warnings
-from typing import Annotated, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
+from typer.core import TyperCommand
 
-from nlfilter_torch import __version__, native
+from nlfilter_torch import __version__
 from nlfilter_torch.cli.abstract import abstract
 from nlfilter_torch.cli.app import app as app_verb
 from nlfilter_torch.cli.apply import apply
@@ -19,36 +22,55 @@ from nlfilter_torch.cli.detail import detail
 from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
-from nlfilter_torch.cli.options import INTERRUPTED
+from nlfilter_torch.cli.interrupts import INTERRUPTED, tell
 from nlfilter_torch.cli.presets import presets
 from nlfilter_torch.cli.recolor import recolor
 from nlfilter_torch.cli.sharpen import sharpen
 from nlfilter_torch.cli.tone import tone
+from nlfilter_torch.instruction_sets import NAMES, level, load_library
 
 NAME = "nlfilter-torch"
 
+
+class Verb(TyperCommand):
+    """A command that says what a wrong number was, and takes no number that is NaN or infinite."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Raise ValueError where an option is NaN or infinite, BadParameter where it is beyond its range."""
+        given = list(args)
+        try:
+            rest = super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            if error.param is None or "Input should be" not in error.message:
+                raise
+            value = self.make_parser(ctx).parse_args(given)[0].get(error.param.name or "")
+            if isinstance(value, str) and value.strip("+-").lower() in ("nan", "inf", "infinity"):
+                value = float(value)
+            _check_finite(error.param.opts[0], value)
+            error.message += f", got {reprlib.repr(value)}"
+            raise
+        for parameter in self.params:
+            _check_finite(parameter.opts[0], ctx.params.get(parameter.name))
+        return rest
+
+
+def _check_finite(option: str, value: Any) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{option} must be a finite number, such as 1, got {value}")
+
+
 app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
-app.command(name="app")(app_verb)
-app.command()(detail)
-app.command()(sharpen)
-app.command()(tone)
-app.command()(denoise)
-app.command()(recolor)
-app.command()(colorize)
-app.command()(defocus)
-app.command()(abstract)
-app.command()(apply)
-app.command()(fit)
-app.command()(presets)
-app.command()(batch)
-app.command()(frames)
-app.command()(inspect)
-app.command()(demo)
+app.command(name="app", cls=Verb)(app_verb)
+for _verb in (
+    *(detail, sharpen, tone, denoise, recolor, colorize, defocus, abstract),
+    *(apply, fit, presets, batch, frames, inspect, demo),
+):
+    app.command(cls=Verb)(_verb)
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"{NAME} {__version__}, kernels in C: {native.LEVELS[native.level]}")
+        typer.echo(f"{NAME} {__version__}, kernels in C: {NAMES[level(load_library())]}")
         raise typer.Exit
 
 
@@ -83,7 +105,7 @@ def run(arguments: list[str] | None = None) -> int:
         except (ValueError, OSError, MemoryError) as error:  # a bad file or value, found by the library
             return _refuse(str(error))
     if status == INTERRUPTED:
-        sys.stderr.write(f"{NAME}: interrupted; no file is half written\n")
+        return tell()
     return status if isinstance(status, int) else 0
 
 

@@ -4,15 +4,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options
-from nlfilter_torch.cli.by_rows import Full, Job, Memory
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.files import Photograph
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.streaming.rows import Rows
-from nlfilter_torch.streaming.whole_edit import edit_rows
+from nlfilter_torch.cli import options
 
 Edit = Annotated[
     str,
@@ -27,11 +20,11 @@ Edit = Annotated[
 
 def apply(
     source: options.Source,
-    target: Target,
+    target: options.Target,
     preset: Edit,
-    depth: OutputDepth = None,
-    memory: Memory = None,
-    full: Full = False,
+    depth: options.OutputDepth = None,
+    memory: options.Memory = None,
+    full: options.Full = False,
 ) -> None:
     """Edit a photograph as another one was edited in the browser: sliders, strokes and all.
 
@@ -39,6 +32,15 @@ def apply(
 
     Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli.by_rows import Job
+    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.recipe import Recipe
+    from nlfilter_torch.streaming.rows import Rows
+    from nlfilter_torch.streaming.whole_edit import edit_rows
+
     recipe = Recipe.find(preset)
 
     def work(photograph: Photograph) -> Tensor:
@@ -53,6 +55,7 @@ def apply(
         depth,
         work,
         landmarks=recipe.landmarks,
+        patch_size=recipe.detail.patch_size,
         factors=recipe.factors,
         memory=memory,
         by_rows=by_rows,

@@ -3,17 +3,16 @@
 import os
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nlfilter_torch.checks import check_patch_size, check_positive
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.by_rows import Memory, allowed_memory
-from nlfilter_torch.cli.detail import Edited, PresetName, Residual, check_residual, detail
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.folders import Tally, edit_folder, pictures, prepare
-from nlfilter_torch.ranks import connected_ranks
+from nlfilter_torch.cli.detail import PresetName, detail
+from nlfilter_torch.cli.interrupts import INTERRUPTED
+
+if TYPE_CHECKING:
+    from nlfilter_torch.folders import Tally
 
 Folder = Annotated[Path, typer.Argument(metavar="IN_DIR", help="The folder that holds the photographs.")]
 Target = Annotated[
@@ -39,8 +38,8 @@ def batch(
     target: Target,
     alpha: options.Alpha = "3,3,4,1.05",
     bandwidth: options.Bandwidth = "auto",
-    residual: Residual = None,
-    channels: Edited = options.Channels.luminance,
+    residual: options.Residual = None,
+    channels: options.Edited = options.Channels.luminance,
     spatial_bandwidth: options.SpatialBandwidth = None,
     patch_size: options.PatchSize = 5,
     landmarks: options.Landmarks = 100,
@@ -48,7 +47,7 @@ def batch(
     seed: options.Seed = 0,
     preset: PresetName = None,
     workers: Workers = None,
-    memory: Memory = None,
+    memory: options.Memory = None,
 ) -> None:
     """Edit the details of all photographs of a folder, as `nlfilter-torch detail` edits one.
 
@@ -61,11 +60,15 @@ def batch(
     """
     options.parse_alpha(alpha)
     options.parse_bandwidth(bandwidth)
-    check_residual(residual)
-    allowed_memory(memory)
+
+    from nlfilter_torch.checks import check_patch_size
+    from nlfilter_torch.cli.by_rows import allowed_memory
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.folders import Tally, edit_folder, pictures, prepare
+    from nlfilter_torch.ranks import connected_ranks
+
     check_patch_size(patch_size)
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "--spatial-bandwidth")
+    allowed_memory(memory)
     settings: dict[str, Any] = {
         "alpha": alpha,
         "bandwidth": bandwidth,
@@ -105,7 +108,7 @@ def batch(
             _summarise(total, target)
         ranks.gather(None)  # the first rank to end with status 1 ends the others, which may still have to say something
     if interrupted:
-        raise typer.Exit(options.INTERRUPTED)
+        raise typer.Exit(INTERRUPTED)
     if total.failures or total.left:
         raise typer.Exit(1)
 
@@ -119,7 +122,7 @@ def _tell(sentence: str) -> None:
     typer.echo(f"nlfilter-torch: {sentence}", err=True)
 
 
-def _summarise(tally: Tally, target: Path) -> None:
+def _summarise(tally: "Tally", target: Path) -> None:
     """Counts on the standard output, and the names of what is missing."""
     counts = [f"{tally.done} edited", f"{tally.skipped} there already", f"{len(tally.failures)} failed"]
     if tally.left:

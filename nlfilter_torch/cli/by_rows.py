@@ -1,13 +1,9 @@
 """Verbs on photographs that fit no memory: tile after tile, from file to file."""
 
-import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from nlfilter_torch.cli.progress import stages
 from nlfilter_torch.files import Photograph, TooLarge, read_photograph
@@ -23,29 +19,14 @@ from nlfilter_torch.streaming.rows import Rows
 from nlfilter_torch.streaming.sampling import Report
 from nlfilter_torch.streaming.tiles import Passes
 
-Memory = Annotated[
-    float | None,
-    typer.Option(
-        metavar="GB",
-        help="Gigabytes of memory that may be used, beside the 0.3 of the program itself. "
-        "A larger photograph is worked out in tiles of rows, which takes "
-        "longer and shows no seams. Left out: four fifths of what is free.",
-    ),
-]
-Full = Annotated[
-    bool,
-    typer.Option(
-        "--full",
-        help="In tiles: work from every pixel, not from a million of them. Takes two or three times as long.",
-    ),
-]
+MOST = 1e6  # gigabytes that anyone may have
 
 
 def allowed_memory(gigabytes: float | None) -> int:
     """``--memory`` in bytes."""
     if gigabytes is None:
         return free_memory()
-    if not 0 < gigabytes < math.inf:
+    if not 0 < gigabytes <= MOST:
         raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
     return int(gigabytes * 1e9)
 

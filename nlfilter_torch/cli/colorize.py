@@ -4,16 +4,8 @@ from enum import StrEnum
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options, painted_rows, painting
-from nlfilter_torch.cli.by_rows import Full, Job, Memory
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.colorize import colorize as edit
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import Photograph
-from nlfilter_torch.streaming.colorize import colorize_rows
-from nlfilter_torch.streaming.rows import Rows
+from nlfilter_torch.cli import options
 
 
 class Method(StrEnum):
@@ -42,18 +34,18 @@ Strength = Annotated[
 
 def colorize(
     source: options.Source,
-    target: Target,
-    strokes: painting.StrokesFile = None,
-    region: painting.ColourRegions = None,
+    target: options.Target,
+    strokes: options.StrokesFile = None,
+    region: options.ColourRegions = None,
     strength: Strength = 1.0,
     method: Spread = Method.regression,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
-    memory: Memory = None,
-    full: Full = False,
+    memory: options.Memory = None,
+    full: options.Full = False,
 ) -> None:
     """Colour a grey photograph: paint some strokes, and the colours spread over what looks alike nearby.
 
@@ -64,6 +56,15 @@ def colorize(
 
     Without painting: `nlfilter-torch colorize grey.jpg out.jpg --region 10,10,30,30:skyblue --region 10,300,9,9:green`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing, painted_rows, painting
+    from nlfilter_torch.cli.by_rows import Job
+    from nlfilter_torch.edits.colorize import colorize as edit
+    from nlfilter_torch.features import reduce_channels
+    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.streaming.colorize import colorize_rows
+    from nlfilter_torch.streaming.rows import Rows
 
     def work(photograph: Photograph) -> Tensor:
         painted, mask = painting.colour_strokes(photograph, strokes, region)

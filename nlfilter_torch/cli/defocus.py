@@ -4,12 +4,8 @@ from enum import StrEnum
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options, painting
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.defocus import defocus as edit
-from nlfilter_torch.files import Photograph
+from nlfilter_torch.cli import options
 
 
 class Aperture(StrEnum):
@@ -28,14 +24,14 @@ Shape = Annotated[Aperture, typer.Option(help="Turn dots into discs, as a lens d
 
 def defocus(
     source: options.Source,
-    target: Target,
-    region: painting.Regions = None,
-    mask: painting.MaskFile = None,
+    target: options.Target,
+    region: options.Regions = None,
+    mask: options.MaskFile = None,
     radius: Radius = None,
     aperture: Shape = Aperture.disc,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
 ) -> None:
@@ -45,6 +41,11 @@ def defocus(
 
     Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing, painting
+    from nlfilter_torch.edits.defocus import defocus as edit
+    from nlfilter_torch.files import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         focus = painting.selection(photograph, mask, region, option="--region")

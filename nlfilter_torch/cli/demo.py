@@ -3,27 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
-import skimage.data
-import torch
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.inspect import print_table, summarize
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import check_folder
-from nlfilter_torch.filtering import detail_layers, polynomial_filter
-from nlfilter_torch.masks import diffusion_mask
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.pictures import (
-    plot_response,
-    save_figure,
-    show_eigenvectors,
-    show_images,
-    show_layers,
-    show_mask,
-)
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
@@ -43,6 +25,26 @@ def demo(
     Writes pictures of the photograph before and after, of its layers, of the patterns that the filter finds, of the
     sliders and of a region that spreads to all that looks like it, and prints a table.
     """
+    import skimage.data
+    import torch
+
+    from nlfilter_torch.cli.inspect import print_table, summarize
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.colour import edit_luminance
+    from nlfilter_torch.features import reduce_channels
+    from nlfilter_torch.files import check_folder
+    from nlfilter_torch.filtering import detail_layers, polynomial_filter
+    from nlfilter_torch.masks import diffusion_mask
+    from nlfilter_torch.operator import nonlocal_operator
+    from nlfilter_torch.pictures import (
+        plot_response,
+        save_figure,
+        show_eigenvectors,
+        show_images,
+        show_layers,
+        show_mask,
+    )
+
     check_folder(folder)
     image = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / options.LEVELS
     with steps(4) as begin:

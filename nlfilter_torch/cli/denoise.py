@@ -3,17 +3,14 @@
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.denoise import denoise as edit
-from nlfilter_torch.files import Photograph
+from nlfilter_torch.cli import options
 
 NoiseLevel = Annotated[
     float | None,
     typer.Option(
         min=0.0,
+        max=255.0,
         metavar="LEVELS",
         help="Strength of the noise: its standard deviation in grey levels of 255. Left out: estimated.",
     ),
@@ -22,11 +19,11 @@ NoiseLevel = Annotated[
 
 def denoise(
     source: options.Source,
-    target: Target,
+    target: options.Target,
     noise_level: NoiseLevel = None,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     landmarks: options.Landmarks = 200,
     seed: options.Seed = 0,
 ) -> None:
@@ -36,6 +33,11 @@ def denoise(
 
     Gently: `nlfilter-torch denoise in.jpg out.jpg --noise-level 3`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.edits.denoise import denoise as edit
+    from nlfilter_torch.files import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         level = None if noise_level is None else noise_level / options.LEVELS

@@ -1,71 +1,13 @@
 """``nlfilter-torch detail``: raise or lower the details of a photograph, scale by scale."""
 
-import math
 from dataclasses import asdict, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import options, painted_rows, painting
-from nlfilter_torch.cli.by_rows import Full, Job, Memory, allowed_memory, edit_by_rows, read_if_it_fits
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.edits.enhance import colour_masks
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import Depth, check_output, write_photograph
-from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.masks import filter_regions
+from nlfilter_torch.cli import options
 from nlfilter_torch.presets import PRESETS, find_preset
-from nlfilter_torch.streaming.detail import detail_rows
-from nlfilter_torch.streaming.rows import Rows
-
-
-class FileDepth(StrEnum):
-    """What a channel of the output file holds."""
-
-    eight = "8"
-    sixteen = "16"
-    floats = "float"
-
-
-DEPTHS: dict[FileDepth, Depth] = {
-    FileDepth.eight: "uint8",
-    FileDepth.sixteen: "uint16",
-    FileDepth.floats: "float32",
-}
-
-Target = Annotated[
-    str,
-    typer.Argument(
-        metavar="OUT", help="The edited photograph; the ending of its name (.png, .jpg, .tif, .webp) gives the type."
-    ),
-]
-Residual = Annotated[
-    float | None,
-    typer.Option(
-        metavar="GAIN",
-        help="Strength of the grain that no typical patch explains. 1 leaves it as it is, which keeps noise down. "
-        "Left out: as the first slider of --alpha.",
-    ),
-]
-Edited = Annotated[
-    options.Channels,
-    typer.Option(help="Edit brightness and keep the colours, or edit red, green and blue alike, colours too."),
-]
-OutputDepth = Annotated[
-    FileDepth | None,
-    typer.Option(help="Bits a channel of the output, or floats (TIFF only). Left out: as many as the input has."),
-]
-
-
-def check_residual(residual: float | None) -> None:
-    """Raise unless ``--residual`` was left out or is finite."""
-    if residual is not None and not math.isfinite(residual):
-        raise ValueError(f"--residual must be a finite number, such as 1, got {residual}")
 
 
 def use_preset(context: typer.Context, name: str | None) -> str | None:
@@ -80,7 +22,10 @@ def use_preset(context: typer.Context, name: str | None) -> str | None:
 Spread = Annotated[
     float,
     typer.Option(
-        metavar="TIME", help="How far the edit of a region spreads to what is less like it: 0.5 little, 5 far."
+        min=0.05,
+        max=20.0,
+        metavar="TIME",
+        help="How far the edit of a region spreads to what is less like it: 0.5 little, 5 far.",
     ),
 ]
 PresetName = Annotated[
@@ -97,23 +42,23 @@ PresetName = Annotated[
 
 def detail(
     source: options.Source,
-    target: Target,
+    target: options.Target,
     alpha: options.Alpha = "3,3,4,1.05",
     bandwidth: options.Bandwidth = "auto",
-    residual: Residual = None,
-    channels: Edited = options.Channels.luminance,
-    depth: OutputDepth = None,
+    residual: options.Residual = None,
+    channels: options.Edited = options.Channels.luminance,
+    depth: options.OutputDepth = None,
     spatial_bandwidth: options.SpatialBandwidth = None,
     patch_size: options.PatchSize = 5,
     landmarks: options.Landmarks = 100,
     sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
     preset: PresetName = None,
-    region: painting.SliderRegions = None,
-    mask: painting.MaskFile = None,
+    region: options.SliderRegions = None,
+    mask: options.MaskFile = None,
     spread: Spread = 1.0,
-    memory: Memory = None,
-    full: Full = False,
+    memory: options.Memory = None,
+    full: options.Full = False,
 ) -> None:
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
 
@@ -133,8 +78,25 @@ def detail(
 
     Edit like another photograph: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
     """
-    sliders = options.parse_alpha(alpha)
-    check_residual(residual)
+    numbers = options.parse_alpha(alpha)
+    grey_levels = options.parse_bandwidth(bandwidth)
+
+    import torch
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing, painted_rows, painting
+    from nlfilter_torch.cli.by_rows import Job, allowed_memory, edit_by_rows, read_if_it_fits
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.colour import edit_luminance
+    from nlfilter_torch.edits.enhance import colour_masks
+    from nlfilter_torch.features import reduce_channels
+    from nlfilter_torch.files import check_output, write_photograph
+    from nlfilter_torch.filtering import polynomial_filter
+    from nlfilter_torch.masks import filter_regions
+    from nlfilter_torch.streaming.detail import detail_rows
+    from nlfilter_torch.streaming.rows import Rows
+
+    sliders = torch.tensor(numbers)
     # A mask is worked out before the filter, from coordinates as large as a factor beside its own factor.
     needed = options.working_bytes(landmarks, patch_size, factors=2 if region or mask else 1)
     allowed = allowed_memory(memory)
@@ -142,7 +104,7 @@ def detail(
         begin("Reading")
         photograph = read_if_it_fits(source, target, needed, allowed)
         if photograph is not None:
-            edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
+            edited = photograph if depth is None else replace(photograph, depth=options.DEPTHS[depth])
             check_output(target, edited)
 
             begin("Comparing patches")
@@ -158,9 +120,9 @@ def detail(
                     spatial_bandwidth=spatial_bandwidth,
                     generator=torch.Generator().manual_seed(seed),
                 )
-            operator = options.build_operator(
+            operator = editing.build_operator(
                 reduce_channels(image, "luminance"),
-                bandwidth=bandwidth,
+                bandwidth=grey_levels,
                 spatial_bandwidth=spatial_bandwidth,
                 patch_size=patch_size,
                 landmarks=landmarks,
@@ -192,7 +154,7 @@ def detail(
             residual=residual,
             time=spread,
             channels=channels.value,
-            photometric_bandwidth=options.parse_bandwidth(bandwidth),
+            photometric_bandwidth=grey_levels,
             spatial_bandwidth=spatial_bandwidth,
             patch_size=patch_size,
             num_landmarks=landmarks,
@@ -200,4 +162,4 @@ def detail(
             generator=torch.Generator().manual_seed(seed),
         )
 
-    edit_by_rows(Path(source), Path(target), None if depth is None else DEPTHS[depth], allowed, by_rows)
+    edit_by_rows(Path(source), Path(target), None if depth is None else options.DEPTHS[depth], allowed, by_rows)

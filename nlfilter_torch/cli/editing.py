@@ -3,41 +3,23 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import torch
-import typer
 from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.by_rows import Job, allowed_memory, edit_by_rows, read_if_it_fits
-from nlfilter_torch.cli.detail import DEPTHS, FileDepth
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.files import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.streaming.rows import Rows
-
-Bandwidth = Annotated[
-    float | None,
-    typer.Option(
-        "--bandwidth",
-        metavar="LEVELS",
-        help="How different two spots may be and still count as alike, in grey levels from 0 to 255. Left out: what "
-        "suits this command.",
-    ),
-]
-SpatialBandwidth = Annotated[
-    float | None,
-    typer.Option(
-        metavar="PIXELS",
-        help="How far apart two spots may be and still count as alike. Left out: what suits this command.",
-    ),
-]
 
 
 def edit_file(
     source: str,
     target: str,
-    depth: FileDepth | None,
+    depth: options.FileDepth | None,
     edit: Callable[[Photograph], Tensor],
     *,
     landmarks: int,
@@ -70,7 +52,7 @@ def edit_file(
         else:
             photograph = read_if_it_fits(source, target, needed, allowed)
         if photograph is not None:
-            edited = photograph if depth is None else replace(photograph, depth=DEPTHS[depth])
+            edited = photograph if depth is None else replace(photograph, depth=options.DEPTHS[depth])
             check_output(target, edited)
             begin("Editing")
             pixels = edit(photograph)
@@ -80,8 +62,31 @@ def edit_file(
             write_photograph(edited.with_pixels(pixels), target)
             return
     if allowed is not None and by_rows is not None:
-        kind = None if depth is None else DEPTHS[depth]
+        kind = None if depth is None else options.DEPTHS[depth]
         edit_by_rows(Path(source), Path(target), kind, allowed, by_rows, coloured=coloured)
+
+
+def build_operator(
+    guide: Tensor,
+    *,
+    bandwidth: float | Literal["auto"],
+    spatial_bandwidth: float | None,
+    patch_size: int,
+    landmarks: int,
+    sampling: options.Sampling,
+    seed: int,
+) -> NonlocalOperator:
+    """The operator of a guide, from the values of the options above; three channels are compared in colour."""
+    return nonlocal_operator(
+        guide,
+        patch_size=patch_size,
+        photometric_bandwidth=bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=landmarks,
+        landmarks=sampling.value,
+        guide_channels="all",
+        generator=torch.Generator().manual_seed(seed),
+    )
 
 
 def common(bandwidth: float | None, spatial_bandwidth: float | None, landmarks: int, seed: int) -> dict[str, Any]:

@@ -1,20 +1,17 @@
 """``nlfilter-torch fit``: find the sliders that turn one photograph into another, and keep them for the next one."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import torch
 import typer
-from torch import Tensor
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import WHITE, Photograph, check_file, open_beside, read_photograph
-from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.fitting import fit_alpha
 from nlfilter_torch.presets import Preset
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nlfilter_torch.files import Photograph
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit.")]
 After = Annotated[str, typer.Argument(metavar="AFTER", help="The same photograph after it, of the same size.")]
@@ -44,8 +41,17 @@ def fit(
 
     `nlfilter-torch detail other.jpg out.jpg --preset look.json`
     """
-    check_file(preset)
     grey_levels = options.parse_bandwidth(bandwidth)
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.colour import edit_luminance
+    from nlfilter_torch.features import reduce_channels
+    from nlfilter_torch.files import check_file, open_beside, read_photograph
+    from nlfilter_torch.filtering import polynomial_filter
+    from nlfilter_torch.fitting import fit_alpha
+
+    check_file(preset)
     with steps(3) as begin:
         begin("Reading")
         memory = options.working_bytes(landmarks, patch_size)
@@ -63,9 +69,9 @@ def fit(
             )
 
         begin("Comparing patches")
-        operator = options.build_operator(
+        operator = editing.build_operator(
             image,
-            bandwidth=bandwidth,
+            bandwidth=grey_levels,
             spatial_bandwidth=spatial_bandwidth,
             patch_size=patch_size,
             landmarks=landmarks,
@@ -94,14 +100,18 @@ def fit(
     typer.echo(f"preset: {preset}")
 
 
-def step_of(photograph: Photograph) -> float:
+def step_of(photograph: "Photograph") -> float:
     """Distance of two values that the file can tell apart."""
+    from nlfilter_torch.files import WHITE
+
     return 1 / WHITE[photograph.depth] if photograph.depth in WHITE else 0.0
 
 
-def unclipped(photograph: Photograph, name: str) -> Tensor:
+def unclipped(photograph: "Photograph", name: str) -> "Tensor":
     """Mask (1, 1, H, W) of the pixels of an edited file that tell how bright they were to be, those it could hold."""
-    if photograph.depth not in WHITE:
+    import torch
+
+    if step_of(photograph) == 0.0:
         return torch.ones_like(photograph.pixels[:, :1])
     inside = ((photograph.pixels > 0) & (photograph.pixels < 1)).all(1, keepdim=True)
     if not bool(inside.any()):
@@ -111,13 +121,13 @@ def unclipped(photograph: Photograph, name: str) -> Tensor:
     return inside.float()
 
 
-def stored(pixels: Tensor, photograph: Photograph) -> Tensor:
+def stored(pixels: "Tensor", photograph: "Photograph") -> "Tensor":
     """What is left of pixels after they were written to a file like ``photograph``."""
     step = step_of(photograph)
     return pixels if step == 0.0 else (pixels.clamp(0, 1) / step).round() * step
 
 
-def explained(before: Tensor, after: Tensor, fitted: Tensor) -> float:
+def explained(before: "Tensor", after: "Tensor", fitted: "Tensor") -> float:
     """Share of the squared change that is not left over: R squared, 1 at best."""
     left, change = ((after.double() - x.double()).square().sum() for x in (fitted, before))
     return 1.0 - float(left / change)

@@ -3,14 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.detail import Residual
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.files import SUFFIXES, Photograph, check_folder, check_output, read_photograph, write_photograph
-from nlfilter_torch.frames import filter_frames
 
 Frames = Annotated[
     Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
@@ -33,7 +28,7 @@ def frames(
     target: Edited,
     alpha: options.Alpha = "3,3,4,1.05",
     bandwidth: options.Bandwidth = "auto",
-    residual: Residual = None,
+    residual: options.Residual = None,
     references: References = 3,
     patch_size: options.PatchSize = 5,
     landmarks: options.Landmarks = 100,
@@ -48,6 +43,14 @@ def frames(
     Example: `nlfilter-torch frames shots edited --alpha 2,2,2,1`
     """
     sliders = options.parse_alpha(alpha)
+    grey_levels = options.parse_bandwidth(bandwidth)
+
+    import torch
+
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.files import Photograph, check_folder, check_output, read_photograph, write_photograph
+    from nlfilter_torch.frames import filter_frames
+
     paths = _pictures(folder)
     if target.exists() and target.resolve() == folder.resolve():
         raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
@@ -67,10 +70,10 @@ def frames(
 
         edited = filter_frames(
             map(read, paths),
-            sliders,
+            torch.tensor(sliders),
             references=samples,
             residual=residual,
-            photometric_bandwidth=options.parse_bandwidth(bandwidth),
+            photometric_bandwidth=grey_levels,
             patch_size=patch_size,
             num_landmarks=landmarks,
             landmarks=sampling.value,
@@ -84,6 +87,8 @@ def frames(
 
 def _pictures(folder: Path) -> list[Path]:
     """The image files of a folder, by name."""
+    from nlfilter_torch.files import SUFFIXES
+
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; name the one that holds the frames")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)

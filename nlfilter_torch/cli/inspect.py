@@ -3,21 +3,17 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from torch import Tensor
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import check_folder, open_beside, read_photograph
-from nlfilter_torch.filtering import captured_energy
-from nlfilter_torch.operator import NonlocalOperator
-from nlfilter_torch.pictures import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
-from nlfilter_torch.spectrum import Spectrum
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nlfilter_torch.operator import NonlocalOperator
+    from nlfilter_torch.spectrum import Spectrum
 
 Folder = Annotated[
     Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
@@ -58,15 +54,25 @@ def inspect(
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
     sliders = options.parse_alpha(alpha)
+    grey_levels = options.parse_bandwidth(bandwidth)
+
+    import torch
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.features import reduce_channels
+    from nlfilter_torch.files import check_folder, open_beside, read_photograph
+    from nlfilter_torch.pictures import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
+
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
         photograph = read_photograph(source, bytes_per_pixel=options.working_bytes(landmarks, patch_size, factors=5))
         guide = reduce_channels(photograph.pixels, "luminance")
         begin("Comparing patches")
-        operator = options.build_operator(
+        operator = editing.build_operator(
             guide,
-            bandwidth=bandwidth,
+            bandwidth=grey_levels,
             spatial_bandwidth=spatial_bandwidth,
             patch_size=patch_size,
             landmarks=landmarks,
@@ -80,15 +86,17 @@ def inspect(
         folder.mkdir(exist_ok=True)
         save_figure(show_eigenvectors(spectrum), folder / "eigenvectors.png")
         save_figure(plot_eigenvalues(spectrum), folder / "eigenvalues.png")
-        save_figure(plot_response(sliders, spectrum), folder / "response.png")
+        save_figure(plot_response(torch.tensor(sliders), spectrum), folder / "response.png")
         report = {**figures, "eigenvalues": spectrum.eigenvalues[0].tolist()}
         with open_beside(folder / "diagnostics.json") as stream:
             stream.write(json.dumps(report, indent=2).encode() + b"\n")
     print_table(figures, f"The filter of {source}")
 
 
-def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> dict[str, Any]:
+def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:
     """The diagnostics of one image as plain numbers, bandwidth in grey levels."""
+    from nlfilter_torch.filtering import captured_energy
+
     figures = {
         name: value[0] if isinstance(value, list) else value for name, value in asdict(operator.diagnostics()).items()
     }
@@ -107,7 +115,11 @@ def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> 
 
 def print_table(figures: dict[str, Any], title: str) -> None:
     """Print diagnostics with what each of them tells."""
-    table = Table(title=title, title_justify="left")
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title), title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
     table.add_column("what it tells")

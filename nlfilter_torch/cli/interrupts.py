@@ -1,31 +1,58 @@
-"""Ctrl-C at moments when Python itself would lose it."""
+"""Ctrl-C and requests to end (SIGTERM, SIGHUP): no traceback, no unfinished file, and a status that tells.
+
+This module is imported before anything that takes time.
+"""
 
 import _thread
+import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 
+INTERRUPTED = 128 + signal.SIGINT  # exit status, as shells have it for Ctrl-C
 PAUSE = 0.05  # seconds until a lost interrupt comes again: long enough for the callback that lost it to be over
+SHOW_CURSOR = "\x1b[?25h"
+ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class Ended(SystemExit):
+    """Another process asked this one to end; raised where it works, so that unfinished files are removed."""
+
+    def __init__(self, number: int) -> None:
+        """Take the status that shells have for the signal of that number."""
+        self.number, self.status = number, 128 + number
+        super().__init__(self.status)
+
+
+def tell() -> int:
+    """Say that the work was interrupted; return the exit status."""
+    sys.stderr.write("nlfilter-torch: interrupted; no file is half written\n")
+    return INTERRUPTED
 
 
 @contextmanager
 def heeded() -> Iterator[None]:
-    """Repeat an interrupt that comes while Python runs a destructor or a callback, such as those after each import.
+    """Turn signals into exceptions that end the work, and never into a traceback of a module that is imported.
 
-    Python can raise nothing there: it would print "Exception ignored in" and go on with the work to its end.
+    An interrupt that comes while Python runs a destructor or a callback, such as those after each import, is repeated:
+    Python can raise nothing there. It would print "Exception ignored in" and go on with the work to its end.
     """
     former = sys.unraisablehook
     repeats: list[threading.Timer] = []
 
     def hook(lost: "sys.UnraisableHookArgs") -> None:
-        if not issubclass(lost.exc_type, KeyboardInterrupt):
+        if not isinstance(lost.exc_value, KeyboardInterrupt | Ended):
             former(lost)
             return
-        repeats.append(threading.Timer(PAUSE, _thread.interrupt_main))  # here it would be lost once more
+        number = lost.exc_value.number if isinstance(lost.exc_value, Ended) else signal.SIGINT
+        repeats.append(threading.Timer(PAUSE, _thread.interrupt_main, [number]))  # here it would be lost once more
         repeats[-1].daemon = True
         repeats[-1].start()
 
+    handlers = _install()
     sys.unraisablehook = hook
     try:
         yield
@@ -33,3 +60,42 @@ def heeded() -> Iterator[None]:
         sys.unraisablehook = former
         for repeat in repeats:
             repeat.cancel()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def _install() -> dict[int, signal.Handlers]:
+    """Handle the signals whose handlers are still Python's own; return these handlers.
+
+    A shell's background jobs ignore SIGINT, those of nohup SIGHUP, and programs around this one have their own plans.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    own: dict[int, object] = {signal.SIGINT: signal.default_int_handler, **dict.fromkeys(ENDINGS, signal.SIG_DFL)}
+    replaced = {number: handler for number, handler in own.items() if signal.getsignal(number) is handler}
+    for number in replaced:
+        signal.signal(number, _handle)
+    return replaced  # type: ignore[return-value]  # they are what signal.signal takes
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    """Raise; or end at once where a module is imported, whose code may turn an exception into any other."""
+    files = sys.modules.get("nlfilter_torch.files")
+    if _importing(frame) and not getattr(files, "unfinished", None):
+        if sys.stderr.isatty():
+            sys.stderr.write(SHOW_CURSOR)  # a progress bar hides it
+        if number == signal.SIGINT:
+            tell()
+        sys.stderr.flush()
+        os._exit(128 + number)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    raise Ended(number)
+
+
+def _importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False

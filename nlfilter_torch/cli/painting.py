@@ -1,69 +1,14 @@
-"""What someone paints or marks on a photograph: strokes, masks and rectangles, as options of several verbs."""
+"""Scribbles, masks and rectangles on a photograph, from the options that give them."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import torch
-import typer
 from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.files import Photograph, read_photograph
-
-StrokesFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--strokes",
-        metavar="FILE",
-        help="Strokes painted over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where "
-        "nothing is painted.",
-    ),
-]
-ColourRegions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        metavar="X,Y,W,H:COLOUR",
-        help="A rectangle of colour in place of a stroke, or on top of them: column and row of its upper left corner, "
-        "width and height in pixels, and a colour such as red or #c04020. May be given several times; later ones cover "
-        "earlier ones.",
-    ),
-]
-Keeps = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--keep", metavar="X,Y,W,H", help="A rectangle whose likes stay as they are. May be given several times."
-    ),
-]
-Regions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        metavar="X,Y,W,H",
-        help="A rectangle: column and row of its upper left corner, width and height in pixels. May be given several "
-        "times.",
-    ),
-]
-SliderRegions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        metavar="X,Y,W,H[:SLIDERS]",
-        help="Edit only what looks like a rectangle: column and row of its upper left corner, its width and height, "
-        "and sliders of its own if they are not those of --alpha, such as 60,300,20,20:3,3,4,1. May be given several "
-        "times.",
-    ),
-]
-MaskFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--mask",
-        metavar="FILE",
-        help="A picture of the photograph's size, white where it is selected, black elsewhere.",
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -180,7 +125,7 @@ def slider_regions(
 def with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Rectangle, Tensor]:
     """A rectangle of ``--region`` and its sliders (k+1,)."""
     rectangle = Rectangle.parse(text, "--region", size)
-    own = alpha if rectangle.note is None else parse_sliders(rectangle.note, "--region")
+    own = alpha if rectangle.note is None else torch.tensor(parse_sliders(rectangle.note, "--region"))
     if len(own) != len(alpha):
         raise ValueError(
             f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "

@@ -3,8 +3,6 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from nlfilter_torch.presets import PRESETS, PURPOSES, find_preset
 
@@ -22,6 +20,9 @@ def presets(name: Name = None) -> None:
     if name is not None:
         typer.echo(find_preset(name).to_json(), nl=False)
         return
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table("preset", "alpha", "bandwidth", "what it does")
     for title, preset in PRESETS.items():
         sliders = ", ".join(f"{value:g}" for value in preset.alpha)

@@ -3,15 +3,8 @@
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options, painted_rows, painting
-from nlfilter_torch.cli.by_rows import Full, Job, Memory
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.recolor import recolor as edit
-from nlfilter_torch.files import Photograph
-from nlfilter_torch.streaming.recolor import recolor_rows
-from nlfilter_torch.streaming.rows import Rows
+from nlfilter_torch.cli import options
 
 Reach = Annotated[
     float,
@@ -26,18 +19,18 @@ Reach = Annotated[
 
 def recolor(
     source: options.Source,
-    target: Target,
-    strokes: painting.StrokesFile = None,
-    region: painting.ColourRegions = None,
-    keep: painting.Keeps = None,
+    target: options.Target,
+    strokes: options.StrokesFile = None,
+    region: options.ColourRegions = None,
+    keep: options.Keeps = None,
     reach: Reach = 0.8,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
-    memory: Memory = None,
-    full: Full = False,
+    memory: options.Memory = None,
+    full: options.Full = False,
 ) -> None:
     """Give things another colour: paint a little of it on one, and all that look alike take it.
 
@@ -48,6 +41,14 @@ def recolor(
 
     Spare the wood: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing, painted_rows, painting
+    from nlfilter_torch.cli.by_rows import Job
+    from nlfilter_torch.edits.recolor import recolor as edit
+    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.streaming.recolor import recolor_rows
+    from nlfilter_torch.streaming.rows import Rows
 
     def check(channels: int) -> None:
         editing.check_colour(channels, "recolor", "use nlfilter-torch colorize, which colours grey ones")

@@ -3,15 +3,18 @@
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.sharpen import sharpen as edit
-from nlfilter_torch.files import Photograph
+from nlfilter_torch.cli import options
+from nlfilter_torch.presets import GAINS
 
 Amount = Annotated[
-    float, typer.Option(metavar="GAIN", help="Strength: 1 leaves the photograph as it is, 4 is visible, 8 is strong.")
+    float,
+    typer.Option(
+        min=GAINS[0],
+        max=GAINS[1],
+        metavar="GAIN",
+        help="Strength: 1 leaves the photograph as it is, 4 is visible, 8 is strong.",
+    ),
 ]
 GuideBlur = Annotated[
     float,
@@ -21,12 +24,12 @@ GuideBlur = Annotated[
 
 def sharpen(
     source: options.Source,
-    target: Target,
+    target: options.Target,
     amount: Amount = 4.0,
     guide_blur: GuideBlur = 1.2,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     patch_size: options.PatchSize = 5,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
@@ -35,6 +38,11 @@ def sharpen(
 
     Example: `nlfilter-torch sharpen in.jpg out.jpg --amount 5`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.edits.sharpen import sharpen as edit
+    from nlfilter_torch.files import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)

@@ -3,30 +3,38 @@
 from typing import Annotated
 
 import typer
-from torch import Tensor
 
-from nlfilter_torch.cli import editing, options
-from nlfilter_torch.cli.detail import OutputDepth, Target
-from nlfilter_torch.edits.tone import adjust_tone
-from nlfilter_torch.files import Photograph
+from nlfilter_torch.cli import options
+from nlfilter_torch.presets import GAINS
 
 Contrast = Annotated[
     float,
-    typer.Option(metavar="GAIN", help="Contrast of the smooth shading: 1 leaves it, 1.4 is strong, 0.7 flattens."),
+    typer.Option(
+        min=GAINS[0],
+        max=GAINS[1],
+        metavar="GAIN",
+        help="Contrast of the smooth shading: 1 leaves it, 1.4 is strong, 0.7 flattens.",
+    ),
 ]
 Clarity = Annotated[
-    float, typer.Option(metavar="GAIN", help="Contrast of the largest details on it: 1 leaves it, 4 is strong.")
+    float,
+    typer.Option(
+        min=GAINS[0],
+        max=GAINS[1],
+        metavar="GAIN",
+        help="Contrast of the largest details on it: 1 leaves it, 4 is strong.",
+    ),
 ]
 
 
 def tone(
     source: options.Source,
-    target: Target,
+    target: options.Target,
     contrast: Contrast = 1.2,
     clarity: Clarity = 1.0,
-    bandwidth: editing.Bandwidth = None,
-    spatial_bandwidth: editing.SpatialBandwidth = None,
-    depth: OutputDepth = None,
+    bandwidth: options.OwnBandwidth = None,
+    spatial_bandwidth: options.OwnSpatialBandwidth = None,
+    depth: options.OutputDepth = None,
     patch_size: options.PatchSize = 5,
     landmarks: options.Landmarks = 100,
     seed: options.Seed = 0,
@@ -35,6 +43,11 @@ def tone(
 
     Example: `nlfilter-torch tone in.jpg out.jpg --contrast 1.2 --clarity 2`
     """
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.edits.tone import adjust_tone
+    from nlfilter_torch.files import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)

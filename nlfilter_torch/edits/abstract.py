@@ -11,7 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image, check_positive, check_reach
+from nlfilter_torch.checks import (
+    check_count,
+    check_not_negative,
+    check_number,
+    check_photograph,
+    check_positive,
+    check_reach,
+    check_share,
+)
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.operator import nonlocal_operator
@@ -27,6 +35,7 @@ LEAST = 1e-4  # of r
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones where the image is flat, and where it has an edge
+MOST_TONES = 1 << 16  # as many as 16 bits have
 FLAT = 1e-12  # of squared gradients; keeps the derivative of their root finite
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, at which a step is crisp
 
@@ -55,7 +64,7 @@ def abstract(
         power: k >= 0, a number or a tensor of shape () or (B,). At 0 the image comes back.
         edges: darkness of the lines, 0 for none, 1 for black ones.
         edge_width: of the lines, in pixels, at most half the short side.
-        tones: number of tones of luminance, at least 2; None leaves it continuous.
+        tones: number of tones of luminance, from 2 to 65536; None leaves it continuous.
         photometric_bandwidth: h_y; larger makes larger flat areas.
         spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
         patch_size: of the patches that are compared.
@@ -98,7 +107,7 @@ class Abstraction:
     """
 
     def __init__(self, image: Tensor, **options: Any) -> None:
-        check_image(image, "image")
+        check_photograph(image, "image")
         options = {"patch_size": PATCH_SIZE, "num_landmarks": LANDMARKS, **options}
         check_count(options["num_landmarks"], "num_landmarks")
         options["num_landmarks"] = min(options["num_landmarks"], image[0, 0].numel())
@@ -124,13 +133,14 @@ class Abstraction:
     ) -> Tensor:
         """The abstract image (B, C, H, W); arguments and errors are those of :func:`abstract`."""
         image = self._image
-        _check_power(power)
-        if not 0 <= edges <= 1:
-            raise ValueError(f"edges must be in [0, 1], got {edges}; 0 draws no lines")
+        check_not_negative(power, "power", "0 leaves the image as it is", image.shape[0])
+        check_number(edges, "edges")
+        check_share(edges, "edges")
+        check_number(edge_width, "edge_width")
         check_positive(edge_width, "edge_width")
         check_reach(edge_width, "edge_width", (image.shape[-2], image.shape[-1]))
-        if tones is not None and tones < 2:
-            raise ValueError(f"tones must be at least 2, got {tones}; None leaves luminance continuous")
+        if tones is not None:
+            check_count(tones, "tones", least=2, most=MOST_TONES)
         if (edges > 0 or tones is not None) and image.shape[1] not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {image.shape[1]}; select some")
 
@@ -193,9 +203,3 @@ def _gaussian(image: Tensor, sigma: float) -> Tensor:
 
     size = 2 * math.ceil(3 * sigma) + 1
     return gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="replicate")
-
-
-def _check_power(power: float | Tensor) -> None:
-    values = torch.as_tensor(power).detach()
-    if values.device.type == "cpu" and not bool(((values >= 0) & torch.isfinite(values)).all()):
-        raise ValueError(f"power must be at least 0 and finite, got {values.tolist()}; 0 leaves the image as it is")

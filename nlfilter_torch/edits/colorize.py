@@ -8,14 +8,23 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_count, check_image, check_positive, check_same_size
+from nlfilter_torch.checks import (
+    check_choice,
+    check_count,
+    check_image,
+    check_patch_size,
+    check_photograph,
+    check_positive,
+    check_same_size,
+    check_share,
+)
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
 from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.masks import segment_mask
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.strokes import check_painted, check_share, propagate_strokes
+from nlfilter_torch.strokes import check_painted, propagate_strokes
 
 Method = Literal["regression", "kmeans"]
 
@@ -98,11 +107,12 @@ def colorize(
         >>> bool((colour[:, 2] > colour[:, 0])[..., :10].all()), bool((colour[:, 0] > colour[:, 2])[..., 14:].all())
         (True, True)
     """
-    check_image(grey, "grey", channels=1)
+    check_photograph(grey, "grey", channels=1)
     check_choice(method, "method", ("regression", "kmeans"))
-    check_positive(photometric_bandwidth, "photometric_bandwidth")
+    check_positive(photometric_bandwidth, "photometric_bandwidth", grey.shape[0])
     if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth")
+        check_positive(spatial_bandwidth, "spatial_bandwidth", grey.shape[0])
+    check_patch_size(patch_size)
     check_count(num_landmarks, "num_landmarks")
     once = Colorization(
         grey,
@@ -159,7 +169,8 @@ class Colorization:
             check_image(tensor, name, channels=channels, batch=batch)
             check_same_size(tensor, size, name, "grey image")
         check_painted(stroke_mask)
-        check_share(strength, "strength")
+        check_share(strength, "strength", batch)
+        check_positive(time, "time", batch)
 
         luminance = grey.to(working_dtype(grey))
         painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)

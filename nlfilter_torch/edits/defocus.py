@@ -8,7 +8,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_image, check_positive, check_reach, check_same_size
+from nlfilter_torch.checks import (
+    check_choice,
+    check_image,
+    check_number,
+    check_photograph,
+    check_positive,
+    check_reach,
+    check_same_size,
+)
 from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.edits.spots import Pixels, Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
@@ -75,11 +83,12 @@ def defocus(
         >>> bool(blurred[..., :18].std() < image[..., :18].std() / 2)
         True
     """
-    check_image(image, "image")
+    check_photograph(image, "image")
     if image.shape[1] not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
     check_choice(aperture, "aperture", ("disc", "gaussian"))
     reach = RADIUS * min(image.shape[-2:]) if radius is None else radius
+    check_number(reach, "radius", "pass a float or None")
     check_positive(reach, "radius")
     check_reach(reach, "radius", (image.shape[-2], image.shape[-1]))
     held = Defocusing(

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image
+from nlfilter_torch.checks import check_count, check_image, check_not_negative, check_photograph
 from nlfilter_torch.edits.locality import nearby
 from nlfilter_torch.features import pad_border
 from nlfilter_torch.filtering import detail_layers, weigh_layers
@@ -61,12 +61,12 @@ def denoise(
         >>> round(float((noisy - clean).std()), 2), bool((denoise(noisy) - clean).std() < 0.06)
         (0.1, True)
     """
-    check_image(image, "image")
+    check_photograph(image, "image")
     check_count(num_landmarks, "num_landmarks")
+    if noise_level is not None:
+        check_not_negative(noise_level, "noise_level", "0 changes nothing", image.shape[0])
     pixels = image.to(working_dtype(image))
     level = estimate_noise(pixels) if noise_level is None else torch.as_tensor(noise_level).to(pixels).reshape(-1)
-    if level.device.type == "cpu" and not bool(((level >= 0) & torch.isfinite(level)).all()):
-        raise ValueError(f"noise_level must be at least 0 and finite, got {level.tolist()}; 0 changes nothing")
 
     heard = level.clamp(min=QUIET)
     operator = nonlocal_operator(

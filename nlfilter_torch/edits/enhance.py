@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_tensor
+from nlfilter_torch.checks import check_image, check_photograph, check_positive, check_tensor
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import polynomial_filter
@@ -60,11 +60,12 @@ def enhance(
         >>> enhance(image, torch.tensor([3.0, 3.0, 4.0, 1.05]), region, num_landmarks=50).shape
         torch.Size([1, 3, 24, 24])
     """
-    check_image(image, "image")
+    check_photograph(image, "image")
     check_tensor(alpha, "alpha")
+    check_positive(mask_bandwidth, "mask_bandwidth", image.shape[0])
     pixels = image.to(working_dtype(image))
     if regions is not None:
-        check_tensor(regions, "regions")
+        check_image(regions, "regions", batch=image.shape[0])
         shared = {name: value for name, value in options.items() if name in SHARED}
         masks = colour_masks(
             pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared

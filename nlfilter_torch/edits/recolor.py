@@ -8,13 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_same_size, check_unit_range
+from nlfilter_torch.checks import check_image, check_photograph, check_same_size, check_share, check_unit_range
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.spots import Spots, find_spots
 from nlfilter_torch.operator import nonlocal_operator
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.strokes import check_painted, check_share
+from nlfilter_torch.strokes import check_painted
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
@@ -75,7 +75,7 @@ def recolor(
         >>> torch.equal(blue[..., :8], image[..., :8]), bool((blue[:, 2] > blue[:, 0])[..., 14:].all())
         (True, True)
     """
-    check_image(image, "image", channels=3)
+    check_photograph(image, "image", channels=3)
     held = Recoloring(image, photometric_bandwidth=photometric_bandwidth, patch_size=patch_size, **options)
     return held(strokes, stroke_mask, keep=keep, reach=reach)
 
@@ -113,7 +113,7 @@ class Recoloring:
         check_painted(stroke_mask)
         if keep is not None:
             check_unit_range(keep, "keep")
-        check_share(reach, "reach", below=True)
+        check_share(reach, "reach", batch, below=True)
 
         pixels = image.to(working_dtype(image))
         painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_reach
+from nlfilter_torch.checks import check_number, check_photograph, check_reach, check_weight
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.edits.denoise import soften
 from nlfilter_torch.features import reduce_channels
@@ -51,7 +51,9 @@ def sharpen(
         >>> sharp.shape, bool(sharp.std() > image.std())
         (torch.Size([1, 3, 32, 32]), True)
     """
-    check_image(image, "image")
+    check_photograph(image, "image")
+    check_weight(amount, "amount", image.shape[0])
+    check_number(guide_blur, "guide_blur")
     if not guide_blur >= 0:
         raise ValueError(f"guide_blur must be at least 0, got {guide_blur}; 0 leaves the guide as it is")
     check_reach(guide_blur, "guide_blur", (image.shape[-2], image.shape[-1]))

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_count, check_image
+from nlfilter_torch.checks import check_order, check_photograph, check_weight
 from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.filtering import polynomial_filter
@@ -47,8 +47,10 @@ def adjust_tone(
         >>> bool((strong.mean((2, 3)) - image.mean((2, 3))).abs().max() < 1e-5), bool(strong.std() > image.std())
         (True, True)
     """
-    check_image(image, "image")
-    check_count(order, "order")
+    check_photograph(image, "image")
+    check_order(order)
+    check_weight(contrast, "contrast", image.shape[0])
+    check_weight(clarity, "clarity", image.shape[0])
     operator = nonlocal_operator(reduce_channels(image, "luminance"), **options)
 
     def slider(value: float | Tensor) -> Tensor:

@@ -6,13 +6,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.bandwidth import estimate_bandwidth
 from nlfilter_torch.checks import check_choice
 from nlfilter_torch.features import GuideChannels, unit_window
 from nlfilter_torch.landmarks import Sampling
-from nlfilter_torch.modules.learning import UnitWindow, check_learn, current, shown, start_or_positive
+from nlfilter_torch.modules.learning import Positive, UnitWindow, check_learn, current, shown, start_or_positive
 from nlfilter_torch.nystrom import Completion
-from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.operator import NonlocalOperator, check_options, nonlocal_operator
+from nlfilter_torch.sharding import check_group
 
 LEARNABLE = ("photometric_bandwidth", "spatial_bandwidth", "patch_weights")
 
@@ -21,16 +21,14 @@ class NonlocalAffinity(nn.Module):
     """Guide to operator, a layer around :func:`nonlocal_operator`, whose options it takes.
 
     Args:
-        learn: what trains besides the network that makes the guide: any of ``"photometric_bandwidth"`` (of which
-            ``"auto"`` is then the start, image by image, and one factor trains), ``"spatial_bandwidth"`` (which must
-            have a number to start from) and ``"patch_weights"``. All stay positive.
+        learn: what trains besides the network that makes the guide: any of ``"photometric_bandwidth"`` and
+            ``"spatial_bandwidth"`` (which must have numbers to start from) and ``"patch_weights"``. All stay positive.
         **options: of :func:`nonlocal_operator`. A ``generator`` gives every call other landmarks; do not combine it
             with gradient checkpointing, which runs the layer twice and expects the same. A layer with a ``group`` is
             neither pickled nor copied.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive; other options are checked
-            with the first guide.
+        TypeError, ValueError: if ``learn`` has another name, or an option is not one of :func:`nonlocal_operator`.
     """
 
     def __init__(
@@ -51,6 +49,16 @@ class NonlocalAffinity(nn.Module):
     ) -> None:
         super().__init__()
         names = check_learn(learn, LEARNABLE)
+        check_options(
+            num_landmarks=num_landmarks,
+            landmarks=landmarks,
+            completion=completion,
+            guide_channels=guide_channels,
+            tolerance=tolerance,
+            generator=generator,
+        )
+        check_group(group)
+        window = unit_window(patch_size, patch_weights)
         self.patch_size = patch_size
         self.num_landmarks = num_landmarks
         self.landmarks: Sampling = landmarks
@@ -60,11 +68,17 @@ class NonlocalAffinity(nn.Module):
         self.generator = generator
         self.group = group
 
-        self.automatic = isinstance(photometric_bandwidth, str)
+        self.photometric_bandwidth: float | Positive | Literal["auto"]
         if isinstance(photometric_bandwidth, str):
-            check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
-            photometric_bandwidth = 1.0  # a factor from here on
-        self.photometric_bandwidth = start_or_positive(photometric_bandwidth, "photometric_bandwidth", names)
+            check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
+            if "photometric_bandwidth" in names:
+                raise ValueError(
+                    "photometric_bandwidth must be a number to learn from, got 'auto'; "
+                    "pass the mean of estimate_bandwidth over a few guides"
+                )
+            self.photometric_bandwidth = photometric_bandwidth
+        else:
+            self.photometric_bandwidth = start_or_positive(photometric_bandwidth, "photometric_bandwidth", names)
         if spatial_bandwidth is None and "spatial_bandwidth" in names:
             raise ValueError(
                 "spatial_bandwidth must be a number of pixels to learn from, got None; "
@@ -76,23 +90,18 @@ class NonlocalAffinity(nn.Module):
         # Non-persistent: like the other options, it belongs to the constructor, not to what was learned.
         self.patch_weights: Tensor | UnitWindow | None
         if "patch_weights" in names:
-            self.patch_weights = UnitWindow(unit_window(patch_size, patch_weights))
+            self.patch_weights = UnitWindow(window)
         else:
-            given = None if patch_weights is None else unit_window(patch_size, patch_weights)
-            self.register_buffer("patch_weights", given, persistent=False)
+            self.register_buffer("patch_weights", None if patch_weights is None else window, persistent=False)
 
     def forward(self, guide: Tensor) -> NonlocalOperator:
         """Operator of a guide (B, C, H, W)."""
-        photometric: float | Tensor | Literal["auto"] = current(self.photometric_bandwidth)
-        if self.automatic and isinstance(photometric, Tensor):
-            photometric = photometric * estimate_bandwidth(guide, guide_channels=self.guide_channels, group=self.group)
-        elif self.automatic:
-            photometric = "auto"
+        photometric = self.photometric_bandwidth
         weights = self.patch_weights
         return nonlocal_operator(
             guide,
             patch_size=self.patch_size,
-            photometric_bandwidth=photometric,
+            photometric_bandwidth=photometric if isinstance(photometric, str) else current(photometric),
             spatial_bandwidth=current(self.spatial_bandwidth),
             num_landmarks=self.num_landmarks,
             landmarks=self.landmarks,
@@ -106,11 +115,10 @@ class NonlocalAffinity(nn.Module):
 
     def extra_repr(self) -> str:
         """The options that decide what the operator does."""
-        photometric = shown(self.photometric_bandwidth)
-        if self.automatic:
-            photometric = "auto" if photometric == 1.0 else f"{photometric} * auto"
+        photometric = self.photometric_bandwidth
+        start = photometric if isinstance(photometric, str) else shown(photometric)
         return (
-            f"patch_size={self.patch_size}, photometric_bandwidth={photometric}, "
+            f"patch_size={self.patch_size}, photometric_bandwidth={start}, "
             f"spatial_bandwidth={shown(self.spatial_bandwidth)}, num_landmarks={self.num_landmarks}, "
             f"landmarks={self.landmarks!r}, completion={self.completion!r}, guide_channels={self.guide_channels!r}"
         )

@@ -29,8 +29,8 @@ class NonlocalFilter(nn.Module):
         **options: of :func:`nonlocal_operator`.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or a bandwidth is not positive; other options are checked
-            with the first image.
+        TypeError, ValueError: if ``learn`` has another name, or ``alpha``, ``residual`` or an option is not as the two
+            layers take it.
 
     Example:
         >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), photometric_bandwidth=0.1, num_landmarks=30)
@@ -74,6 +74,7 @@ class NonlocalFilter(nn.Module):
         Raises:
             TypeError, ValueError: if a tensor does not fit, or there are sliders for K regions but not K masks.
         """
+        check_image(image, "image")
         operator = self.affinity(image if guide is None else guide)
         if mask is not None:
             check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]))

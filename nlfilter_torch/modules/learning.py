@@ -7,7 +7,7 @@ from typing import overload
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_positive
+from nlfilter_torch.checks import check_number, check_positive, described
 
 
 class Positive(nn.Module):
@@ -19,6 +19,7 @@ class Positive(nn.Module):
 
     def __init__(self, start: float, name: str) -> None:
         super().__init__()
+        check_number(start, name, "pass the number to start from")
         check_positive(start, name)
         self.logarithm = nn.Parameter(torch.tensor(math.log(start)))
 
@@ -55,6 +56,12 @@ class UnitWindow(nn.Module):
 
 def check_learn(learn: Collection[str], choices: Sequence[str]) -> frozenset[str]:
     """The names in ``learn``; raise ValueError if one of them is not among ``choices``."""
+    if (
+        not isinstance(learn, Collection)
+        or isinstance(learn, Tensor)
+        or any(not isinstance(name, str) for name in learn)
+    ):
+        raise TypeError(f"learn must be a list of names, got {described(learn)}; choose from {', '.join(choices)}")
     names = frozenset([learn] if isinstance(learn, str) else learn)
     unknown = sorted(map(repr, names.difference(choices)))
     if unknown:

@@ -4,6 +4,7 @@ from collections.abc import Collection
 
 from torch import Tensor, nn
 
+from nlfilter_torch.checks import check_positive
 from nlfilter_torch.masks import diffusion_mask, segment_mask
 from nlfilter_torch.modules.learning import check_learn, current, shown, start_or_positive
 from nlfilter_torch.spectrum import Spectrum
@@ -41,10 +42,14 @@ class SegmentMask(nn.Module):
 
     Args:
         time: diffusion time t > 0.
+
+    Raises:
+        TypeError, ValueError: if ``time`` is not positive.
     """
 
     def __init__(self, *, time: float = 1.0) -> None:
         super().__init__()
+        check_positive(time, "time")
         self.time = time
 
     def forward(self, spectrum: Spectrum, regions: Tensor) -> Tensor:

@@ -1,11 +1,12 @@
 """Operator and image to filtered image, as a layer."""
 
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_alpha
+from nlfilter_torch.checks import check_alpha, check_tensor, check_weight, described
 from nlfilter_torch.filtering import polynomial_filter, weigh_layers
 from nlfilter_torch.modules.learning import check_learn
 from nlfilter_torch.operator import NonlocalOperator
@@ -44,8 +45,10 @@ class PolynomialSliders(nn.Module):
     ) -> None:
         super().__init__()
         names = check_learn(learn, LEARNABLE)
-        start = torch.tensor(alpha, dtype=torch.get_default_dtype())
+        start = _sliders(alpha)
         check_alpha(start, dimensions=(1, 2))
+        if residual is not None:
+            check_weight(residual, "residual")
         if residual is None and "residual" in names:
             residual = float(start[..., 0].mean())
         weight = None if residual is None else torch.tensor(float(residual))
@@ -68,6 +71,11 @@ class PolynomialSliders(nn.Module):
 
     def combine(self, layers: Tensor, alpha: Tensor | None = None) -> Tensor:
         """The same, with ``residual`` alpha_1, from layers (B, k+1, C, H, W) of :func:`detail_layers` that are held."""
+        check_tensor(layers, "layers")
+        if layers.ndim != 5:
+            raise ValueError(
+                f"layers must have shape (B, k+1, C, H, W), got {tuple(layers.shape)}; take them from detail_layers"
+            )
         return weigh_layers(layers, self.alpha if alpha is None else alpha)
 
     def extra_repr(self) -> str:
@@ -75,3 +83,13 @@ class PolynomialSliders(nn.Module):
         residual = None if self.residual is None else round(self.residual.item(), 4)
         alpha = self.alpha.double().mul(1e4).round().div(1e4).tolist()  # in double: 1.05 has no tail of digits there
         return f"alpha={alpha}, residual={residual}"
+
+
+def _sliders(alpha: Any) -> Tensor:
+    """The sliders of a constructor as a tensor of the default dtype."""
+    try:
+        return torch.as_tensor(alpha, dtype=torch.get_default_dtype()).detach().clone()
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise TypeError(
+            f"alpha must be numbers or rows of equal length of them, got {described(alpha)}; pass (1.0, 1.0, 1.0, 1.0)"
+        ) from None

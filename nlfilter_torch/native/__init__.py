@@ -14,23 +14,23 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from nlfilter_torch import instruction_sets
 from nlfilter_torch.checks import is_transformed
 
 if TYPE_CHECKING:
     from nlfilter_torch.nystrom import Affinity
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
-LEVELS = ("none", "AVX2", "AVX-512")
+LEVELS = instruction_sets.NAMES
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
 
 
 def _load() -> ctypes.CDLL | None:
     """The compiled library, if the installation has one."""
-    path = Path(__file__).with_name("kernels.so")
-    if not path.exists():
+    library = instruction_sets.load_library()
+    if library is None:
         return None
-    library = ctypes.CDLL(str(path))
     shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
     share_threads(library, _openmp())
     planes: list[Any] = [_POINTER, _LONG, _LONG]  # (B, R, N) and their strides
@@ -40,7 +40,7 @@ def _load() -> ctypes.CDLL | None:
     factor: list[Any] = [_LONG, _LONG, *planes]  # images, landmarks, (B, M, N)
     library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, *planes, _POINTER]
-    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _FLOAT, _POINTER, _POINTER]
+    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER]
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
@@ -64,7 +64,7 @@ def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
 
 
 _library = _load()
-level: int = _library.nlfilter_level() if _library else 0  # of LEVELS, what this processor and installation can do
+level = instruction_sets.level(_library)  # of LEVELS, what this processor and installation can do
 
 
 def suits(*tensors: Tensor) -> bool:
@@ -177,29 +177,28 @@ def gather(images: Tensor, factor: Tensor) -> Tensor:
     return out
 
 
-def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, least: float, most: float) -> tuple[Tensor, Tensor]:
+def sweep(factor: Tensor, diagonal: Tensor, half: Tensor, most: float) -> tuple[Tensor, Tensor]:
     """The scaling d of every pixel for a guess at its moment, and the moment that it has.
 
     Args:
         factor: (B, M, N).
         diagonal: (B, N).
         half: of the guess t, (B, M).
-        least: of half of u . t.
         most: of d.
 
     Returns:
         d (B, N), and factor @ d (B, M) in float64.
     """
-    return _sweep(factor, half, None, diagonal, least, most)
+    return _sweep(factor, half, None, diagonal, most)
 
 
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
     """``factor diag(weights) factor^T vector``, (B, M) in float64, of a factor (B, M, N), (B, N) and (B, M)."""
-    return _sweep(factor, vector, weights, None, 0.0, 0.0)[1]
+    return _sweep(factor, vector, weights, None, 0.0)[1]
 
 
 def _sweep(
-    factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, least: float, most: float
+    factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, most: float
 ) -> tuple[Tensor, Tensor]:
     factor = _by_rows(factor)
     batch, marks, pixels = factor.shape
@@ -208,7 +207,7 @@ def _sweep(
     out = factor.new_empty(batch, pixels)
     moment = factor.new_empty(batch, marks, dtype=torch.float64)
     _call(
-        "sweep", factor, row.data_ptr(), *(t if t is None else t.data_ptr() for t in (scaling, diagonal)), least, most,
+        "sweep", factor, row.data_ptr(), *(t if t is None else t.data_ptr() for t in (scaling, diagonal)), most,
         out.data_ptr(), moment.data_ptr(),
     )  # fmt: skip
     return out, moment

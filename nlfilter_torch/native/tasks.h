@@ -5,6 +5,7 @@
 
 #pragma once
 
+#include <float.h>
 #include <stdatomic.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -52,7 +53,7 @@ struct thin {
     long images_stride;
     const float *scaling;  /* d, (N), or none */
     const float *diagonal; /* c, (N), or none */
-    float least, most;     /* of half of u . t, and of d */
+    float most;            /* of d */
     long factor_step, images_step; /* from one image of a batch to the next; everything else is contiguous */
     long pixels;                   /* N */
 };

@@ -59,12 +59,12 @@ static void run_sweep(struct work *work, long image, long piece, long first, lon
 /* Given a diagonal, what out = d has for a moment where row is half of its guess; else factor diag(scaling) factor^T
  * row, and out is room for what lies between. */
 int nlfilter_sweep(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
-                   long factor_stride, const float *row, const float *scaling, const float *diagonal, float least,
-                   float most, float *out, double *moment)
+                   long factor_stride, const float *row, const float *scaling, const float *diagonal, float most,
+                   float *out, double *moment)
 {
     struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
-                        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .least = least, .most = most,
-                        .images = out, .images_step = pixels, .out = out, .pixels = pixels};
+                        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .most = most, .images = out,
+                        .images_step = pixels, .out = out, .pixels = pixels};
     struct work work = {.run = run_sweep, .task = &task, .level = level, .images = images, .pixels = pixels};
     return add_up(&work, threads, marks, moment);
 }

@@ -1,5 +1,7 @@
 /* Products of the factor with a few rows, each reading it once; see thin.py, and newton.py for the sweep. */
 
+#define LEAST (FLT_EPSILON / 4)
+
 /* Where the next rows of the factor begin; past the last one it is that once more. Several keep memory busy. */
 INLINE void NAME(adjacent)(const struct thin *task, long row, long start, int count, const float **found)
 {
@@ -82,9 +84,11 @@ static TARGET void NAME(sweep)(const struct thin *task, long first, long last, d
         const long end = last - start < step ? last : start + step;
         NAME(spread)(task, start, end);
         for (long i = start; task->diagonal && i < end; i++) {
-            const float half = task->out[i] < task->least ? task->least : task->out[i];
-            const float root = 1.0f / (sqrtf(half * half + task->diagonal[i]) + half);
-            task->out[i] = root > task->most ? task->most : root;
+            /* newton.py: the root without cancellation for either sign of u . t, and finite without a diagonal */
+            const float half = task->out[i], c = task->diagonal[i], root = sqrtf(half * half + c);
+            const float over = half < 0.0f ? root - half : 1.0f, under = half < 0.0f ? c : root + half;
+            const float d = over / (under < LEAST ? LEAST : under);
+            task->out[i] = d > task->most ? task->most : d;
         }
         NAME(gather)(task, start, end, totals);
     }

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_count, check_patch_size, check_positive
+from nlfilter_torch.checks import check_choice, check_count, check_patch_size, check_positive, check_share
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.edits.colorize import FAR, LOCALITY, NEAR, Stage
 from nlfilter_torch.edits.locality import nearby
@@ -29,7 +29,7 @@ from nlfilter_torch.streaming.tiles import (
     row_by_row,
     rows_that_fit,
 )
-from nlfilter_torch.strokes import FittedStrokes, check_share, fit_strokes
+from nlfilter_torch.strokes import FittedStrokes, fit_strokes
 
 
 def stream_colorize(

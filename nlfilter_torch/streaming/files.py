@@ -22,11 +22,15 @@ from nlfilter_torch import tiff
 from nlfilter_torch.files import (
     check_file,
     check_type,
+    claimed,
     encode,
     first_bytes,
+    link_target,
     name_beside,
     open_beside,
     read_channels,
+    remove_stale,
+    unfinished,
 )
 from nlfilter_torch.streaming.rows import Rows, RowSource
 from nlfilter_torch.streaming.tiff_rows import TiffRows
@@ -115,6 +119,8 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         _zarr()
         if not path.is_dir():
             check_file(path)
+            if path.exists():
+                raise ValueError(f"{path} is a file, but no array of zarr that could be replaced; choose another name")
         elif not _holds_zarr(path):
             raise ValueError(f"{path} is a folder, but no array of zarr that could be replaced; choose another name")
         return
@@ -241,12 +247,17 @@ def _open_zarr(path: Path) -> StoredPicture:
 def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:
     """An array that takes its name when it is whole; one that had the name before goes then, and not earlier."""
     shape = tuple(like.rows.shape)
+    path = link_target(path)
     beside, former = name_beside(path), name_beside(path)
+    unfinished.add(beside)
+    claim = ExitStack()
     try:
+        remove_stale(path.parent, {path.name})
         chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
         array = _zarr().create_array(
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
         )
+        claim.enter_context(claimed(beside))
         start = 0
         for band in tiff.bands((part for _, part in rows), CHUNK):
             values = band.reshape(len(band), *shape[1:])
@@ -264,9 +275,11 @@ def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPictur
     except OSError as error:
         raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
+        claim.close()
         shutil.rmtree(former, ignore_errors=True)
         if beside.exists():
             _remove(beside)
+        unfinished.discard(beside)
 
 
 def _remove(folder: Path) -> None:

@@ -9,17 +9,18 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.edits.enhance import MASK_BANDWIDTH, SHARED
+from nlfilter_torch.eigenvalue_bound import is_bounded
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.frames import FittedFilter
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.masks import check_negative, mask_of_exponents, squared_distances
-from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.newton import PixelScaling
 from nlfilter_torch.precision import full_precision
 from nlfilter_torch.spectrum import RitzPairs
 from nlfilter_torch.streaming.influence import sample_by_influence
 from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
 from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, take_pilot
-from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, sum_up
+from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, limiter_by_passes, sum_up
 from nlfilter_torch.streaming.tiles import Passes, row_by_row
 
 
@@ -61,7 +62,7 @@ class FittedMasks:
 
     Attributes:
         kernel: of the operator that compares colours.
-        balancing: its moment t, (1, M, 1).
+        balancing: what the scaling of a pixel is a function of.
         core: (1, M, M), from a column of F to coordinates of the diffusion map.
         centres: of the regions in these coordinates, (1, K, M).
         others: of pixels that the masks stay away from, (1, 1 or K, M), or None.
@@ -69,7 +70,7 @@ class FittedMasks:
     """
 
     kernel: Kernel
-    balancing: Tensor
+    balancing: PixelScaling
     core: Tensor
     centres: Tensor
     others: Tensor | None
@@ -126,11 +127,11 @@ def fit_masks(
 
 
 def _region_means(
-    picture: Picture, regions: RowSource, name: str, kernel: Kernel, balancing: Tensor, report: Report
+    picture: Picture, regions: RowSource, name: str, kernel: Kernel, balancing: PixelScaling, report: Report
 ) -> Tensor:
     """The mean column of F over each region, (1, M, K) in float64."""
     margin, rows = kernel.patch_weights.shape[0] // 2, picture.statistics_rows
-    total = torch.zeros(1, balancing.shape[1], regions.shape[2], dtype=torch.float64)
+    total = torch.zeros(1, balancing.moment.shape[1], regions.shape[2], dtype=torch.float64)
     weight = torch.zeros(regions.shape[2], dtype=torch.float64)
     for start in range(0, picture.size[0], rows):
         report("Finding regions", start, picture.size[0])
@@ -149,10 +150,10 @@ def _region_means(
     return total / weight
 
 
-def _columns(kernel: Kernel, features: Tensor, balancing: Tensor) -> Tensor:
+def _columns(kernel: Kernel, features: Tensor, balancing: PixelScaling) -> Tensor:
     """F (1, M, n) of pixels with features (1, D, n)."""
     factor, diagonal = kernel.factor(features)
-    return factor * scaling_from_moment(factor, diagonal, balancing.to(factor)).unsqueeze(1)
+    return factor * balancing(factor, diagonal)[0].unsqueeze(1)
 
 
 def _gather(
@@ -163,15 +164,15 @@ def _gather(
     *,
     spectral: bool,
     **options: Any,
-) -> tuple[Kernel, Tensor, Sums]:
-    """Kernel, moment t of balancing, and the sums for the first ``order`` powers of W."""
+) -> tuple[Kernel, PixelScaling, Sums]:
+    """Kernel, scaling, and the sums for the first ``order`` powers of W."""
     report = passes.report
     pilot = take_pilot(picture, image, report, **options)
-    kernel, balancing = pilot.kernel, pilot.balancing
+    kernel, total = pilot.kernel, pilot.balancing
     completed = kernel.completion == "diagonal"
 
     def every(stage: str) -> Iterator[Block]:
-        return all_blocks(picture, kernel, image, report, stage)
+        return all_blocks(picture, kernel, image, report, stage)  # the kernel as it is by then
 
     def some(stage: str) -> Iterator[Block]:
         report(stage, 0, 1)
@@ -180,8 +181,11 @@ def _gather(
     drawn = passes.sample < picture.pixels
     if drawn:
         chosen = sample_by_influence(picture, pilot, image, passes.sample, report, spectral=spectral)
-        balancing = balance_by_passes(lambda: some("Balancing"), balancing, completed=completed)
-    if drawn and passes.statistics == "sample":
-        return kernel, balancing, sum_up(lambda: some("Summing up"), balancing, order)
-    balancing = balance_by_passes(lambda: every("Balancing"), balancing, completed=completed)
-    return kernel, balancing, sum_up(lambda: every("Summing up"), balancing, order)
+        total = balance_by_passes(lambda: some("Balancing"), total, completed=completed)
+    part = some if drawn and passes.statistics == "sample" else every
+    if part is every:
+        total = balance_by_passes(lambda: every("Balancing"), total, completed=completed)
+    balancing = PixelScaling(total, completed)
+    if is_bounded(options.get("landmarks", "kmeans"), picture.pixels, total.shape[1]):
+        kernel = replace(kernel, limiter=limiter_by_passes(lambda: part("Bounding"), balancing))
+    return kernel, balancing, sum_up(lambda: part("Summing up"), balancing, order)

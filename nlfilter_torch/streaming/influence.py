@@ -10,7 +10,7 @@ from torch import Tensor
 from nlfilter_torch.blocks import CACHED
 from nlfilter_torch.features import reduce_channels
 from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.newton import scaling_from_moment
+from nlfilter_torch.newton import PixelScaling, scaling_from_moment
 from nlfilter_torch.nystrom import Affinity
 from nlfilter_torch.spectrum import CUT
 from nlfilter_torch.streaming import sampling
@@ -108,7 +108,8 @@ class Influence:
         marks = kernel.landmarks.shape[2]
         measures = [torch.eye(marks, dtype=torch.float64)]
         if spectral:
-            gram = sum_up(lambda: pilot.sample.blocks(kernel), pilot.balancing, 1).grams[0, 0]
+            balancing = PixelScaling(pilot.balancing, kernel.completion == "diagonal")
+            gram = sum_up(lambda: pilot.sample.blocks(kernel), balancing, 1).grams[0, 0]
             values, vectors = torch.linalg.eigh(gram)
             values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
             measures.append(values.rsqrt()[:, None] * vectors.mT)

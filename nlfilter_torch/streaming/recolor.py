@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nlfilter_torch.checks import check_count, check_patch_size
+from nlfilter_torch.checks import check_count, check_patch_size, check_share
 from nlfilter_torch.edits.recolor import colour_guide
 from nlfilter_torch.streaming.dye import Marked, fit_dye
 from nlfilter_torch.streaming.fitting import fit_spectrum
@@ -20,7 +20,6 @@ from nlfilter_torch.streaming.tiles import (
     in_silence,
     rows_that_fit,
 )
-from nlfilter_torch.strokes import check_share
 
 
 def stream_recolor(

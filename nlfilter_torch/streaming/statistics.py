@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.checks import warn
-from nlfilter_torch.newton import LARGEST, scaling_from_moment
+from nlfilter_torch.eigenvalue_bound import limiter
+from nlfilter_torch.newton import LARGEST, PixelScaling, scaling_from_moment
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import sum_grams, whiten_gram
 from nlfilter_torch.thin import moment
@@ -77,6 +78,21 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
     return total
 
 
+def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
+    """The ``X^(1/2)`` (1, M, M) by which the factor is multiplied, or None where no eigenvalue exceeds 1."""
+    dtype = next(iter(blocks())).factor.dtype
+
+    def gram(at: Tensor, power: int) -> Tensor:
+        matrix = torch.zeros((), dtype=torch.float64)
+        for block in blocks():
+            scaling, remainder = balancing(block.factor, block.diagonal)
+            weights = block.weights * (at.unsqueeze(1) - remainder).clamp(min=1e-30).pow(-power)
+            matrix = matrix + sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
+        return matrix
+
+    return limiter(gram, balancing.moment, dtype)
+
+
 @dataclass(frozen=True)
 class Sums:
     """What a pass over a balanced image leaves.
@@ -104,12 +120,11 @@ class Sums:
         return root @ root @ self.moments[:, 0]
 
 
-def sum_up(blocks: Pass, total: Tensor, order: int) -> Sums:
-    """One pass over pixels whose balancing moment is ``total``, for the first ``order`` powers of W."""
-    grams, moments, dtype = torch.zeros(()), torch.zeros(()), total.dtype
+def sum_up(blocks: Pass, balancing: PixelScaling, order: int) -> Sums:
+    """One pass over the pixels of a balanced image, for the first ``order`` powers of W."""
+    grams, moments, dtype = torch.zeros(()), torch.zeros(()), balancing.moment.dtype
     for block in blocks():
-        scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor))
-        remainder = scaling * (scaling * block.diagonal)
+        scaling, remainder = balancing(block.factor, block.diagonal)
         grams = grams + sum_grams(block.factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
         powers = [(scaling * block.weights).unsqueeze(1) * block.image]
         for _ in range(order - 1):

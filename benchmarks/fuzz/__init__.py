@@ -1,0 +1,1 @@
+"""Random operators, pictures and calls, and what the library promises of each: ``python -m benchmarks.fuzz``."""

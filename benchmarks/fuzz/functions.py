@@ -1,0 +1,395 @@
+"""Every public function with random arguments, half of the time with one that is wrong.
+
+Legal arguments have to give finite values and no error; wrong ones finite values or an error in one sentence.
+"""
+
+import math
+import random
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import nlfilter_torch as nlf
+from benchmarks.fuzz.cases import SAMPLINGS, log_uniform
+from benchmarks.fuzz.checks import Findings, judged
+
+SIDES = (4, 24)
+TOO_LARGE = 1_000_001  # as a patch size, 8 TB of weights
+
+
+class Scene:
+    """An image, its operator and all other arguments that fit them."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self.rng = rng
+        self.batch = rng.choice((1, 1, 2))
+        self.size = (rng.randint(*SIDES), rng.randint(*SIDES))
+        self.dtype = rng.choice((torch.float32, torch.float32, torch.float64))
+        self.order = rng.randint(1, 4)
+        self.regions = rng.randint(1, 3)
+        self.generator = torch.Generator().manual_seed(rng.randint(0, 1 << 20))
+
+    def noise(self, *shape: int) -> Tensor:
+        """In [0, 1], sometimes of few levels."""
+        levels = self.rng.choice((2, 4, 255, 1 << 20))
+        values = torch.rand(shape, generator=self.generator, dtype=torch.float64)
+        return ((values * levels).round() / levels).to(self.dtype)
+
+    def image(self, channels: int) -> Tensor:
+        """(B, C, H, W), flat in one half at times."""
+        image = self.noise(self.batch, channels, *self.size)
+        if self.rng.random() < 0.3:
+            image[..., self.size[1] // 2 :] = self.rng.random()
+        return image
+
+    def mask(self, channels: int) -> Tensor:
+        """(B, C, H, W) in [0, 1], of which every channel holds a rectangle."""
+        mask = torch.zeros(self.batch, channels, *self.size, dtype=self.dtype)
+        for plane in mask.flatten(0, 1):
+            top, left = (self.rng.randint(0, side - 2) for side in self.size)
+            plane[top : top + self.rng.randint(1, 8), left : left + self.rng.randint(1, 8)] = self.rng.choice((1, 0.5))
+        return mask
+
+    @cached_property
+    def guide(self) -> Tensor:
+        """What the operator is made from."""
+        return self.image(self.rng.choice((1, 3, 2)))
+
+    @cached_property
+    def operator(self) -> nlf.NonlocalOperator:
+        """Of a bandwidth that suits noise."""
+        bandwidth = log_uniform(self.rng, 0.03, 1.0)
+        return nlf.nonlocal_operator(self.guide, photometric_bandwidth=bandwidth, num_landmarks=self.rng.randint(1, 16))
+
+    @cached_property
+    def spectrum(self) -> nlf.Spectrum:
+        """Of the operator."""
+        return self.operator.spectrum()
+
+
+Kind = Callable[[Scene], Any]
+
+
+def _number(least: float, most: float) -> Kind:
+    """A number, or a tensor of one for each image."""
+
+    def kind(scene: Scene) -> float | Tensor:
+        if scene.rng.random() < 0.7:
+            return scene.rng.uniform(least, most)
+        return torch.tensor([scene.rng.uniform(least, most) for _ in range(scene.batch)], dtype=scene.dtype)
+
+    return kind
+
+
+def _plain(least: float, most: float) -> Kind:
+    return lambda scene: scene.rng.uniform(least, most)
+
+
+def _count(least: int, most: int) -> Kind:
+    return lambda scene: scene.rng.randint(least, most)
+
+
+def _one_of(*values: Any) -> Kind:
+    return lambda scene: scene.rng.choice(values)
+
+
+def _image(*channels: int) -> Kind:
+    return lambda scene: scene.image(scene.rng.choice(channels))
+
+
+def _alpha(scene: Scene) -> Tensor:
+    shape = scene.rng.choice(((scene.order + 1,), (scene.batch, scene.order + 1)))
+    return 4 * torch.rand(shape, generator=scene.generator).to(scene.dtype)
+
+
+def _short_side(part: float) -> Kind:
+    return lambda scene: scene.rng.uniform(0.1, part * min(scene.size))
+
+
+AFFINITY: dict[str, Kind] = {
+    "patch_size": _one_of(1, 3, 5),
+    "spatial_bandwidth": _plain(0.5, 30.0),
+    "num_landmarks": _count(1, 16),
+    "landmarks": _one_of(*SAMPLINGS),
+    "completion": _one_of("diagonal"),
+    "tolerance": _plain(1e-6, 1e-3),
+    "generator": lambda scene: scene.generator,
+}
+BANDWIDTH = {"photometric_bandwidth": _one_of("auto", 0.05, 0.2)}
+GUIDED = {"guide_channels": _one_of("luminance", "all")}
+LOCAL = {name: AFFINITY[name] for name in ("patch_size", "spatial_bandwidth", "num_landmarks")}
+FILTER = AFFINITY | BANDWIDTH
+OPERATOR: dict[str, Kind] = {"operator": lambda scene: scene.operator}
+SPECTRUM: dict[str, Kind] = {"spectrum": lambda scene: scene.spectrum}
+REGION: dict[str, Kind] = {"region": lambda scene: scene.mask(scene.regions)}
+REGIONS: dict[str, Kind] = {"regions": REGION["region"]}
+NEGATIVE: dict[str, Kind] = {"negative": lambda scene: scene.mask(1)}
+IMAGE = {"image": _image(1, 3, 2)}
+PAINTED: dict[str, Kind] = {"strokes": _image(3), "stroke_mask": lambda scene: scene.mask(1)}
+ALPHA: dict[str, Kind] = {"alpha": _alpha}
+ROWS: dict[str, Kind] = {"alpha": lambda scene: 4 * scene.noise(scene.regions, scene.order + 1)}
+LIST: dict[str, Kind] = {"alpha": lambda scene: [scene.rng.uniform(0, 4) for _ in range(scene.order + 1)]}
+RESIDUAL = {"residual": _plain(0.0, 2.0)}
+TIME = {"time": _number(0.1, 5.0)}
+WIDTH = {"width": _number(0.5, 8.0)}
+ORDER: dict[str, Kind] = {"order": lambda scene: scene.order}
+
+
+def _responses(scene: Scene) -> Callable[[Tensor], Tensor]:
+    power = scene.rng.uniform(0.1, 3.0)
+    return scene.rng.choice((lambda x: x**power, lambda x: (1 - x) * x.sqrt(), torch.ones_like, lambda x: x))
+
+
+def _wrong_response(scene: Scene) -> Any:
+    return scene.rng.choice((lambda x: None, lambda x: "text", lambda x: x[:, :1], None, 1.0))
+
+
+def _layer(**options: Any) -> Tensor:
+    image, guide = options.pop("image"), options.pop("guide", None)
+    return nlf.NonlocalFilter(options.pop("alpha"), **options)(image, guide)
+
+
+def _affinity(**options: Any) -> Tensor:
+    image = options.pop("image")
+    return nlf.NonlocalAffinity(**options)(image) @ image
+
+
+def _sliders(operator: nlf.NonlocalOperator, image: Tensor, **options: Any) -> Tensor:
+    return nlf.PolynomialSliders(options.pop("alpha"), **options)(operator, image)
+
+
+def _diffusion_module(spectrum: nlf.Spectrum, region: Tensor, **options: Any) -> Tensor:
+    return nlf.DiffusionMask(**options)(spectrum, region)
+
+
+def _segment_module(spectrum: nlf.Spectrum, regions: Tensor, **options: Any) -> Tensor:
+    return nlf.SegmentMask(**options)(spectrum, regions)
+
+
+def _first(scene: Scene) -> Tensor:
+    return scene.image(3)[:1]
+
+
+@dataclass(frozen=True)
+class Function:
+    """A public function, its arguments that are always given, and those that may be left out."""
+
+    call: Callable[..., Any]
+    required: dict[str, Kind]
+    optional: dict[str, Kind]
+
+
+NUMBERS = {name: _plain(0.1, 4.0) for name in ("time", "width")}
+FUNCTIONS = {
+    "nonlocal_operator": Function(nlf.nonlocal_operator, {"guide": _image(1, 3, 2)}, FILTER | GUIDED),
+    "NonlocalOperator.matmul": Function(lambda operator, image: operator @ image, OPERATOR | IMAGE, {}),
+    "NonlocalOperator.spectrum": Function(
+        lambda operator, **options: operator.spectrum(**options), OPERATOR, {"rank": _count(1, 20)}
+    ),
+    "polynomial_filter": Function(nlf.polynomial_filter, OPERATOR | IMAGE | ALPHA, RESIDUAL),
+    "detail_layers": Function(nlf.detail_layers, OPERATOR | IMAGE, ORDER),
+    "spectral_filter": Function(nlf.spectral_filter, SPECTRUM | IMAGE | {"response": _responses}, RESIDUAL),
+    "polynomial_response": Function(
+        nlf.polynomial_response, {"eigenvalues": lambda scene: scene.noise(scene.batch, 5), **ALPHA}, {}
+    ),
+    "captured_energy": Function(nlf.captured_energy, SPECTRUM | IMAGE, {}),
+    "estimate_bandwidth": Function(nlf.estimate_bandwidth, {"guide": _image(1, 3, 2)}, GUIDED),
+    "estimate_noise": Function(nlf.estimate_noise, IMAGE, {}),
+    "diffusion_map": Function(nlf.diffusion_map, SPECTRUM | TIME, {}),
+    "diffusion_mask": Function(nlf.diffusion_mask, SPECTRUM | REGION, TIME | WIDTH | NEGATIVE),
+    "segment_mask": Function(nlf.segment_mask, SPECTRUM | REGIONS, TIME),
+    "compose_alpha": Function(nlf.compose_alpha, {"masks": REGION["region"]} | ROWS, {}),
+    "filter_regions": Function(nlf.filter_regions, OPERATOR | IMAGE | {"masks": REGION["region"]} | ROWS, RESIDUAL),
+    "propagate_strokes": Function(
+        nlf.propagate_strokes,
+        SPECTRUM | PAINTED,
+        {"strength": _number(0, 1), "reach": _number(0, 0.99), "smoothness": _number(0.1, 10)},
+    ),
+    "fit_alpha": Function(
+        nlf.fit_alpha,
+        OPERATOR | {"image": _image(3), "target": _image(3)},
+        ORDER
+        | {"mask": NEGATIVE["negative"], "ridge": _plain(0, 1), "shared": _one_of(True, False)}
+        | {"rounding": _plain(0, 0.01)},
+    ),
+    "filter_frames": Function(
+        lambda **arguments: list(nlf.filter_frames(**arguments)),
+        {
+            "frames": lambda scene: [scene.image(3) for _ in range(2)],
+            "references": lambda scene: [_first(scene)],
+            "alpha": lambda scene: 4 * scene.noise(scene.order + 1),
+        },
+        RESIDUAL | FILTER,
+    ),
+    "fit_filter": Function(
+        lambda **arguments: nlf.fit_filter(**arguments).moments,
+        {
+            "operator": lambda scene: nlf.nonlocal_operator(scene.guide[:1], num_landmarks=8),
+            "image": _first,
+        },
+        ORDER,
+    ),
+    "enhance": Function(nlf.enhance, {"image": _image(1, 3)} | ALPHA, RESIDUAL | FILTER),
+    "enhance with regions": Function(
+        nlf.enhance,
+        {"image": _image(1, 3)} | REGIONS | ROWS,
+        NEGATIVE | RESIDUAL | TIME | WIDTH | FILTER | {"mask_bandwidth": _plain(0.03, 0.5)},
+    ),
+    "sharpen": Function(
+        nlf.sharpen, {"image": _image(1, 3)}, FILTER | {"amount": _number(0, 8), "guide_blur": _short_side(0.5)}
+    ),
+    "adjust_tone": Function(
+        nlf.adjust_tone, {"image": _image(1, 3)}, FILTER | ORDER | {"contrast": _number(0, 2), "clarity": _number(0, 4)}
+    ),
+    "denoise": Function(
+        nlf.denoise, IMAGE, LOCAL | {"noise_level": _number(0, 0.3), "photometric_bandwidth": _plain(0.03, 0.5)}
+    ),
+    "abstract": Function(
+        nlf.abstract,
+        {"image": _image(1, 3)},
+        LOCAL
+        | BANDWIDTH
+        | {"power": _number(0, 2), "edges": _plain(0, 1), "edge_width": _short_side(0.5)}
+        | {"tones": _count(2, 9)},
+    ),
+    "defocus": Function(
+        nlf.defocus,
+        {"image": _image(1, 3), "focus_region": lambda scene: scene.mask(1)},
+        LOCAL
+        | {"radius": _short_side(0.5), "aperture": _one_of("disc", "gaussian")}
+        | {"photometric_bandwidth": _plain(0.03, 0.5)},
+    ),
+    "recolor": Function(
+        nlf.recolor,
+        {"image": _image(3)} | PAINTED,
+        LOCAL | {"keep": NEGATIVE["negative"], "reach": _number(0, 0.99), "photometric_bandwidth": _plain(0.03, 0.5)},
+    ),
+    "colorize": Function(
+        nlf.colorize,
+        {"grey": _image(1)} | PAINTED,
+        LOCAL
+        | {"method": _one_of("regression", "kmeans"), "strength": _number(0, 1), "time": _number(0.1, 5)}
+        | {"photometric_bandwidth": _plain(0.03, 0.5)},
+    ),
+    "NonlocalFilter": Function(
+        _layer, LIST | {"image": _image(1, 3)}, RESIDUAL | FILTER | GUIDED | {"learn": _one_of((), ("alpha",))}
+    ),
+    "NonlocalAffinity": Function(_affinity, {"image": _image(1, 3)}, FILTER | GUIDED | {"learn": _one_of(())}),
+    "PolynomialSliders": Function(_sliders, OPERATOR | IMAGE | LIST, RESIDUAL | {"learn": _one_of((), ("alpha",))}),
+    "DiffusionMask": Function(
+        _diffusion_module, SPECTRUM | REGION, NUMBERS | {"learn": _one_of((), ("time", "width"))}
+    ),
+    "SegmentMask": Function(_segment_module, SPECTRUM | REGIONS, {"time": NUMBERS["time"]}),
+}
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function, its arguments, and which of them is wrong."""
+
+    name: str
+    arguments: dict[str, Any]
+    wrong: str | None
+
+    def __str__(self) -> str:
+        """In one line."""
+        shown = ", ".join(f"{name}={_shown(value)}" for name, value in self.arguments.items())
+        return f"{self.name}({shown}){'' if self.wrong is None else ' with a wrong ' + self.wrong}"
+
+
+def random_call(rng: random.Random) -> Call:
+    """A public function and arguments of it, half of the time with one that is wrong."""
+    name = rng.choice(tuple(FUNCTIONS))
+    function, scene = FUNCTIONS[name], Scene(rng)
+    arguments = {key: kind(scene) for key, kind in function.required.items()}
+    arguments |= {key: kind(scene) for key, kind in function.optional.items() if rng.random() < 0.4}
+    if "num_landmarks" in function.optional:  # no more than pixels, as its default may be
+        arguments.setdefault("num_landmarks", 16)
+    candidates = [key for key in arguments if "." not in name or key != "operator"]  # whose method it is
+    wrong = rng.choice(candidates) if candidates and rng.random() < 0.5 else None
+    if wrong is not None:
+        arguments[wrong] = _wrong_response(scene) if wrong == "response" else _wrong(rng, wrong, arguments[wrong])
+    return Call(name, arguments, wrong)
+
+
+def check_call(call: Call) -> Findings:
+    """Make the call, and check what comes of it."""
+    findings, made = Findings(), None
+    with judged(findings, legal=call.wrong is None):
+        made = FUNCTIONS[call.name].call(**call.arguments)
+    for tensor in _tensors(made):
+        findings.finite(tensor, "the result")
+    return findings
+
+
+def _wrong(rng: random.Random, name: str, value: Any) -> Any:
+    """Something else in place of an argument; it may happen to be legal."""
+    if isinstance(value, Tensor) and value.ndim > 0 and rng.random() < 0.8:
+        return rng.choice(TENSORS)(value)
+    if isinstance(value, list) and value and rng.random() < 0.6:
+        return [*value[:-1], _wrong(rng, name, value[-1])]
+    choices: list[Any] = [None, "text", "", [], (), {}, math.nan, math.inf, -1, -1.5, 0, 0.5, True, 1j, "nan", b"1"]
+    choices += [torch.tensor(math.nan), torch.ones(7), torch.tensor([]), torch.tensor(1j), torch.tensor(-1.0)]
+    choices += [1e20, 1e-40, -math.inf]
+    if name in ("patch_size", "num_landmarks"):
+        choices += [TOO_LARGE, 10**400, 2, 48.0]
+    return rng.choice(choices)
+
+
+def _with(tensor: Tensor, value: float) -> Tensor:
+    changed = tensor.clone()
+    changed.view(-1)[-1] = value
+    return changed
+
+
+TENSORS: tuple[Callable[[Tensor], Any], ...] = (
+    lambda t: _with(t, math.nan),
+    lambda t: _with(t, math.inf),
+    lambda t: _with(t, 1e20),
+    lambda t: t * 1e20,
+    lambda t: t * 1e-40,
+    lambda t: t * 255,
+    lambda t: -t,
+    lambda t: t * 0,
+    lambda t: t.long(),
+    lambda t: t.bool(),
+    lambda t: t.half(),
+    lambda t: t.to(torch.complex64),
+    lambda t: t[0],
+    lambda t: t[None],
+    lambda t: t[..., :0],
+    lambda t: t[:0],
+    lambda t: t[..., :-1],
+    lambda t: torch.cat([t] * 5),
+    lambda t: torch.cat([t] * 5, dim=min(1, t.ndim - 1)),
+    lambda t: t.mT.contiguous().mT if t.ndim > 1 else t.flip(0),
+    lambda t: t.to_sparse(),
+    lambda t: t.numpy(),
+    lambda t: t.tolist(),
+    lambda t: t.clone().requires_grad_(),
+)
+
+
+def _tensors(value: Any) -> Iterable[Tensor]:
+    """What a result holds that can be finite or not."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, list | tuple):
+        for part in value:
+            yield from _tensors(part)
+    elif isinstance(value, nlf.NonlocalOperator):
+        yield from (value.factor, value.diagonal, value.scaling, value.residual)
+    elif isinstance(value, nlf.Spectrum):
+        yield from (value.eigenvalues, value.eigenvectors)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')}{tuple(value.shape)}" if value.numel() != 1 else str(value)
+    if isinstance(value, nlf.NonlocalOperator | nlf.Spectrum | torch.Generator):
+        return type(value).__name__
+    return "a function" if callable(value) else repr(value)[:60]

@@ -1,0 +1,177 @@
+"""The fuzzer of ``benchmarks.fuzz`` for a minute, on images of at most 32x32 pixels, and what its checks notice."""
+
+import random
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.fuzz import checks
+from benchmarks.fuzz.__main__ import main
+from benchmarks.fuzz.cases import random_case
+from benchmarks.fuzz.checks import Findings, check_case, check_operator, is_sentence, judged
+from benchmarks.fuzz.functions import FUNCTIONS, check_call, random_call
+from benchmarks.fuzz.pictures import check_picture, pictures
+from benchmarks.fuzz.truth import Exact
+from nlfilter_torch import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.checks import check_positive, warn
+from tests.problems import noise
+
+# Hypothesis draws every choice, and so makes a case that fails simpler.
+sources = st.randoms(use_true_random=False)
+
+
+def assert_kept(what: object, findings: Findings) -> None:
+    broken = [f"{figure.promise}: {figure.value:.4g} {figure.detail}" for figure in findings.broken]
+    assert not broken, f"{what}\n" + "\n".join(broken)
+
+
+@pytest.mark.slow
+@given(rng=sources)
+@settings(max_examples=400)
+def test_random_operators_keep_their_promises(rng: random.Random) -> None:
+    case = random_case(rng, side=32)
+    assert_kept(case, check_case(case))
+
+
+@pytest.mark.slow
+@given(rng=sources)
+@settings(max_examples=1000)
+def test_public_functions_with_random_arguments(rng: random.Random) -> None:
+    call = random_call(rng)
+    assert_kept(call, check_call(call))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("picture", [picture for picture in pictures(0) if picture.side == 64][:10], ids=str)
+def test_pictures_keep_the_promises_of_their_operators(picture) -> None:
+    assert_kept(picture, check_picture(picture))
+
+
+def operator(**changes: object) -> NonlocalOperator:
+    made = nonlocal_operator(noise(2, 1, 9, 8, dtype=torch.float32), photometric_bandwidth=0.3, num_landmarks=8)
+    return replace(made, **changes)
+
+
+def broken_promises(made: NonlocalOperator) -> set[str]:
+    findings = Findings()
+    check_operator(findings, made, noise(2, 1, 9, 8, dtype=torch.float32), None)
+    return {figure.promise for figure in findings.broken}
+
+
+def test_checks_notice_a_false_residual() -> None:
+    scaling = operator().scaling.clone()
+    scaling[1, 7] *= 1.01
+    assert {checks.RESIDUAL, checks.ROW_SUMS} <= broken_promises(operator(scaling=scaling))
+
+
+def test_checks_notice_a_row_sum_that_no_warning_tells_of() -> None:
+    made = operator()
+    made = replace(made, scaling=made.scaling * 1.001, residual=made.residual + 2e-3)
+    promises = broken_promises(made)
+    assert checks.ROW_SUMS in promises
+    assert checks.RESIDUAL not in promises
+
+
+def test_checks_notice_an_eigenvalue_above_one() -> None:
+    assert checks.EIGENVALUES in broken_promises(operator(scaling=operator().scaling * 1.001))
+
+
+def test_checks_notice_an_eigenvalue_below_zero() -> None:
+    remainder = operator().remainder.clone()
+    remainder[0] -= 1.0
+    assert checks.EIGENVALUES in broken_promises(operator(remainder=remainder))
+
+
+@pytest.mark.parametrize("name", ["factor", "diagonal", "scaling", "remainder", "residual"])
+def test_checks_notice_what_is_not_finite(name: str) -> None:
+    changed = getattr(operator(), name).clone()
+    changed.view(-1)[0] = torch.nan
+    assert broken_promises(operator(**{name: changed})) == {checks.FINITE}
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 1e6])
+def test_the_largest_eigenvalue_is_found_without_a_dense_matrix(monkeypatch, scale: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.randn(3, 6, 40, generator=generator, dtype=torch.float64) * scale
+    diagonal = torch.rand(3, 40, generator=generator, dtype=torch.float64)
+    factor[2] = 0  # the largest entry of the diagonal is then the answer
+    exact = Exact(factor, diagonal)
+    _, dense = exact.eigenvalue_range()
+    monkeypatch.setattr("benchmarks.fuzz.truth.DENSE", 0)
+    least, most = exact.eigenvalue_range()
+    torch.testing.assert_close(most, dense, atol=0, rtol=1e-7)
+    torch.testing.assert_close(least, diagonal.amin(1))
+
+
+def failure(function, *arguments: object) -> Exception:
+    try:
+        function(*arguments)
+    except Exception as error:
+        return error
+    pytest.fail("no error was raised")
+
+
+def test_a_sentence_names_requirement_and_remedy_and_comes_from_the_package() -> None:
+    assert is_sentence(failure(check_positive, -1.0, "time"))
+    assert not is_sentence(failure(torch.ones(2).reshape, 3))
+    assert not is_sentence(failure(int, "x must be a number, got it not; write one"))
+
+
+def test_legal_arguments_may_not_be_refused() -> None:
+    for legal in (True, False):
+        findings = Findings()
+        with judged(findings, legal=legal):
+            check_positive(-1.0, "time")
+        assert {figure.promise for figure in findings.broken} == ({checks.REFUSED} if legal else set())
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("row sums are off by 1; raise num_landmarks", True),
+        ("row sums are off by 1; use completion='diagonal'", False),  # which is in force
+        ("row sums are off by 1", False),
+    ],
+)
+def test_a_warning_needs_a_remedy_that_is_not_in_force(text: str, kept: bool) -> None:
+    findings = Findings()
+    with judged(findings, legal=True, completed=True):
+        warn(text)
+    assert findings.warned == [text]
+    assert (not findings.broken) == kept
+    findings = Findings()
+    with judged(findings, legal=True):
+        warnings.warn(text, DeprecationWarning, stacklevel=1)
+    assert findings.broken
+
+
+def test_every_public_function_is_called() -> None:
+    import nlfilter_torch
+
+    # Made by the functions, not called by users.
+    results = {"Diagnostics", "FittedFilter", "NonlocalOperator", "Spectrum"}
+    assert set(nlfilter_torch.__all__) - results <= FUNCTIONS.keys()
+
+
+@pytest.mark.parametrize("kind", [[], ["--functions"], ["--pictures"]])
+def test_a_seed_gives_the_same_cases_and_a_broken_promise_exit_status_1(kind, monkeypatch, tmp_path, capsys) -> None:
+    if not kind:
+        monkeypatch.setattr(checks, "SLACK", {torch.float32: -1.0, torch.float64: -1.0})  # no residual is good enough
+    runs = []
+    for _ in range(2):
+        with pytest.raises(SystemExit) as stopped:
+            main([*kind, "--cases", "3", "--workers", "1", "--out", str(tmp_path / "new" / "fuzz.json")])
+        runs.append((stopped.value.code, capsys.readouterr().out, (tmp_path / "new" / "fuzz.json").read_text()))
+    assert runs[0] == runs[1]
+    if not kind:
+        assert runs[0][0] == 1
+        assert f"{checks.RESIDUAL}, 3 such" in runs[0][1]
+        assert "python -m benchmarks.fuzz --seed 0 --case" in runs[0][1]
+        with pytest.raises(SystemExit) as stopped:
+            main(["--case", "1"])
+        assert stopped.value.code == 1
+        assert f"BROKEN {checks.RESIDUAL}" in capsys.readouterr().out
