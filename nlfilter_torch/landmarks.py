@@ -28,6 +28,7 @@ ITERATIONS = 5
 # ties, which must not be decided by the order in which a kernel adds up.
 TIE = 16
 CACHED_SCORES = 1 << 20  # of points against centres; on a processor a batch goes in parts with no more
+LARGEST = 1e16  # features whose squares float32 can still add up
 MANY = 1 << 24  # a permutation of more pixels would take more memory than the image
 
 
@@ -82,13 +83,14 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shar
         return subset
     points = subset.detach()
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
+    points = points.clamp(-LARGEST, LARGEST).float()  # a choice needs no more, and the kernels in C take no more
     # Half of them start the clusters, drawn at random.
     few = torch.randperm(points.shape[2], generator=generator, device=generator.device)
     few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)].to(points.device)
     pivots = _pivots(gather_columns(points, few, None), count, generator)
     start = from_first(few[pivots], shard).unsqueeze(1)  # (B, 1, M)
-    assignment = from_first(_lloyd(points, points.gather(2, start.expand(-1, points.shape[1], -1))), shard)
-    return _cluster_means(subset, assignment, subset.gather(2, start.expand(-1, subset.shape[1], -1)))
+    assignment = from_first(_lloyd(points, _pick(points, start)), shard)
+    return _cluster_means(subset, assignment, _pick(subset, start))
 
 
 def _bounded(candidates: int, most: int, count: int) -> int:

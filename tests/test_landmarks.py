@@ -156,6 +156,21 @@ def test_a_few_points_that_hold_all_of_the_residual_do_not_fill_a_block() -> Non
     assert len(pivots.unique()) > 200
 
 
+@pytest.mark.parametrize("count", [20, 300])
+def test_both_precisions_choose_the_same_landmarks(count: int) -> None:
+    x = cloud(2).float()
+    single, double = (choose_landmarks(y, (HEIGHT, WIDTH), count, "kmeans", seeded()) for y in (x, x.double()))
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(single.double(), double, atol=1e-5, rtol=1e-5)
+
+
+def test_features_whose_squares_overflow_in_single_precision() -> None:
+    x = 1e25 * cloud()
+    landmarks = choose_landmarks(x, (HEIGHT, WIDTH), 300, "kmeans", seeded())
+    assert landmarks.isfinite().all()
+    assert landmarks.unique(dim=2).shape[2] > 100
+
+
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_landmarks_pass_gradients_to_the_features(sampling: str) -> None:
     x = cloud().requires_grad_()
