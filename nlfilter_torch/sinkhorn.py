@@ -10,18 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch import chebyshev, native, newton
-from nlfilter_torch.blocks import SWEPT, pixel_blocks
+from nlfilter_torch import chebyshev, newton
 from nlfilter_torch.checks import warn
 from nlfilter_torch.differentiation import once_differentiable, outer_product
-from nlfilter_torch.sharding import Shard, reduce_sum
-from nlfilter_torch.thin import gather, moment, spread
+from nlfilter_torch.sharding import Shard
+from nlfilter_torch.thin import moment, spread
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}  # a residual that is worth a warning, unless it was asked for
-# Conjugate gradients gain a factor 5.8 a step or more: so many steps, or a residual below the rounding of the dtype.
-SOLVE_STEPS = {torch.float32: 10, torch.float64: 24}
-SOLVED = {torch.float32: 1e-7, torch.float64: 1e-16}
 
 
 @dataclass(frozen=True)
@@ -101,40 +97,9 @@ class _Balance(torch.autograd.Function):
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
         right = moment(factor, (weight * grad).unsqueeze(1), ctx.shard)
-        solution = _conjugate_gradients(factor, weight, right, inverse, ctx.shard)
+        solution = newton.conjugate_gradients(factor, weight, right, inverse, ctx.shard)
         affinity = spread(solution.to(factor).mT, factor).squeeze(1)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
         grad_factor = outer_product(totals, torch.stack([-a, -scaling], dim=1).to(dtype))
         return grad_factor, (-a * scaling).to(dtype), None, None, None
-
-
-def _weighted_moment(factor: Tensor, weight: Tensor, shard: Shard | None, total: Tensor) -> Tensor:
-    """``factor @ (weight * (factor^T total))``, (B, M, 1) in float64."""
-    row = total.to(factor).mT
-    if native.suits(factor, weight, row):
-        return reduce_sum(native.weigh(factor, weight, row[:, 0]).unsqueeze(2), shard)
-    found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        columns = factor[:, :, block]
-        found += gather(weight[:, None, block] * spread(row, columns), columns).mT
-    return reduce_sum(found, shard)
-
-
-def _conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, shard: Shard | None) -> Tensor:
-    """The s (B, M, 1) in float64 with ``(I + factor diag(weight) factor^T) s = right``."""
-    tiny = torch.finfo(torch.float64).tiny  # where the right side is zero, so is the solution
-    solution, residual = torch.zeros_like(right), right
-    preconditioned = inverse @ residual
-    direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
-    goal = SOLVED[factor.dtype] ** 2 * size
-    for _ in range(SOLVE_STEPS[factor.dtype]):
-        image = direction + _weighted_moment(factor, weight, shard, direction)
-        step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
-        solution, residual = solution + step * direction, residual - step * image
-        preconditioned = inverse @ residual
-        before, size = size, (residual * preconditioned).sum(1, keepdim=True)
-        if factor.device.type == "cpu" and bool((size <= goal).all()):
-            break
-        direction = preconditioned + size / before.clamp(min=tiny) * direction
-    return solution
