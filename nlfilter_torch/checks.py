@@ -25,6 +25,8 @@ def check_tensor(value: object, name: str, remedy: str = "convert it with torch.
     """Raise unless ``value`` is a tensor."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; {remedy}")
+    if value.layout != torch.strided:
+        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call its to_dense()")
 
 
 def check_instance(value: object, kind: type, name: str, remedy: str) -> None:

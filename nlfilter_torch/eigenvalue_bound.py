@@ -17,7 +17,8 @@ from nlfilter_torch.matrix_function import SymmetricMatrix
 from nlfilter_torch.sharding import Shard, reduce_sum
 from nlfilter_torch.spectrum import compute_grams
 
-SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}  # by which rounding and the tolerance of row sums may exceed 1
+# By which rounding and the tolerance of row sums may exceed 1: more than the r of a pixel that is not isolated.
+SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}
 MAX_STEPS = 12
 ALWAYS = 1 << 22  # numbers of a factor; up to here the bound takes a few milliseconds
 
@@ -38,10 +39,15 @@ def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, shard: Shar
     """The matrices S of an image in memory: factor (B, M, N), d (B, N), r (B, N); differentiable."""
 
     def gram(at: Tensor, power: int) -> Tensor:
-        weights = (at.unsqueeze(1) - remainder.double()).clamp(min=1e-30).pow(-power / 2)
+        weights = shift(at, remainder).pow(-power / 2)
         return reduce_sum(compute_grams(factor, (scaling * weights).to(factor), None, 1)[:, 0], shard)
 
     return gram
+
+
+def shift(at: Tensor, remainder: Tensor) -> Tensor:
+    """``x - r``, (B, N) in float64, kept from zero."""
+    return (at.unsqueeze(1) - remainder.double()).clamp(min=1e-9)
 
 
 def limiter(gram: ShiftedGram, moment: Tensor, dtype: torch.dtype) -> Tensor | None:

@@ -258,6 +258,7 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
     check_image(masks, "masks")
     check_unit_range(masks, "masks")
     check_tensor(alpha, "alpha")
+    check_dtype(alpha, "alpha", "write 1.0 instead of 1")
     if alpha.ndim not in (2, 3) or alpha.shape[-2] != masks.shape[1] or alpha.shape[-1] < 2:
         raise ValueError(
             f"alpha must have shape ({masks.shape[1]}, k+1) or (B, {masks.shape[1]}, k+1), a row of sliders for every "

@@ -30,7 +30,7 @@ LARGE = 64  # the part that the sample is at least: larger images have rarer pix
 GUESSES = 3  # steps of the first guess towards its fixed point; more gain nothing for pixels outside its sample
 REFINEMENTS = 3  # steps of Newton's method on the sample; after two the Jacobian still changes
 UNIFORM = 0.05  # of the sample is drawn uniformly, so that no pixel of it stands for more than 20 times its share
-EXCESS = 4e-5  # by which rounding may take the d of a pixel above 1
+EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # by which rounding may take the d of a pixel above 1
 LARGEST = 2.0  # bounds d while t is a guess; a larger one is left to the damped method
 MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
@@ -61,7 +61,7 @@ def isolated(scaling: Tensor) -> Tensor:
 
     Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1.
     """
-    return scaling > 1 + EXCESS
+    return scaling > 1 + EXCESS[scaling.dtype]
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ from nlfilter_torch.nystrom import Completion, whitener
 from nlfilter_torch.precision import full_precision, working_dtype
 from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
 from nlfilter_torch.sharding import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
-from nlfilter_torch.sinkhorn import balance
+from nlfilter_torch.sinkhorn import balance, warn_of_residual
 from nlfilter_torch.spectrum import Spectrum, compute_spectrum
 from nlfilter_torch.thin import moment, spread
 
@@ -423,6 +423,7 @@ def assemble(
             factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
             before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
             residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard)
+            warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,

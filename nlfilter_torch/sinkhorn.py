@@ -57,12 +57,17 @@ def balance(
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
     scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
-    if factor.device.type == "cpu" and not bool((residual <= max(tolerance, ALARM[factor.dtype])).all()):
+    warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
+    return Balancing(scaling, total, residual, int(steps))
+
+
+def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
+    """Warn, on processors, of row sums that are off by more than was asked for and more than rounding."""
+    if residual.device.type == "cpu" and not bool((residual <= max(tolerance or 0.0, ALARM[dtype])).all()):
         remedy = "raise photometric_bandwidth or num_landmarks" + (
             ", or use completion='diagonal'" if not completed else ""
         )
         warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
-    return Balancing(scaling, total, residual, int(steps))
 
 
 class _Balance(torch.autograd.Function):

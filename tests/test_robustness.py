@@ -76,5 +76,6 @@ def test_values_far_outside_of_0_to_1() -> None:
     image = torch.tensor(IMAGES["camera"], dtype=torch.float32)[None, None]
     # Uniform, because k-means may send a pixel elsewhere when it is rounded: of 100 + y, float32 keeps y to 4e-6.
     plain = nonlocal_operator(image, photometric_bandwidth=0.1, landmarks="uniform") @ image
-    shifted = nonlocal_operator(image + 100, photometric_bandwidth=0.1, landmarks="uniform") @ image
+    with pytest.warns(UserWarning, match="guide must be in"):
+        shifted = nonlocal_operator(image + 100, photometric_bandwidth=0.1, landmarks="uniform") @ image
     torch.testing.assert_close(shifted, plain, atol=2e-3, rtol=0)

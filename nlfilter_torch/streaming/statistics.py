@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.checks import warn
-from nlfilter_torch.eigenvalue_bound import limiter
+from nlfilter_torch.eigenvalue_bound import limiter, shift
 from nlfilter_torch.newton import LARGEST, PixelScaling, scaling_from_moment
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import sum_grams, whiten_gram
@@ -86,7 +86,7 @@ def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
         matrix = torch.zeros((), dtype=torch.float64)
         for block in blocks():
             scaling, remainder = balancing(block.factor, block.diagonal)
-            weights = block.weights * (at.unsqueeze(1) - remainder).clamp(min=1e-30).pow(-power)
+            weights = block.weights * shift(at, remainder).pow(-power)
             matrix = matrix + sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
         return matrix
 
