@@ -29,6 +29,12 @@ def check_tensor(value: object, name: str, remedy: str = "convert it with torch.
         raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call its to_dense()")
 
 
+def check_dtype(tensor: Tensor, name: str, remedy: str) -> None:
+    """Raise unless ``tensor`` is of a floating-point dtype."""
+    if tensor.dtype not in FLOATING:
+        raise TypeError(f"{name} must be of a floating-point dtype, got {tensor.dtype}; {remedy}")
+
+
 def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
     """Raise unless ``value`` is an instance of ``kind``."""
     if not isinstance(value, kind):
@@ -314,8 +320,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
     """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, where allowed, (B, k+1, H, W)."""
     check_tensor(alpha, "alpha")
-    if alpha.dtype not in FLOATING:
-        raise TypeError(f"alpha must be of a floating-point dtype, got {alpha.dtype}; write 1.0 instead of 1")
+    check_dtype(alpha, "alpha", "write 1.0 instead of 1")
     if alpha.ndim not in dimensions:
         shapes = {1: "(k+1,)", 2: "(B, k+1)", 4: "(B, k+1, H, W)"}
         wanted = " or ".join(shapes[n] for n in dimensions)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from nlfilter_torch.blocks import CACHED, block_length
 from nlfilter_torch.checks import (
+    check_dtype,
     check_finite,
     check_image,
     check_instance,

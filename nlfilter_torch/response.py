@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from nlfilter_torch.checks import FLOATING, check_alpha, check_finite, check_tensor
+from nlfilter_torch.checks import check_alpha, check_dtype, check_finite, check_tensor
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
@@ -26,8 +26,7 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
         tensor([3.0000, 2.0625, 1.5000])
     """
     check_tensor(eigenvalues, "eigenvalues")
-    if eigenvalues.dtype not in FLOATING:
-        raise TypeError(f"eigenvalues must be of a floating-point dtype, got {eigenvalues.dtype}; convert them")
+    check_dtype(eigenvalues, "eigenvalues", "convert them")
     check_finite(eigenvalues, "eigenvalues")
     check_alpha(alpha, dimensions=(1, 2))
     weights = alpha.to(eigenvalues)
