@@ -18,6 +18,7 @@ Response = Callable[[Tensor], Tensor]
 
 LARGEST_PATCH = 101  # features take its square times the memory of the guide
 LARGEST_ORDER = 1000  # each has a copy of the image
+LARGEST_EIGENVALUE = 1e6
 FAR_OUTSIDE = 16.0  # of [0, 1]; brighter than what HDR pictures scaled to a white of 1 hold, darker than 8-bit ones
 
 
@@ -331,6 +332,18 @@ def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None
             f"alpha must have at least two entries, got {entries}; give one per layer, such as (1, 1, 1, 1)"
         )
     check_finite(alpha, "alpha")
+
+
+def check_eigenvalues(values: Tensor) -> None:
+    """Raise unless eigenvalues are floating-point and so near to [0, 1] that their powers stay finite."""
+    check_tensor(values, "eigenvalues")
+    check_dtype(values, "eigenvalues", "convert them")
+    check_finite(values, "eigenvalues")
+    if not is_hidden(values) and values.numel() and float(values.detach().abs().max()) > LARGEST_EIGENVALUE:
+        raise ValueError(
+            f"eigenvalues must be in [0, 1] or near it, got values up to {float(values.detach().abs().max()):g}; "
+            "divide them by the largest"
+        )
 
 
 def warn(message: str) -> None:

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_dtype, check_finite, check_tensor
+from nlfilter_torch.checks import check_alpha, check_eigenvalues
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
@@ -25,9 +25,7 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
         >>> polynomial_response(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 1.0, 1.0, 1.5]))
         tensor([3.0000, 2.0625, 1.5000])
     """
-    check_tensor(eigenvalues, "eigenvalues")
-    check_dtype(eigenvalues, "eigenvalues", "convert them")
-    check_finite(eigenvalues, "eigenvalues")
+    check_eigenvalues(eigenvalues)
     check_alpha(alpha, dimensions=(1, 2))
     weights = alpha.to(eigenvalues)
     gain = weights[..., -1:]  # Horner's scheme from the coarsest layer down
