@@ -24,7 +24,7 @@ from nlfilter_torch.checks import (
     warn_of_scale,
 )
 from nlfilter_torch.compilation import uncompiled
-from nlfilter_torch.eigenvalue_bound import is_bounded, largest_eigenvalue, limiter, shifted_gram
+from nlfilter_torch.eigenvalue_bound import exceeds, is_bounded, largest_eigenvalue, limiter, shifted_gram
 from nlfilter_torch.features import GuideChannels, extract_features, reduce_channels, unit_window
 from nlfilter_torch.kernel import Kernel
 from nlfilter_torch.landmarks import Sampling, choose_landmarks
@@ -417,13 +417,13 @@ def assemble(
         balancing = balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard)
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    if bounded and watched:
-        limit = limiter(shifted_gram(factor, scaling, remainder, shard), balancing.moment, factor.dtype)
-        if limit is not None:
-            factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
-            before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
-            residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard)
-            warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
+    gram = shifted_gram(factor, scaling, remainder, shard)
+    if bounded and watched and exceeds(gram, factor):
+        limit = limiter(gram, moment(factor, scaling.unsqueeze(1), shard), factor)
+        factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
+        before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
+        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard)
+        warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,

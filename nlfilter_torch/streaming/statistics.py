@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.checks import warn
-from nlfilter_torch.eigenvalue_bound import limiter, shift
+from nlfilter_torch.eigenvalue_bound import exceeds, limiter, shift
 from nlfilter_torch.newton import LARGEST, PixelScaling, scaling_from_moment
 from nlfilter_torch.sinkhorn import balance
 from nlfilter_torch.spectrum import sum_grams, whiten_gram
@@ -80,7 +80,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
 
 def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
     """The ``X^(1/2)`` (1, M, M) by which the factor is multiplied, or None where no eigenvalue exceeds 1."""
-    dtype = next(iter(blocks())).factor.dtype
+    like = next(iter(blocks())).factor
 
     def gram(at: Tensor, power: int) -> Tensor:
         matrix = torch.zeros((), dtype=torch.float64)
@@ -90,7 +90,7 @@ def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
             matrix = matrix + sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
         return matrix
 
-    return limiter(gram, balancing.moment, dtype)
+    return limiter(gram, balancing.moment, like) if exceeds(gram, like) else None
 
 
 @dataclass(frozen=True)
