@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.modules import NonlocalFilter as NonlocalFilter
     from nlfilter_torch.modules import PolynomialSliders as PolynomialSliders
     from nlfilter_torch.modules import SegmentMask as SegmentMask
+    from nlfilter_torch.operator import Certificate as Certificate
     from nlfilter_torch.operator import Diagnostics as Diagnostics
     from nlfilter_torch.operator import NonlocalOperator as NonlocalOperator
     from nlfilter_torch.operator import nonlocal_operator as nonlocal_operator
@@ -49,6 +50,7 @@ __version__ = "0.1.0"
 
 #: Every public name, and the module that defines it.
 _DEFINED_IN = {
+    "Certificate": "operator",
     "Diagnostics": "operator",
     "DiffusionMask": "modules",
     "FittedFilter": "frames",
