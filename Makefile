@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
 PINS := pyproject.toml constraints.txt
-COMPILED := hatch_build.py $(wildcard nlfilter_torch/native/*.[ch])
+COMPILED := hatch_build.py $(wildcard nlfilter_torch/core/kernels/*.[ch])
 
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --no-install-recommends

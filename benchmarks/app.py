@@ -18,8 +18,8 @@ import torch.nn.functional as F
 
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.files import Photograph, write_photograph
-from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 REPEATS = 20
 

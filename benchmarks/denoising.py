@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.photographs import photograph
-from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.operator.features import reduce_channels
 
 HELD_OUT = {"camera": (60, 190), "coffee": (150, 220), "chelsea": (70, 130)}  # row and column of a part to look at
 PART = 160  # pixels of it

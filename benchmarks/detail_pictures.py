@@ -26,8 +26,8 @@ from skimage.filters import unsharp_mask
 from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator, polynomial_filter
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.pictures import save_figure, show_images
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.plotting import save_figure, show_images
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 RADIUS = 2.0

@@ -7,7 +7,7 @@ from pathlib import Path
 import skimage.data
 import torch
 
-from nlfilter_torch.files import Photograph, write_photograph
+from nlfilter_torch.io.photographs import Photograph, write_photograph
 from tests.browser import Editor, Tab, chromium
 
 

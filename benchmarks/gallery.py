@@ -14,8 +14,8 @@ from benchmarks.figures.colours import BLUE, TRUE, reached
 from benchmarks.figures.focus import PORTRAIT, WIDE, default_map
 from benchmarks.figures.scenes import luminance, marked, painted_over, scene, spots, strokes
 from nlfilter_torch import abstract, colorize, defocus, enhance, recolor
-from nlfilter_torch.edits.enhance import colour_masks
-from nlfilter_torch.pictures import save_figure, show_images
+from nlfilter_torch.edits.detail import colour_masks
+from nlfilter_torch.plotting import save_figure, show_images
 
 SIDE = 270  # of a panel
 SIZE = 640  # of a photograph

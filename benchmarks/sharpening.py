@@ -25,7 +25,7 @@ from torch import Tensor
 from benchmarks import unsharp
 from benchmarks.photographs import photograph
 from nlfilter_torch import detail_layers, nonlocal_operator, polynomial_filter, sharpen
-from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.operator.features import reduce_channels
 
 PICTURES = ("astronaut", "camera", "chelsea", "coffee")
 NOISES = (0, 10, 20)  # grey levels

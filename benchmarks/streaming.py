@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from benchmarks.memory import MIB, forget_peak, resident
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.cli.options import working_bytes
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.streaming import stream_detail
-from nlfilter_torch.streaming.detail import detail_rows
-from nlfilter_torch.streaming.files import open_picture, write_picture
-from nlfilter_torch.streaming.tiles import SAMPLE, Passes, Statistics
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.io.rows import open_picture, write_picture
+from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.detail import detail_rows
+from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 PIECE = 256  # side of a piece of the mosaic

@@ -24,11 +24,11 @@ from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
 from nlfilter_torch.edits.chroma import split_luminance
 from nlfilter_torch.edits.recolor import colour_guide
-from nlfilter_torch.streaming import stream_colorize, stream_recolor
-from nlfilter_torch.streaming.colorize import colorize_rows
-from nlfilter_torch.streaming.files import open_picture, write_picture
-from nlfilter_torch.streaming.recolor import recolor_rows
-from nlfilter_torch.streaming.tiles import Passes
+from nlfilter_torch.io.rows import open_picture, write_picture
+from nlfilter_torch.tiled import stream_colorize, stream_recolor
+from nlfilter_torch.tiled.colorize import colorize_rows
+from nlfilter_torch.tiled.recolor import recolor_rows
+from nlfilter_torch.tiled.tiles import Passes
 
 VERBS = {"recolor": recolor_rows, "colorize": colorize_rows}
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB

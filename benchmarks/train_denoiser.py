@@ -45,8 +45,8 @@ from benchmarks.denoising import (
 )
 from benchmarks.photographs import photograph
 from nlfilter_torch import NonlocalFilter, denoise
-from nlfilter_torch.files import open_beside
-from nlfilter_torch.pictures import save_figure, show_images
+from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.plotting import save_figure, show_images
 
 SCENES = ("astronaut", "motorcycle", "rocket")
 TEXTURES = ("coins", "moon", "brick", "grass", "gravel", "immunohistochemistry", "retina", "hubble_deep_field")

@@ -27,6 +27,6 @@ python_use_unqualified_type_names = True
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|numpy|matplotlib)\..*"),
-    ("py:mod", r"nlfilter_torch\.\w+"),
-    ("py:class", r"nlfilter_torch\.[a-z_]+\.\w+"),
+    ("py:mod", r"nlfilter_torch(\.\w+)+"),
+    ("py:class", r"nlfilter_torch(\.[a-z_]+)+\.\w+"),
 ]

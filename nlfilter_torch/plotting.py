@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch.files import open_beside
-from nlfilter_torch.response import polynomial_response
-from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.filtering.response import polynomial_response
+from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.operator.spectrum import Spectrum
 
 DPI = 100
 SIDE = 512  # pixels along the longer side of a picture

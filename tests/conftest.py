@@ -33,7 +33,7 @@ def session(tmp_path: Path) -> "Session":
     """The editor's, with a small photograph open: cat.png, in the folder that it saves in."""
     # Not above: tests of the filter run where nothing that reads files is installed.
     from nlfilter_torch.app.session import Session
-    from nlfilter_torch.files import Photograph, write_photograph
+    from nlfilter_torch.io.photographs import Photograph, write_photograph
     from tests.problems import cat
 
     write_photograph(Photograph(cat()), tmp_path / "cat.png")

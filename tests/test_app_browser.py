@@ -15,8 +15,8 @@ from PIL import Image
 from playwright.sync_api import Browser, expect
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from tests.browser import CHROMIUM, Editor, Tab, chromium
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium")

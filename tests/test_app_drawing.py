@@ -8,9 +8,9 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.app import controls, drawing
-from nlfilter_torch.brush import Stroke
-from nlfilter_torch.recipe import STEPS, Recipe
-from nlfilter_torch.steps import Detail
+from nlfilter_torch.edits.recipe import STEPS, Recipe
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import Detail
 from tests.problems import cat
 
 

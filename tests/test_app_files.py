@@ -9,12 +9,12 @@ import psutil
 import pytest
 from PIL import Image
 
-import nlfilter_torch.files
+import nlfilter_torch.io.photographs
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.cli import main
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import LINE, cat, difference
 
 
@@ -138,7 +138,7 @@ def test_an_interrupted_save_leaves_the_old_file(session: Session, monkeypatch: 
         stream.write(before[:100])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(nlfilter_torch.files.Image.Image, "save", break_off)
+    monkeypatch.setattr(nlfilter_torch.io.photographs.Image.Image, "save", break_off)
     with pytest.raises(OSError, match="no space left"):
         session.save("out.png")
     assert target.read_bytes() == before

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from nlfilter_torch import diffusion_mask, estimate_bandwidth, nonlocal_operator, polynomial_filter
 from nlfilter_torch.app.preview import MaskMaker, Preview, reduce, sampled_operator, stride_for
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.brush import Stroke
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, FilterStep, Recolor
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import Abstract, Colorize, Defocus, Detail, FilterStep, Recolor
+from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import cat, difference
 
 

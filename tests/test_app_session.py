@@ -8,9 +8,9 @@ import skimage.data
 from PIL import Image
 
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.brush import Stroke
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Detail, Recolor
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import Detail, Recolor
 from tests.problems import LINE
 
 

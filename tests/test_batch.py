@@ -16,11 +16,10 @@ import skimage.data
 import torch.distributed as dist
 from PIL import Image
 
-from nlfilter_torch import folders
-from nlfilter_torch.cli import main
-from nlfilter_torch.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
-from nlfilter_torch.presets import PRESETS
-from nlfilter_torch.ranks import Ranks, connected_ranks
+from nlfilter_torch.cli import folders, main
+from nlfilter_torch.cli.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
+from nlfilter_torch.core.ranks import Ranks, connected_ranks
+from nlfilter_torch.edits.presets import PRESETS
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
 ROOT = Path(__file__).parents[1]
@@ -264,7 +263,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         tally.done, tally.left = 1, 1
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlfilter_torch.folders.edit_folder", interrupt)
+    monkeypatch.setattr("nlfilter_torch.cli.folders.edit_folder", interrupt)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 130
     captured = capsys.readouterr()
     told = "nlfilter-torch: the same command does the rest\nnlfilter-torch: interrupted; no file is half written\n"
@@ -276,7 +275,9 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     """A preset and options reach the edit and the record; cores are shared among workers and local ranks."""
     fill(tmp_path / "in", 9)
     seen = {}
-    monkeypatch.setattr("nlfilter_torch.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args))
+    monkeypatch.setattr(
+        "nlfilter_torch.cli.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args)
+    )
     monkeypatch.setattr("nlfilter_torch.cli.batch._cores", lambda: 12)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     arguments = ["batch", str(tmp_path / "in"), str(tmp_path / "out"), "--preset", "smooth", "--seed", "5"]

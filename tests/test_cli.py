@@ -17,8 +17,8 @@ from PIL import ExifTags, Image, ImageCms
 import nlfilter_torch
 from nlfilter_torch import NonlocalFilter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.cli import main
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.files import Depth, Photograph, read_photograph, write_photograph
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.io.photographs import Depth, Photograph, read_photograph, write_photograph
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 

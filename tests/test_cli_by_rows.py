@@ -19,8 +19,8 @@ import zarr
 from PIL import Image
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.streaming.tiff_rows import TiffRows
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.io.tiff_rows import TiffRows
 from tests.test_streaming_files import PROFILE, Array, cat
 
 LITTLE = "0.03"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
@@ -29,8 +29,8 @@ LITTLE = "0.03"  # gigabytes: less than the picture takes whole, more than it ta
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples and blocks in proportion to small pictures."""
-    monkeypatch.setattr("nlfilter_torch.streaming.sampling.PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 8000)
+    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
 
 
 @pytest.fixture
@@ -231,7 +231,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "import signal, sys, time\n"
         # A shell's background jobs, which these tests may be one of, ignore this signal, and so would their children.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from nlfilter_torch.streaming import detail, rows, tiles\n"
+        "from nlfilter_torch.tiled import detail, sources as rows, tiles\n"
         "def slow(original):\n"
         "    def edit(*arguments):\n"
         "        time.sleep(0.05)\n"

@@ -9,8 +9,8 @@ from PIL import Image
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.cli.painting import Rectangle
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.cli.scribbles import Rectangle
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 
 HEIGHT, WIDTH = 48, 64
 LANDMARKS = ("--landmarks", "40")

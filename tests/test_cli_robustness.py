@@ -15,10 +15,10 @@ import tifffile
 import torch
 
 import nlfilter_torch
-from nlfilter_torch import files
 from nlfilter_torch.cli import main
-from nlfilter_torch.files import Photograph, open_beside, read_photograph, write_photograph
-from nlfilter_torch.presets import shown
+from nlfilter_torch.edits.presets import shown
+from nlfilter_torch.io import photographs as files
+from nlfilter_torch.io.photographs import Photograph, open_beside, read_photograph, write_photograph
 
 LONG = "9" * 400
 HEAVY = ("torch", "kornia", "skimage", "numpy", "PIL")
@@ -126,7 +126,7 @@ def test_memory_of_large_patches_is_asked_for(
         asked.append(bytes_per_pixel)
         raise ValueError("enough")
 
-    monkeypatch.setattr("nlfilter_torch.cli.by_rows.read_photograph", read)
+    monkeypatch.setattr("nlfilter_torch.cli.tiled.read_photograph", read)
     refused(capsys, "apply", photo, tmp_path / "out.png", "--preset", preset)
     assert asked[0] > 4 * 2 * 99**2
 

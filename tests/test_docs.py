@@ -16,7 +16,7 @@ from PIL import Image
 import nlfilter_torch
 from benchmarks import accuracy, guide_pictures
 from nlfilter_torch.cli import main
-from nlfilter_torch.presets import PRESETS, PURPOSES
+from nlfilter_torch.edits.presets import PRESETS, PURPOSES
 from tests.pages import DOCS, ROOT, Page
 
 PAGES = {page.path.stem: page for page in DOCS}

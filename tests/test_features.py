@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlfilter_torch import estimate_bandwidth
-from nlfilter_torch.features import extract_features, pad_border, patch_window, reduce_channels
+from nlfilter_torch.operator.features import extract_features, pad_border, patch_window, reduce_channels
 from tests import reference
 from tests.images import photograph
 

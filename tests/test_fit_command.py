@@ -8,8 +8,8 @@ import skimage.data
 import torch
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.presets import Preset
+from nlfilter_torch.edits.presets import Preset
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 
 ALPHA = (2.2, 1.6, 1.3, 1.02)
 

@@ -9,9 +9,9 @@ import torch
 
 from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.cli import main
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import build, noise, picture
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05], dtype=torch.float64)

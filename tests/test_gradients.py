@@ -18,10 +18,10 @@ from nlfilter_torch import (
     polynomial_response,
     spectral_filter,
 )
-from nlfilter_torch.differentiation import OuterProduct
-from nlfilter_torch.features import patch_window
-from nlfilter_torch.matrix_function import SymmetricMatrix
-from nlfilter_torch.strokes import propagate_strokes
+from nlfilter_torch.core.autograd import OuterProduct
+from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.filtering.scribbles import propagate_strokes
+from nlfilter_torch.operator.features import patch_window
 from tests.images import hard_images
 from tests.plain_autograd import plain_filter
 from tests.problems import noise, picture, seeded

@@ -5,8 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch import landmarks
-from nlfilter_torch.landmarks import (
+from nlfilter_torch.operator import landmarks
+from nlfilter_torch.operator.landmarks import (
     _pivots,
     _sums_by_product,
     _sums_in_order,
@@ -14,7 +14,7 @@ from nlfilter_torch.landmarks import (
     choose_landmarks,
     condense,
 )
-from nlfilter_torch.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
 from tests.images import hard_images, photograph
 
 HEIGHT, WIDTH = 20, 30

@@ -283,7 +283,7 @@ def test_masks_are_worked_out_block_by_block(monkeypatch: pytest.MonkeyPatch) ->
         return mask, torch.autograd.grad((mask * weights[:, :2]).sum(), guide)[0]
 
     whole = mask_and_slope()
-    monkeypatch.setattr("nlfilter_torch.masks.CACHED", 1)  # of 256 pixels
+    monkeypatch.setattr("nlfilter_torch.filtering.masks.CACHED", 1)  # of 256 pixels
     for found, wanted in zip(mask_and_slope(), whole, strict=True):
         torch.testing.assert_close(found, wanted, atol=1e-10, rtol=1e-8)
 

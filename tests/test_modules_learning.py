@@ -18,7 +18,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     polynomial_filter,
 )
-from nlfilter_torch.features import patch_window
+from nlfilter_torch.operator.features import patch_window
 from tests.layers import ALPHA, EVERYTHING, OPTIONS, backward, everything, image, untouched
 from tests.problems import noise
 

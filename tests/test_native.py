@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from hatch_build import FOLDER, CompiledKernels
-from nlfilter_torch import landmarks, native, newton, nonlocal_operator, nystrom
-from nlfilter_torch.differentiation import OuterProduct
-from nlfilter_torch.nystrom import nystrom_factor, whitener
-from nlfilter_torch.sinkhorn import _weighted_moment
-from nlfilter_torch.spectrum import sum_grams
-from nlfilter_torch.thin import moment, spread
+from nlfilter_torch import nonlocal_operator
+from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.autograd import OuterProduct
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.operator import landmarks, newton, nystrom
+from nlfilter_torch.operator.newton import weighted_moment
+from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator.spectrum import sum_grams
 from tests import reference
 
 LEVELS = [pytest.param(level, id=name) for level, name in enumerate(native.LEVELS) if 0 < level <= native.level]
@@ -217,8 +219,8 @@ def test_weighted_moments(level: int, pixels: int, marks: int, monkeypatch: pyte
     arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), None, random(2, marks, 1).double()
     factor, weights, total = (t.double() for t in arguments if t is not None)
     exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
-    found = _weighted_moment(*arguments)
-    plain = by_torch(monkeypatch, _weighted_moment, *arguments)
+    found = weighted_moment(*arguments)
+    plain = by_torch(monkeypatch, weighted_moment, *arguments)
     error, usual = (found - exact).abs().max(), (plain - exact).abs().max()
     assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
 
@@ -346,7 +348,7 @@ def test_installing_compiles(tmp_path: Path) -> None:
     build_data, shown = install(tmp_path)
     assert not shown
     assert (tmp_path / FOLDER / "kernels.so").stat().st_size > 10_000
-    assert build_data["artifacts"] == ["nlfilter_torch/native/kernels.so"]
+    assert build_data["artifacts"] == ["nlfilter_torch/core/kernels/kernels.so"]
     assert build_data["tag"].startswith("py3-none-")
     assert not build_data["pure_python"]
 

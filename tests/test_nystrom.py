@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
 from tests import reference
 
 

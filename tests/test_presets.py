@@ -7,8 +7,8 @@ import skimage.data
 import torch
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.presets import PRESETS, PURPOSES, Preset, find_preset
+from nlfilter_torch.edits.presets import PRESETS, PURPOSES, Preset, find_preset
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import NonlocalOperator, detail_layers, fit_filter, nonlocal_operator, polynomial_filter
-from nlfilter_torch.newton import LARGEST, PixelScaling, Solution, damped, scaling_from_moment
-from nlfilter_torch.sinkhorn import balance
-from nlfilter_torch.streaming import stream_detail
+from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.operator.newton import LARGEST, PixelScaling, Solution, damped, scaling_from_moment
+from nlfilter_torch.tiled import stream_detail
 from tests import reference
 from tests.problems import noise, picture, seeded
 

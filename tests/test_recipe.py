@@ -9,17 +9,17 @@ import skimage.data
 import torch
 
 from nlfilter_torch import abstract, colorize, defocus, enhance, recolor
-from nlfilter_torch.brush import Stroke, cover, mask_of, paint, thin
 from nlfilter_torch.cli import main
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.edits.enhance import colour_masks
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.presets import PRESETS
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, Recolor
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.detail import colour_masks
+from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
+from nlfilter_torch.edits.steps import Abstract, Colorize, Defocus, Detail, Recolor
+from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import nonlocal_operator
 
 SIZE = (48, 64)
 LINE = ((0.25, 0.25), (0.5, 0.25))

@@ -7,8 +7,8 @@ from skimage.measure import label
 
 from nlfilter_torch import nonlocal_operator, recolor
 from nlfilter_torch.edits.chroma import group_colours, region_means, split_luminance
+from nlfilter_torch.edits.components import MAX_SPOTS, Pixels, find_spots, label_spots, unit_vectors
 from nlfilter_torch.edits.recolor import colour_guide
-from nlfilter_torch.edits.spots import MAX_SPOTS, Pixels, find_spots, label_spots, unit_vectors
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
 
 
@@ -141,7 +141,7 @@ def test_spots_beyond_the_last_that_is_kept_apart_are_taken_together() -> None:
 
 
 def test_spots_are_what_is_connected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.edits.spots.MAX_SPOTS", 10**9)
+    monkeypatch.setattr("nlfilter_torch.edits.components.MAX_SPOTS", 10**9)
     for number, size in enumerate([(1, 1), (1, 9), (9, 1), (7, 8), (40, 31)]):
         for density in (0.1, 0.3, 0.5, 0.8, 1.0):
             planes = torch.rand(3, *size, generator=torch.Generator().manual_seed(number)) < density
@@ -158,7 +158,7 @@ def test_spots_are_what_is_connected(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_products_along_directions_are_those_of_unit_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Block by block, gradients too."""
-    monkeypatch.setattr("nlfilter_torch.edits.spots.CACHED", 1)  # blocks of 256 pixels
+    monkeypatch.setattr("nlfilter_torch.edits.components.CACHED", 1)  # blocks of 256 pixels
     basis, factor, directions = (noise(*shape).requires_grad_() for shape in ((5, 5), (5, 700), (3, 5)))
     found = Pixels.of(basis, factor).along(directions)
     wanted = directions @ unit_vectors(basis, factor)

@@ -31,7 +31,7 @@ from nlfilter_torch import (
     propagate_strokes,
     segment_mask,
 )
-from nlfilter_torch.sharding import Shard, meet, with_halo
+from nlfilter_torch.core.communicator import Shard, meet, with_halo
 from tests.problems import noise, picture, seeded
 
 pytestmark = [

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlfilter_torch import estimate_bandwidth, nonlocal_operator
-from nlfilter_torch.sinkhorn import balance
+from nlfilter_torch.operator.balancing import balance
 from tests import reference
 from tests.images import reduced
 

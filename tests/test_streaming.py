@@ -10,19 +10,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch import landmarks as landmarks_module
 from nlfilter_torch import nonlocal_operator, polynomial_filter
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.edits.enhance import colour_masks
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.landmarks import candidate_pixels
-from nlfilter_torch.masks import filter_regions
-from nlfilter_torch.streaming import sampling, stream_detail
-from nlfilter_torch.streaming.detail import rows_in_memory
-from nlfilter_torch.streaming.influence import draw, sample_by_influence
-from nlfilter_torch.streaming.rows import Picture
-from nlfilter_torch.streaming.statistics import balance_by_passes
-from nlfilter_torch.streaming.tiles import Passes
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.detail import colour_masks
+from nlfilter_torch.filtering.masks import filter_regions
+from nlfilter_torch.operator import landmarks as landmarks_module
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.landmarks import candidate_pixels
+from nlfilter_torch.tiled import sampling, stream_detail
+from nlfilter_torch.tiled.detail import rows_in_memory
+from nlfilter_torch.tiled.leverage import draw, sample_by_influence
+from nlfilter_torch.tiled.sources import Picture
+from nlfilter_torch.tiled.statistics import balance_by_passes
+from nlfilter_torch.tiled.tiles import Passes
 
 Array = NDArray[Any]
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
@@ -72,7 +72,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 1500)
-    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -228,7 +228,7 @@ def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
 
 
 def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 600)
+    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
     stream_detail(source, edited, ALPHA, tile_rows=10, sample=2000, num_landmarks=30)
@@ -307,7 +307,7 @@ def test_more_landmarks_than_pixels_are_reduced() -> None:
 
 
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.streaming.statistics.MAX_PASSES", 1)
+    monkeypatch.setattr("nlfilter_torch.tiled.statistics.MAX_PASSES", 1)
     picture = Picture(cat(30, 40))
 
     def image(colours: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlfilter_torch import Spectrum, nonlocal_operator, propagate_strokes
-from nlfilter_torch.strokes import NOISE, SPOT
+from nlfilter_torch.filtering.scribbles import NOISE, SPOT
 from tests.images import two_colours
 from tests.problems import build, guides, noise, options, picture, seeded
 

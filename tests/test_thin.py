@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import SWEPT
-from nlfilter_torch.thin import gather, moment, spread
+from nlfilter_torch.core.blocks import SWEPT
+from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
 
 
 def random(*shape: int) -> Tensor:

@@ -10,13 +10,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.brush import Stroke, cover, mask_of, paint
 from nlfilter_torch.cli import main
-from nlfilter_torch.files import Photograph, read_photograph, write_photograph
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Abstract, Colorize, Defocus, Detail, Recolor
-from nlfilter_torch.streaming import stream_detail, whole_edit
-from nlfilter_torch.streaming.tiles import Passes
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint
+from nlfilter_torch.edits.steps import Abstract, Colorize, Defocus, Detail, Recolor
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.tiled import recipe as whole_edit
+from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import cat, difference
 
 LINE = ((0.25, 0.25), (0.5, 0.3))
@@ -78,8 +79,8 @@ def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
 
 
 def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.streaming.sampling.PILOT", 4000)
-    monkeypatch.setattr("nlfilter_torch.streaming.rows.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 4000)
+    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
     photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
     write_photograph(Photograph(cat(), "uint16"), photo)
     preset.write_text(Recipe(DETAIL, recolor=RECOLOR).to_json())

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from benchmarks.figures import FIGURES, SIZE
-from nlfilter_torch.files import open_beside
-from nlfilter_torch.pictures import save_figure
+from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.plotting import save_figure
 
 QUICK = 72  # pixels
 

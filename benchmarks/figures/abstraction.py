@@ -7,7 +7,7 @@ from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, s
 from nlfilter_torch import abstract
 from nlfilter_torch.edits.abstract import edge_lines, quantize
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
-from nlfilter_torch.pictures import show_images
+from nlfilter_torch.plotting import show_images
 
 TONES, LINES = 8, 0.8
 PART = (95, 10, 170)  # left, top, side

@@ -9,7 +9,7 @@ from torch import Tensor
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
 from nlfilter_torch import defocus, nonlocal_operator
 from nlfilter_torch.edits.defocus import LOCALITY, RADIUS, blur_by, focus_map
-from nlfilter_torch.pictures import show_images
+from nlfilter_torch.plotting import show_images
 
 PORTRAIT: tuple[Box, ...] = (
     (190, 70, 70, 90),

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.photographs import photograph
-from nlfilter_torch.features import reduce_channels
+from nlfilter_torch.operator.features import reduce_channels
 
 SIZE = 640  # of the longer side of a photograph, in pixels
 SIDE = 384  # of a panel

@@ -14,7 +14,8 @@ from torch import Tensor
 import nlfilter_torch
 from benchmarks.fuzz.cases import Case
 from benchmarks.fuzz.truth import DENSE, Exact
-from nlfilter_torch import NonlocalOperator, detail_layers, native, nonlocal_operator, polynomial_filter
+from nlfilter_torch import NonlocalOperator, detail_layers, nonlocal_operator, polynomial_filter
+from nlfilter_torch.core import kernels as native
 
 FINITE = "non-finite values"
 RESIDUAL = "false residuals"

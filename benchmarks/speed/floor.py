@@ -9,9 +9,9 @@ floor is not slow by a clumsy choice:
   results never leave the cache;
 - a read as ``factor.sum()``, as ``factor @ vector`` and as ``vector @ factor``.
 
-The kernels in C (:mod:`nlfilter_torch.native`) know that the whitening is a triangle and form half of its product, so
-that the operator may be quicker than this. The exponential, the features, the landmarks, the writing of the factor and
-the memory for it are not in the floor.
+The kernels in C (:mod:`nlfilter_torch.core.kernels`) know that the whitening is a triangle and form half of its
+product, so that the operator may be quicker than this. The exponential, the features, the landmarks, the writing of
+the factor and the memory for it are not in the floor.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from benchmarks.speed.cases import Case
 from benchmarks.speed.timing import Call, Timing, try_once
 
 READS = 10
-BLOCKS = (4080, 16368)  # an odd number of cache lines, see nlfilter_torch.blocks
+BLOCKS = (4080, 16368)  # an odd number of cache lines, see nlfilter_torch.core.blocks
 
 
 PARTS = ("affinity", "whitening", "gram", "read")

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from nlfilter_torch import native
+from nlfilter_torch.core import kernels as native
 
 LIBRARIES = ("torch", "kornia", "numpy", "scikit-image", "scipy", "opencv-python-headless")
 

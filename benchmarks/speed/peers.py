@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from benchmarks.speed.cases import Case, colour
 from benchmarks.speed.timing import Call, discard
 from nlfilter_torch import estimate_bandwidth
-from nlfilter_torch.features import extract_features, patch_window
+from nlfilter_torch.operator.features import extract_features, patch_window
 
 PACKAGE = "nlfilter-torch"
 

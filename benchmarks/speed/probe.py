@@ -14,8 +14,8 @@ from torch import Tensor
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.speed.cases import Case
 from nlfilter_torch import NonlocalFilter
-from nlfilter_torch.nystrom import whitener
-from nlfilter_torch.sinkhorn import balance
+from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.operator.nystrom import whitener
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 

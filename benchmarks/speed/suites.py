@@ -16,10 +16,10 @@ from nlfilter_torch import (
     PolynomialSliders,
     detail_layers,
     estimate_bandwidth,
-    native,
     polynomial_filter,
     spectral_filter,
 )
+from nlfilter_torch.core import kernels as native
 
 COMPARED = 1 << 27  # bytes of the largest factor that is made in float64, too; the main case always is
 

@@ -7,7 +7,7 @@ from nicegui import ui
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.panel import BRUSHES, Brush
 from nlfilter_torch.app.session import Opened, Session
-from nlfilter_torch.brush import Stroke
+from nlfilter_torch.edits.scribbles import Stroke
 
 
 class Easel:

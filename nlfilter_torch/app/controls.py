@@ -6,7 +6,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.edits.recipe import Recipe
 
 Change = Callable[[str, dict[str, Any], bool], None]  # step, entries, whether the change is complete
 

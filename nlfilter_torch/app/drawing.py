@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from nlfilter_torch.brush import Stroke
-from nlfilter_torch.response import polynomial_response
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.filtering.response import polynomial_response
 
 QUALITY = 95
 TINT, OPACITY = (255, 40, 80), 120  # of the mask

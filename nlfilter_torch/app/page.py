@@ -10,11 +10,11 @@ from typing import Any
 from nicegui import events, ui
 
 from nlfilter_torch.app import drawing
-from nlfilter_torch.app.easel import Easel
+from nlfilter_torch.app.canvas import Easel
 from nlfilter_torch.app.panel import Brush, Panel
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
-from nlfilter_torch.recipe import Recipe
+from nlfilter_torch.edits.recipe import Recipe
 
 EXPECTED = (ValueError, OSError, MemoryError)  # of a file or a value that cannot be used; their text says why
 PATIENCE = 0.3  # seconds until the page says that it is at work

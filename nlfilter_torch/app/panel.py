@@ -8,9 +8,9 @@ from nicegui import ui
 
 from nlfilter_torch.app import controls
 from nlfilter_torch.app.controls import Control, Slider
-from nlfilter_torch.presets import PRESETS, PURPOSES
-from nlfilter_torch.recipe import STEPS, Recipe
-from nlfilter_torch.steps import Detail
+from nlfilter_torch.edits.presets import PRESETS, PURPOSES
+from nlfilter_torch.edits.recipe import STEPS, Recipe
+from nlfilter_torch.edits.steps import Detail
 
 COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
 INTRO = {

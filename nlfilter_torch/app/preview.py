@@ -16,23 +16,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.bandwidth import estimate_bandwidth
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.eigenvalue_bound import is_bounded
-from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, unit_window
-from nlfilter_torch.filtering import detail_layers
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.landmarks import choose_landmarks
-from nlfilter_torch.nystrom import whitener
-from nlfilter_torch.operator import NonlocalOperator, assemble, nonlocal_operator
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.steps import Detail, FilterStep
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Detail, FilterStep
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.operator.bandwidth import estimate_bandwidth
+from nlfilter_torch.operator.eigenvalue_bound import is_bounded
+from nlfilter_torch.operator.features import GuideChannels, pad_border, reduce_channels, unit_window
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.landmarks import choose_landmarks
+from nlfilter_torch.operator.nystrom import whitener
+from nlfilter_torch.operator.operator import NonlocalOperator, assemble, nonlocal_operator
+from nlfilter_torch.operator.spectrum import Spectrum
 
 Key = tuple[object, ...]  # the settings that something was worked out from
 
 PIXELS = 1_000_000  # of a preview, at most
-MASK_BANDWIDTH = 25 / 255  # of the masks of nlfilter_torch.edits.enhance
+MASK_BANDWIDTH = 25 / 255  # of the masks of nlfilter_torch.edits.detail
 
 
 def stride_for(height: int, width: int, pixels: int = PIXELS) -> int:

@@ -8,9 +8,10 @@ from typing import Any
 from torch import Tensor
 
 from nlfilter_torch.app.preview import PIXELS, Preview
-from nlfilter_torch.brush import Stroke, thin
 from nlfilter_torch.cli.options import working_bytes
-from nlfilter_torch.files import (
+from nlfilter_torch.edits.recipe import STEPS, Recipe
+from nlfilter_torch.edits.scribbles import Stroke, thin
+from nlfilter_torch.io.photographs import (
     BITS,
     DEPTHS,
     SUFFIXES,
@@ -21,7 +22,6 @@ from nlfilter_torch.files import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.recipe import STEPS, Recipe
 
 SPACING = 0.2  # of the points that a stroke keeps, as a share of its radius
 UNDOS = 100

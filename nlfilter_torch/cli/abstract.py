@@ -45,7 +45,7 @@ def abstract(
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.edits.abstract import abstract as edit
-    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.io.photographs import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)

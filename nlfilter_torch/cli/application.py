@@ -27,7 +27,7 @@ from nlfilter_torch.cli.presets import presets
 from nlfilter_torch.cli.recolor import recolor
 from nlfilter_torch.cli.sharpen import sharpen
 from nlfilter_torch.cli.tone import tone
-from nlfilter_torch.instruction_sets import NAMES, level, load_library
+from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 
 NAME = "nlfilter-torch"
 

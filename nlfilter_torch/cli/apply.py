@@ -35,11 +35,11 @@ def apply(
     from torch import Tensor
 
     from nlfilter_torch.cli import editing
-    from nlfilter_torch.cli.by_rows import Job
-    from nlfilter_torch.files import Photograph
-    from nlfilter_torch.recipe import Recipe
-    from nlfilter_torch.streaming.rows import Rows
-    from nlfilter_torch.streaming.whole_edit import edit_rows
+    from nlfilter_torch.cli.tiled import Job
+    from nlfilter_torch.edits.recipe import Recipe
+    from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.tiled.recipe import edit_rows
+    from nlfilter_torch.tiled.sources import Rows
 
     recipe = Recipe.find(preset)
 

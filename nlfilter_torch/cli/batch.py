@@ -12,7 +12,7 @@ from nlfilter_torch.cli.detail import PresetName, detail
 from nlfilter_torch.cli.interrupts import INTERRUPTED
 
 if TYPE_CHECKING:
-    from nlfilter_torch.folders import Tally
+    from nlfilter_torch.cli.folders import Tally
 
 Folder = Annotated[Path, typer.Argument(metavar="IN_DIR", help="The folder that holds the photographs.")]
 Target = Annotated[
@@ -61,11 +61,11 @@ def batch(
     options.parse_alpha(alpha)
     options.parse_bandwidth(bandwidth)
 
-    from nlfilter_torch.checks import check_patch_size
-    from nlfilter_torch.cli.by_rows import allowed_memory
+    from nlfilter_torch.cli.folders import Tally, edit_folder, pictures, prepare
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.folders import Tally, edit_folder, pictures, prepare
-    from nlfilter_torch.ranks import connected_ranks
+    from nlfilter_torch.cli.tiled import allowed_memory
+    from nlfilter_torch.core.checks import check_patch_size
+    from nlfilter_torch.core.ranks import connected_ranks
 
     check_patch_size(patch_size)
     allowed_memory(memory)

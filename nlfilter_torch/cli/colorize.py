@@ -58,13 +58,15 @@ def colorize(
     """
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, painted_rows, painting
-    from nlfilter_torch.cli.by_rows import Job
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli import scribble_rows as painted_rows
+    from nlfilter_torch.cli import scribbles as painting
+    from nlfilter_torch.cli.tiled import Job
     from nlfilter_torch.edits.colorize import colorize as edit
-    from nlfilter_torch.features import reduce_channels
-    from nlfilter_torch.files import Photograph
-    from nlfilter_torch.streaming.colorize import colorize_rows
-    from nlfilter_torch.streaming.rows import Rows
+    from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.operator.features import reduce_channels
+    from nlfilter_torch.tiled.colorize import colorize_rows
+    from nlfilter_torch.tiled.sources import Rows
 
     def work(photograph: Photograph) -> Tensor:
         painted, mask = painting.colour_strokes(photograph, strokes, region)

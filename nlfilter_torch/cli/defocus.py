@@ -43,9 +43,10 @@ def defocus(
     """
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, painting
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli import scribbles as painting
     from nlfilter_torch.edits.defocus import defocus as edit
-    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.io.photographs import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         focus = painting.selection(photograph, mask, region, option="--region")

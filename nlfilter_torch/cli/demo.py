@@ -30,13 +30,13 @@ def demo(
 
     from nlfilter_torch.cli.inspect import print_table, summarize
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.colour import edit_luminance
-    from nlfilter_torch.features import reduce_channels
-    from nlfilter_torch.files import check_folder
-    from nlfilter_torch.filtering import detail_layers, polynomial_filter
-    from nlfilter_torch.masks import diffusion_mask
-    from nlfilter_torch.operator import nonlocal_operator
-    from nlfilter_torch.pictures import (
+    from nlfilter_torch.edits.colour import edit_luminance
+    from nlfilter_torch.filtering.filters import detail_layers, polynomial_filter
+    from nlfilter_torch.filtering.masks import diffusion_mask
+    from nlfilter_torch.io.photographs import check_folder
+    from nlfilter_torch.operator.features import reduce_channels
+    from nlfilter_torch.operator.operator import nonlocal_operator
+    from nlfilter_torch.plotting import (
         plot_response,
         save_figure,
         show_eigenvectors,

@@ -37,7 +37,7 @@ def denoise(
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.edits.denoise import denoise as edit
-    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.io.photographs import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         level = None if noise_level is None else noise_level / options.LEVELS

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.presets import PRESETS, find_preset
+from nlfilter_torch.edits.presets import PRESETS, find_preset
 
 
 def use_preset(context: typer.Context, name: str | None) -> str | None:
@@ -84,17 +84,19 @@ def detail(
     import torch
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, painted_rows, painting
-    from nlfilter_torch.cli.by_rows import Job, allowed_memory, edit_by_rows, read_if_it_fits
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli import scribble_rows as painted_rows
+    from nlfilter_torch.cli import scribbles as painting
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.colour import edit_luminance
-    from nlfilter_torch.edits.enhance import colour_masks
-    from nlfilter_torch.features import reduce_channels
-    from nlfilter_torch.files import check_output, write_photograph
-    from nlfilter_torch.filtering import polynomial_filter
-    from nlfilter_torch.masks import filter_regions
-    from nlfilter_torch.streaming.detail import detail_rows
-    from nlfilter_torch.streaming.rows import Rows
+    from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
+    from nlfilter_torch.edits.colour import edit_luminance
+    from nlfilter_torch.edits.detail import colour_masks
+    from nlfilter_torch.filtering.filters import polynomial_filter
+    from nlfilter_torch.filtering.masks import filter_regions
+    from nlfilter_torch.io.photographs import check_output, write_photograph
+    from nlfilter_torch.operator.features import reduce_channels
+    from nlfilter_torch.tiled.detail import detail_rows
+    from nlfilter_torch.tiled.sources import Rows
 
     sliders = torch.tensor(numbers)
     # A mask is worked out before the filter, from coordinates as large as a factor beside its own factor.

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.by_rows import Job, allowed_memory, edit_by_rows, read_if_it_fits
 from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.files import Photograph, check_output, read_photograph, write_photograph
-from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
-from nlfilter_torch.streaming.rows import Rows
+from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
+from nlfilter_torch.io.photographs import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.operator.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.tiled.sources import Rows
 
 
 def edit_file(

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.presets import Preset
+from nlfilter_torch.edits.presets import Preset
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.io.photographs import Photograph
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit.")]
 After = Annotated[str, typer.Argument(metavar="AFTER", help="The same photograph after it, of the same size.")]
@@ -45,11 +45,11 @@ def fit(
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.colour import edit_luminance
-    from nlfilter_torch.features import reduce_channels
-    from nlfilter_torch.files import check_file, open_beside, read_photograph
-    from nlfilter_torch.filtering import polynomial_filter
-    from nlfilter_torch.fitting import fit_alpha
+    from nlfilter_torch.edits.colour import edit_luminance
+    from nlfilter_torch.filtering.filters import polynomial_filter
+    from nlfilter_torch.filtering.fit import fit_alpha
+    from nlfilter_torch.io.photographs import check_file, open_beside, read_photograph
+    from nlfilter_torch.operator.features import reduce_channels
 
     check_file(preset)
     with steps(3) as begin:
@@ -102,7 +102,7 @@ def fit(
 
 def step_of(photograph: "Photograph") -> float:
     """Distance of two values that the file can tell apart."""
-    from nlfilter_torch.files import WHITE
+    from nlfilter_torch.io.photographs import WHITE
 
     return 1 / WHITE[photograph.depth] if photograph.depth in WHITE else 0.0
 

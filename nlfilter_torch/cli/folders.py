@@ -1,7 +1,8 @@
 """A folder of photographs edited by worker processes, on one machine or, by their ranks, on several.
 
 Needs the ``cli`` extra. A file is done when the folder for the output holds its name: names appear only with the whole
-file behind them (:func:`nlfilter_torch.files.open_beside`), so an interrupted run is taken up by starting it again.
+file behind them (:func:`~nlfilter_torch.io.photographs.open_beside`), so an interrupted run is taken up by starting it
+again.
 """
 
 import contextlib
@@ -21,7 +22,7 @@ from queue import LifoQueue
 
 import torch
 
-from nlfilter_torch.files import SUFFIXES, check_folder, open_beside, remove_stale
+from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, remove_stale
 
 RECORD = ".nlfilter-batch.json"  # in the folder for the output: the settings of what is in it
 DEATHS = 3  # deaths for each worker, without a file done in between, after which it is not the files' fault

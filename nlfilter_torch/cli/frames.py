@@ -48,8 +48,8 @@ def frames(
     import torch
 
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.files import Photograph, check_folder, check_output, read_photograph, write_photograph
-    from nlfilter_torch.frames import filter_frames
+    from nlfilter_torch.filtering.fitted import filter_frames
+    from nlfilter_torch.io.photographs import Photograph, check_folder, check_output, read_photograph, write_photograph
 
     paths = _pictures(folder)
     if target.exists() and target.resolve() == folder.resolve():
@@ -87,7 +87,7 @@ def frames(
 
 def _pictures(folder: Path) -> list[Path]:
     """The image files of a folder, by name."""
-    from nlfilter_torch.files import SUFFIXES
+    from nlfilter_torch.io.photographs import SUFFIXES
 
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; name the one that holds the frames")

@@ -12,8 +12,8 @@ from nlfilter_torch.cli import options
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nlfilter_torch.operator import NonlocalOperator
-    from nlfilter_torch.spectrum import Spectrum
+    from nlfilter_torch.operator.operator import NonlocalOperator
+    from nlfilter_torch.operator.spectrum import Spectrum
 
 Folder = Annotated[
     Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
@@ -60,9 +60,9 @@ def inspect(
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.features import reduce_channels
-    from nlfilter_torch.files import check_folder, open_beside, read_photograph
-    from nlfilter_torch.pictures import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
+    from nlfilter_torch.io.photographs import check_folder, open_beside, read_photograph
+    from nlfilter_torch.operator.features import reduce_channels
+    from nlfilter_torch.plotting import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
 
     check_folder(folder)
     with steps(4) as begin:
@@ -95,7 +95,7 @@ def inspect(
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:
     """The diagnostics of one image as plain numbers, bandwidth in grey levels."""
-    from nlfilter_torch.filtering import captured_energy
+    from nlfilter_torch.filtering.filters import captured_energy
 
     figures = {
         name: value[0] if isinstance(value, list) else value for name, value in asdict(operator.diagnostics()).items()

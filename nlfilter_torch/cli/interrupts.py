@@ -80,7 +80,7 @@ def _install() -> dict[int, signal.Handlers]:
 
 def _handle(number: int, frame: FrameType | None) -> None:
     """Raise; or end at once where a module is imported, whose code may turn an exception into any other."""
-    files = sys.modules.get("nlfilter_torch.files")
+    files = sys.modules.get("nlfilter_torch.io.photographs")
     if _importing(frame) and not getattr(files, "unfinished", None):
         if sys.stderr.isatty():
             sys.stderr.write(SHOW_CURSOR)  # a progress bar hides it

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nlfilter_torch.presets import BANDWIDTHS, DISTANCES, GAINS, MAX_LANDMARKS, MAX_PATCH, MAX_SLIDERS
+from nlfilter_torch.edits.presets import BANDWIDTHS, DISTANCES, GAINS, MAX_LANDMARKS, MAX_PATCH, MAX_SLIDERS
 
 if TYPE_CHECKING:
-    from nlfilter_torch.files import Depth
+    from nlfilter_torch.io.photographs import Depth
 
 LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from nlfilter_torch.presets import PRESETS, PURPOSES, find_preset
+from nlfilter_torch.edits.presets import PRESETS, PURPOSES, find_preset
 
 Name = Annotated[
     str | None,

@@ -43,12 +43,14 @@ def recolor(
     """
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, painted_rows, painting
-    from nlfilter_torch.cli.by_rows import Job
+    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli import scribble_rows as painted_rows
+    from nlfilter_torch.cli import scribbles as painting
+    from nlfilter_torch.cli.tiled import Job
     from nlfilter_torch.edits.recolor import recolor as edit
-    from nlfilter_torch.files import Photograph
-    from nlfilter_torch.streaming.recolor import recolor_rows
-    from nlfilter_torch.streaming.rows import Rows
+    from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.tiled.recolor import recolor_rows
+    from nlfilter_torch.tiled.sources import Rows
 
     def check(channels: int) -> None:
         editing.check_colour(channels, "recolor", "use nlfilter-torch colorize, which colours grey ones")

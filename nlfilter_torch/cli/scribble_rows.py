@@ -8,8 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch.cli.by_rows import Job
-from nlfilter_torch.cli.painting import (
+from nlfilter_torch.cli.scribbles import (
     Rectangle,
     check_size,
     check_strokes,
@@ -18,7 +17,8 @@ from nlfilter_torch.cli.painting import (
     plain_rectangles,
     with_sliders,
 )
-from nlfilter_torch.streaming.rows import Picture, transparency
+from nlfilter_torch.cli.tiled import Job
+from nlfilter_torch.tiled.sources import Picture, transparency
 
 Floats = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
-from nlfilter_torch.files import Photograph, read_photograph
+from nlfilter_torch.io.photographs import Photograph, read_photograph
 
 
 @dataclass(frozen=True)

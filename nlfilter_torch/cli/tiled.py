@@ -6,18 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlfilter_torch.cli.progress import stages
-from nlfilter_torch.files import Photograph, TooLarge, read_photograph
-from nlfilter_torch.streaming.files import (
-    StoredPicture,
-    check_place,
-    free_memory,
-    is_zarr,
-    open_picture,
-    write_picture,
-)
-from nlfilter_torch.streaming.rows import Rows
-from nlfilter_torch.streaming.sampling import Report
-from nlfilter_torch.streaming.tiles import Passes
+from nlfilter_torch.io.photographs import Photograph, TooLarge, read_photograph
+from nlfilter_torch.io.rows import StoredPicture, check_place, free_memory, is_zarr, open_picture, write_picture
+from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.sources import Rows
+from nlfilter_torch.tiled.tiles import Passes
 
 MOST = 1e6  # gigabytes that anyone may have
 

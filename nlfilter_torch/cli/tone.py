@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.presets import GAINS
+from nlfilter_torch.edits.presets import GAINS
 
 Contrast = Annotated[
     float,
@@ -47,7 +47,7 @@ def tone(
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.edits.tone import adjust_tone
-    from nlfilter_torch.files import Photograph
+    from nlfilter_torch.io.photographs import Photograph
 
     def work(photograph: Photograph) -> Tensor:
         shared = editing.common(bandwidth, spatial_bandwidth, landmarks, seed)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from nlfilter_torch.blocks import strips
-from nlfilter_torch.precision import full_precision
+from nlfilter_torch.core.blocks import strips
+from nlfilter_torch.core.precision import full_precision
 
 Gradients = tuple[Tensor | None, ...]
 

@@ -358,7 +358,7 @@ def called_by_edit() -> bool:
     """Whether an edit of photographs called, which has looked at its image itself."""
     frame: FrameType | None = sys._getframe()
     while frame is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
-        if _module(frame).startswith(("nlfilter_torch.edits", "nlfilter_torch.frames")):
+        if _module(frame).startswith(("nlfilter_torch.edits", "nlfilter_torch.filtering.fitted")):
             return True
         frame = frame.f_back
     return False

@@ -19,8 +19,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from nlfilter_torch.differentiation import Gradients, once_differentiable
-from nlfilter_torch.ranks import name_the_missing
+from nlfilter_torch.core.autograd import Gradients, once_differentiable
+from nlfilter_torch.core.ranks import name_the_missing
 
 
 @dataclass(frozen=True, eq=False)

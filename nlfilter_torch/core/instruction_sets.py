@@ -7,8 +7,8 @@ NAMES = ("none", "AVX2", "AVX-512")
 
 
 def load_library() -> ctypes.CDLL | None:
-    """The compiled library of :mod:`nlfilter_torch.native`, if the installation has one."""
-    path = Path(__file__).with_name("native") / "kernels.so"
+    """The compiled library of :mod:`nlfilter_torch.core.kernels`, if the installation has one."""
+    path = Path(__file__).with_name("kernels") / "kernels.so"
     return ctypes.CDLL(str(path)) if path.exists() else None
 
 

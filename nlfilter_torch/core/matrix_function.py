@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.compilation import uncompiled
-from nlfilter_torch.differentiation import once_differentiable
+from nlfilter_torch.core.autograd import once_differentiable
+from nlfilter_torch.core.compilation import uncompiled
 
 # Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of
 # cancellation are both near 1e-10 then. Below FLOOR the comparison is absolute, since zero eigenvalues are only zero to

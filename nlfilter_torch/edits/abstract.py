@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_count,
     check_not_negative,
     check_number,
@@ -20,11 +20,11 @@ from nlfilter_torch.checks import (
     check_reach,
     check_share,
 )
+from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.edits.locality import nearby
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.spectrum import Spectrum
 
 PATCH_SIZE, LANDMARKS = 3, 200  # by default
 LOCALITY = 0.15  # default spatial bandwidth as a share of the short side

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_choice,
     check_count,
     check_image,
@@ -18,13 +18,13 @@ from nlfilter_torch.checks import (
     check_same_size,
     check_share,
 )
+from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
 from nlfilter_torch.edits.locality import nearby
-from nlfilter_torch.masks import segment_mask
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.strokes import check_painted, propagate_strokes
+from nlfilter_torch.filtering.masks import segment_mask
+from nlfilter_torch.filtering.scribbles import check_painted, propagate_strokes
+from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.spectrum import Spectrum
 
 Method = Literal["regression", "kmeans"]
 

@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.blocks import CACHED, block_length
-from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.strokes import walk_basis
-from nlfilter_torch.thin import spread
+from nlfilter_torch.core.blocks import CACHED, block_length
+from nlfilter_torch.core.kernels.tall_skinny import spread
+from nlfilter_torch.filtering.scribbles import walk_basis
+from nlfilter_torch.operator.spectrum import Spectrum
 
 MAX_SPOTS = 64  # of one region; further ones are taken together
 TINY = 1e-6  # variance below which a pixel correlates with nothing

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_choice,
     check_image,
     check_number,
@@ -17,12 +17,12 @@ from nlfilter_torch.checks import (
     check_reach,
     check_same_size,
 )
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.edits.components import Pixels, Spots, find_spots
 from nlfilter_torch.edits.locality import nearby
-from nlfilter_torch.edits.spots import Pixels, Spots, find_spots
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.strokes import check_painted
+from nlfilter_torch.filtering.scribbles import check_painted
+from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.spectrum import Spectrum
 
 Aperture = Literal["disc", "gaussian"]
 

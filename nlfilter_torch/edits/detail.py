@@ -4,13 +4,13 @@ from typing import Any
 
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_photograph, check_positive, check_tensor
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.masks import diffusion_mask, filter_regions
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.core.checks import check_image, check_photograph, check_positive, check_tensor
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.filtering.masks import diffusion_mask, filter_regions
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import nonlocal_operator
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
 SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter

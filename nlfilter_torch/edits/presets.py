@@ -65,7 +65,7 @@ class Preset:
         """
         import torch
 
-        from nlfilter_torch.edits.enhance import enhance
+        from nlfilter_torch.edits.detail import enhance
 
         return enhance(image, torch.tensor(self.alpha), generator=generator, **self.options())
 

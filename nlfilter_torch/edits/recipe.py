@@ -12,9 +12,9 @@ from typing import Any
 
 from torch import Tensor
 
-from nlfilter_torch.brush import Stroke
-from nlfilter_torch.presets import Preset, find_preset, parse_json, shown
-from nlfilter_torch.steps import NONE, Abstract, Colorize, Defocus, Detail, Recolor, Step
+from nlfilter_torch.edits.presets import Preset, find_preset, parse_json, shown
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import NONE, Abstract, Colorize, Defocus, Detail, Recolor, Step
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_image, check_photograph, check_same_size, check_share, check_unit_range
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_share, check_unit_range
+from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_means, split_luminance
-from nlfilter_torch.edits.spots import Spots, find_spots
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.strokes import check_painted
+from nlfilter_torch.edits.components import Spots, find_spots
+from nlfilter_torch.filtering.scribbles import check_painted
+from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.spectrum import Spectrum
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.presets import is_within, shown
+from nlfilter_torch.edits.presets import is_within, shown
 
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 SMALLEST = 0.75  # pixels; the least radius, at which a dot still covers a pixel

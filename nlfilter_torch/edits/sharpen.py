@@ -5,13 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_number, check_photograph, check_reach, check_weight
-from nlfilter_torch.colour import edit_luminance
+from nlfilter_torch.core.checks import check_number, check_photograph, check_reach, check_weight
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.denoise import soften
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.precision import full_precision, working_dtype
+from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import nonlocal_operator
 
 BANDWIDTH = 10 / 255  # of softened patches
 

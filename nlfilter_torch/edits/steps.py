@@ -12,17 +12,17 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from nlfilter_torch.brush import Stroke, coloured, mask_of, paint, painted
-from nlfilter_torch.colour import edit_luminance
 from nlfilter_torch.edits.abstract import Abstraction
 from nlfilter_torch.edits.colorize import Colorization
+from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.defocus import Defocusing
-from nlfilter_torch.edits.enhance import colour_masks
+from nlfilter_torch.edits.detail import colour_masks
+from nlfilter_torch.edits.presets import ENTRIES, Preset, is_count, is_sliders, is_within
 from nlfilter_torch.edits.recolor import Recoloring
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.filtering import detail_layers, weigh_layers
-from nlfilter_torch.operator import nonlocal_operator
-from nlfilter_torch.presets import ENTRIES, Preset, is_count, is_sliders, is_within
+from nlfilter_torch.edits.scribbles import Stroke, coloured, mask_of, paint, painted
+from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import nonlocal_operator
 
 Valid = tuple[str, Callable[[Any], bool]]  # what an entry must be, in words and as a test
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_alpha,
     check_image,
     check_instance,
@@ -13,10 +13,10 @@ from nlfilter_torch.checks import (
     check_weight,
     checked_response,
 )
-from nlfilter_torch.operator import NonlocalOperator
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import reduce_sum, replicate
-from nlfilter_torch.spectrum import Response, Spectrum
+from nlfilter_torch.core.communicator import reduce_sum, replicate
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.spectrum import Response, Spectrum
 
 
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:

@@ -13,7 +13,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_image,
     check_instance,
     check_not_negative,
@@ -22,11 +22,11 @@ from nlfilter_torch.checks import (
     check_same_size,
     check_tensor,
 )
-from nlfilter_torch.filtering import detail_layers
-from nlfilter_torch.matrix_function import SymmetricMatrix
-from nlfilter_torch.operator import NonlocalOperator
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import Shard, check_whole, reduce_max, reduce_sum
+from nlfilter_torch.core.communicator import Shard, check_whole, reduce_max, reduce_sum
+from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.operator.operator import NonlocalOperator
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_alpha,
     check_image,
     check_instance,
@@ -23,14 +23,14 @@ from nlfilter_torch.checks import (
     check_tensor,
     check_weight,
 )
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.filtering import layers_between, residual_change, weigh_layers
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.newton import PixelScaling
-from nlfilter_torch.operator import NonlocalOperator, nonlocal_operator
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.thin import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.newton import PixelScaling
+from nlfilter_torch.operator.operator import NonlocalOperator, nonlocal_operator
 
 
 @dataclass(frozen=True, eq=False)

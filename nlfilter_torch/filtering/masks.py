@@ -5,8 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import CACHED, block_length
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.blocks import CACHED, block_length
+from nlfilter_torch.core.checks import (
     check_dtype,
     check_finite,
     check_image,
@@ -18,12 +18,12 @@ from nlfilter_torch.checks import (
     is_hidden,
     warn,
 )
-from nlfilter_torch.filtering import polynomial_filter
-from nlfilter_torch.operator import NonlocalOperator
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import reduce_max, reduce_sum, replicate
-from nlfilter_torch.spectrum import Spectrum
-from nlfilter_torch.thin import moment, spread
+from nlfilter_torch.core.communicator import reduce_max, reduce_sum, replicate
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
 STEEPEST = 1e30  # pixels over width: no distance of 0 becomes NaN

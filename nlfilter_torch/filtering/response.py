@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_eigenvalues
+from nlfilter_torch.core.checks import check_alpha, check_eigenvalues
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:

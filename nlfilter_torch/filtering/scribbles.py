@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     check_image,
     check_instance,
     check_positive,
@@ -23,10 +23,10 @@ from nlfilter_torch.checks import (
     check_tensor,
     check_unit_range,
 )
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum, replicate
-from nlfilter_torch.spectrum import RitzPairs, Spectrum
-from nlfilter_torch.thin import moment
+from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum, replicate
+from nlfilter_torch.core.kernels.tall_skinny import moment
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 SPOT = 25 / 38400  # share of the image that a dab of a brush covers: 5x5 pixels of 160x240
 NOISE = 0.08  # variance of the values of one dab, as a share of the variance of the image

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFile, PngImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401
 from torch import Tensor
 
-from nlfilter_torch import exif as exif_tags
-from nlfilter_torch import tiff
+from nlfilter_torch.io import exif as exif_tags
+from nlfilter_torch.io import tiff
 
 if sys.platform != "win32":
     import fcntl

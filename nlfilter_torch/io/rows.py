@@ -17,9 +17,9 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from nlfilter_torch import exif as exif_tags
-from nlfilter_torch import tiff
-from nlfilter_torch.files import (
+from nlfilter_torch.io import exif as exif_tags
+from nlfilter_torch.io import tiff
+from nlfilter_torch.io.photographs import (
     check_file,
     check_type,
     claimed,
@@ -32,8 +32,8 @@ from nlfilter_torch.files import (
     remove_stale,
     unfinished,
 )
-from nlfilter_torch.streaming.rows import Rows, RowSource
-from nlfilter_torch.streaming.tiff_rows import TiffRows
+from nlfilter_torch.io.tiff_rows import TiffRows
+from nlfilter_torch.tiled.sources import Rows, RowSource
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a zarr array that is made here

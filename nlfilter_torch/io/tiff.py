@@ -11,7 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from nlfilter_torch import exif as exif_tags
+from nlfilter_torch.io import exif as exif_tags
 
 # Tags that describe the photograph; the others describe how the file stores it, and are written anew.
 _DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)

@@ -10,7 +10,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from nlfilter_torch import tiff
+from nlfilter_torch.io import tiff
 
 KEPT = 2  # bands of strips or tiles: rows that two tiles of a picture share lie in two at most
 

@@ -6,12 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_image, check_same_size
-from nlfilter_torch.masks import filter_regions
-from nlfilter_torch.modules import affinity, sliders
-from nlfilter_torch.modules.affinity import NonlocalAffinity
-from nlfilter_torch.modules.learning import check_learn
-from nlfilter_torch.modules.sliders import PolynomialSliders
+from nlfilter_torch.core.checks import check_image, check_same_size
+from nlfilter_torch.filtering.masks import filter_regions
+from nlfilter_torch.nn import affinity, sliders
+from nlfilter_torch.nn.affinity import NonlocalAffinity
+from nlfilter_torch.nn.parameters import check_learn
+from nlfilter_torch.nn.sliders import PolynomialSliders
 
 
 class NonlocalFilter(nn.Module):

@@ -4,10 +4,10 @@ from collections.abc import Collection
 
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_positive
-from nlfilter_torch.masks import diffusion_mask, segment_mask
-from nlfilter_torch.modules.learning import check_learn, current, shown, start_or_positive
-from nlfilter_torch.spectrum import Spectrum
+from nlfilter_torch.core.checks import check_positive
+from nlfilter_torch.filtering.masks import diffusion_mask, segment_mask
+from nlfilter_torch.nn.parameters import check_learn, current, shown, start_or_positive
+from nlfilter_torch.operator.spectrum import Spectrum
 
 
 class DiffusionMask(nn.Module):

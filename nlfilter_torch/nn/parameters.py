@@ -7,7 +7,7 @@ from typing import overload
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_number, check_positive, described
+from nlfilter_torch.core.checks import check_number, check_positive, described
 
 
 class Positive(nn.Module):

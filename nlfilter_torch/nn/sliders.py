@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.checks import check_alpha, check_tensor, check_weight, described
-from nlfilter_torch.filtering import polynomial_filter, weigh_layers
-from nlfilter_torch.modules.learning import check_learn
-from nlfilter_torch.operator import NonlocalOperator
+from nlfilter_torch.core.checks import check_alpha, check_tensor, check_weight, described
+from nlfilter_torch.filtering.filters import polynomial_filter, weigh_layers
+from nlfilter_torch.nn.parameters import check_learn
+from nlfilter_torch.operator.operator import NonlocalOperator
 
 LEARNABLE = ("alpha", "residual")
 

@@ -1,7 +1,7 @@
 """Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
-The scaling of a completed kernel comes from :mod:`~nlfilter_torch.newton`, that of any other from
-:mod:`~nlfilter_torch.chebyshev`. Its gradient is implicit, whichever way it was found.
+The scaling of a completed kernel comes from :mod:`~nlfilter_torch.operator.newton`, that of any other from
+:mod:`~nlfilter_torch.operator.chebyshev`. Its gradient is implicit, whichever way it was found.
 """
 
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch import chebyshev, newton
-from nlfilter_torch.checks import warn
-from nlfilter_torch.differentiation import once_differentiable, outer_product
-from nlfilter_torch.sharding import Shard
-from nlfilter_torch.thin import moment, spread
+from nlfilter_torch.core.autograd import once_differentiable, outer_product
+from nlfilter_torch.core.checks import warn
+from nlfilter_torch.core.communicator import Shard
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.operator import chebyshev, newton
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}  # a residual that is worth a warning, unless it was asked for
@@ -77,8 +77,8 @@ class _Balance(torch.autograd.Function):
     d``: its gradient is ``-(z a^T + s d^T)`` in the factor, z = factor d, s = factor a, and ``-a d`` in the diagonal.
 
     With r = d^2 c the equation reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, which solves a system of
-    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.newton`; the estimate of its inverse that
-    balancing leaves behind preconditions conjugate gradients.
+    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`; the estimate of its inverse
+    that balancing leaves behind preconditions conjugate gradients.
     """
 
     @staticmethod

@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_image
-from nlfilter_torch.features import GuideChannels, reduce_channels
-from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.sharding import Shard, meet, reduce_sum, with_halo
+from nlfilter_torch.core.checks import check_choice, check_image
+from nlfilter_torch.core.communicator import Shard, meet, reduce_sum, with_halo
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.operator.features import GuideChannels, reduce_channels
 
 # The paper's 0.6 belongs to its own patch weights, whose squares sum to 0.056; under weights of unit sum the same
 # kernel has a bandwidth larger by 1 / sqrt(0.056) = 4.2, hence 2.5.

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import SWEPT, pixel_blocks
-from nlfilter_torch.newton import Solution, accepted, damped
-from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
-from nlfilter_torch.thin import gather, moment, spread
+from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
+from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum
+from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
+from nlfilter_torch.operator.newton import Solution, accepted, damped
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue

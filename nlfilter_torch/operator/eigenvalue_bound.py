@@ -13,9 +13,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nlfilter_torch.matrix_function import SymmetricMatrix
-from nlfilter_torch.sharding import Shard, reduce_sum
-from nlfilter_torch.spectrum import compute_grams
+from nlfilter_torch.core.communicator import Shard, reduce_sum
+from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.operator.spectrum import compute_grams
 
 # By which rounding and the tolerance of row sums may exceed 1: more than the r of a pixel that is not isolated.
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}

@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.blocks import large_empty
-from nlfilter_torch.checks import LARGEST_PATCH, check_finite, check_patch_size, check_tensor
-from nlfilter_torch.differentiation import Gradients, once_differentiable
+from nlfilter_torch.core.autograd import Gradients, once_differentiable
+from nlfilter_torch.core.blocks import large_empty
+from nlfilter_torch.core.checks import LARGEST_PATCH, check_finite, check_patch_size, check_tensor
 
 GuideChannels = Literal["luminance", "all"]
 Bandwidth = float | Tensor | None

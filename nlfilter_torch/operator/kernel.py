@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from nlfilter_torch.features import GuideChannels, extract_features, reduce_channels
-from nlfilter_torch.nystrom import Completion, nystrom_factor
+from nlfilter_torch.operator.features import GuideChannels, extract_features, reduce_channels
+from nlfilter_torch.operator.nystrom import Completion, nystrom_factor
 
 
 @dataclass(frozen=True, eq=False)

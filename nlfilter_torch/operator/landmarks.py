@@ -7,8 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch import native
-from nlfilter_torch.sharding import Shard, from_first, gather_columns
+from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.communicator import Shard, from_first, gather_columns
 
 Sampling = Literal["kmeans", "uniform", "random"]
 

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch import native
-from nlfilter_torch.blocks import SWEPT, pixel_blocks
-from nlfilter_torch.landmarks import stratified
-from nlfilter_torch.sharding import Shard, reduce_max, reduce_sum
-from nlfilter_torch.spectrum import sum_grams
-from nlfilter_torch.thin import gather, moment, spread
+from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
+from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum
+from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
+from nlfilter_torch.operator.landmarks import stratified
+from nlfilter_torch.operator.spectrum import sum_grams
 
 PER_LANDMARK = (8, 32, 160)  # pixels of the sample: its Jacobian is then within 35, 18 or 8 % of the true one
 EXPLORED = 8192  # pixels that the first guess comes from, at most

@@ -11,9 +11,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch import native
-from nlfilter_torch.blocks import buffered_blocks, large_empty, strip_count, strips
-from nlfilter_torch.differentiation import factors_of, once_differentiable, strips_of_gradient, write_columns
+from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.autograd import factors_of, once_differentiable, strips_of_gradient, write_columns
+from nlfilter_torch.core.blocks import buffered_blocks, large_empty, strip_count, strips
 
 Completion = Literal["diagonal", "none"]
 

@@ -6,8 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.bandwidth import bandwidth_of_rows
-from nlfilter_torch.checks import (
+from nlfilter_torch.core.checks import (
     called_by_edit,
     check_choice,
     check_count,
@@ -23,19 +22,20 @@ from nlfilter_torch.checks import (
     warn,
     warn_of_scale,
 )
-from nlfilter_torch.compilation import uncompiled
-from nlfilter_torch.eigenvalue_bound import exceeds, is_bounded, largest_eigenvalue, limiter, shifted_gram
-from nlfilter_torch.features import GuideChannels, extract_features, reduce_channels, unit_window
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.landmarks import Sampling, choose_landmarks
-from nlfilter_torch.newton import PixelScaling, isolated, row_sums
-from nlfilter_torch.nystrom import Completion, whitener
-from nlfilter_torch.precision import full_precision, working_dtype
-from nlfilter_torch.products import apply_powers, fold_batch, unfold_batch
-from nlfilter_torch.sharding import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
-from nlfilter_torch.sinkhorn import balance, warn_of_residual
-from nlfilter_torch.spectrum import Spectrum, compute_spectrum
-from nlfilter_torch.thin import moment, spread
+from nlfilter_torch.core.communicator import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
+from nlfilter_torch.core.compilation import uncompiled
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.operator.balancing import balance, warn_of_residual
+from nlfilter_torch.operator.bandwidth import bandwidth_of_rows
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, largest_eigenvalue, limiter, shifted_gram
+from nlfilter_torch.operator.features import GuideChannels, extract_features, reduce_channels, unit_window
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
+from nlfilter_torch.operator.newton import PixelScaling, isolated, row_sums
+from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.products import apply_powers, fold_batch, unfold_batch
+from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
 ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
@@ -322,7 +322,7 @@ def nonlocal_operator(
             never used.
         group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
             this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
-            process would, for their own rows; see :mod:`nlfilter_torch.sharding`. None, which
+            process would, for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, which
             ``torch.distributed.group.WORLD`` is as well before there is one, is the whole image here.
 
     Returns:

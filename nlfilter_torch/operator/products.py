@@ -5,9 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.differentiation import once_differentiable, outer_product
-from nlfilter_torch.sharding import Shard
-from nlfilter_torch.thin import moment, spread
+from nlfilter_torch.core.autograd import once_differentiable, outer_product
+from nlfilter_torch.core.communicator import Shard
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 
 
 def apply_powers(

@@ -7,19 +7,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_count, check_patch_size, check_positive, check_share
+from nlfilter_torch.core.checks import check_choice, check_count, check_patch_size, check_positive, check_share
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.edits.colorize import FAR, LOCALITY, NEAR, Stage
 from nlfilter_torch.edits.locality import nearby
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.spectrum import RitzPairs
-from nlfilter_torch.streaming.fitting import fit_spectrum
-from nlfilter_torch.streaming.painted import Guide, Painted, check_room, floats_of_painted, gather, read_strokes
-from nlfilter_torch.streaming.rows import Picture, Rows, RowSource, RowTarget, Tile
-from nlfilter_torch.streaming.sampling import Report, Sample
-from nlfilter_torch.streaming.tiles import (
+from nlfilter_torch.filtering.scribbles import FittedStrokes, fit_strokes
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.tiled.fitting import fit_spectrum
+from nlfilter_torch.tiled.sampling import Report, Sample
+from nlfilter_torch.tiled.scribbles import Guide, Painted, check_room, floats_of_painted, gather, read_strokes
+from nlfilter_torch.tiled.sources import Picture, Rows, RowSource, RowTarget, Tile
+from nlfilter_torch.tiled.tiles import (
     SAMPLE,
     Passes,
     Statistics,
@@ -29,7 +30,6 @@ from nlfilter_torch.streaming.tiles import (
     row_by_row,
     rows_that_fit,
 )
-from nlfilter_torch.strokes import FittedStrokes, fit_strokes
 
 
 def stream_colorize(

@@ -7,23 +7,15 @@ from typing import Any, Literal
 import numpy as np
 from torch import Tensor
 
-from nlfilter_torch.checks import check_alpha, check_choice, check_count, check_positive
-from nlfilter_torch.colour import edit_luminance
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.frames import FittedFilter
-from nlfilter_torch.masks import blend_regions, blend_sliders
-from nlfilter_torch.streaming.fitting import FittedMasks, fit_masks, fit_picture, for_masks
-from nlfilter_torch.streaming.rows import Picture, Rows, RowSource, RowTarget, Tile
-from nlfilter_torch.streaming.sampling import Report
-from nlfilter_torch.streaming.tiles import (
-    SAMPLE,
-    Passes,
-    Statistics,
-    check_target,
-    fill,
-    in_silence,
-    rows_that_fit,
-)
+from nlfilter_torch.core.checks import check_alpha, check_choice, check_count, check_positive
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.filtering.fitted import FittedFilter
+from nlfilter_torch.filtering.masks import blend_regions, blend_sliders
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.tiled.fitting import FittedMasks, fit_masks, fit_picture, for_masks
+from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.sources import Picture, Rows, RowSource, RowTarget, Tile
+from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill, in_silence, rows_that_fit
 
 
 def stream_detail(

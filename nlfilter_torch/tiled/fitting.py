@@ -8,20 +8,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.edits.enhance import MASK_BANDWIDTH, SHARED
-from nlfilter_torch.eigenvalue_bound import is_bounded
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.frames import FittedFilter
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.masks import check_negative, mask_of_exponents, squared_distances
-from nlfilter_torch.newton import PixelScaling
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.spectrum import RitzPairs
-from nlfilter_torch.streaming.influence import sample_by_influence
-from nlfilter_torch.streaming.rows import Picture, RowSource, Tile
-from nlfilter_torch.streaming.sampling import Image, Report, all_blocks, take_pilot
-from nlfilter_torch.streaming.statistics import Block, Sums, balance_by_passes, limiter_by_passes, sum_up
-from nlfilter_torch.streaming.tiles import Passes, row_by_row
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.detail import MASK_BANDWIDTH, SHARED
+from nlfilter_torch.filtering.fitted import FittedFilter
+from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
+from nlfilter_torch.operator.eigenvalue_bound import is_bounded
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.newton import PixelScaling
+from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.tiled.leverage import sample_by_influence
+from nlfilter_torch.tiled.sampling import Image, Report, all_blocks, take_pilot
+from nlfilter_torch.tiled.sources import Picture, RowSource, Tile
+from nlfilter_torch.tiled.statistics import Block, Sums, balance_by_passes, limiter_by_passes, sum_up
+from nlfilter_torch.tiled.tiles import Passes, row_by_row
 
 
 def for_masks(passes: Passes) -> Passes:

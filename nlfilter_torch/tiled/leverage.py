@@ -7,16 +7,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.blocks import CACHED
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.newton import PixelScaling, scaling_from_moment
-from nlfilter_torch.nystrom import Affinity
-from nlfilter_torch.spectrum import CUT
-from nlfilter_torch.streaming import sampling
-from nlfilter_torch.streaming.rows import Picture
-from nlfilter_torch.streaming.sampling import Image, Pilot, Report, Sample, patches_at, scaled_patches
-from nlfilter_torch.streaming.statistics import sum_up
+from nlfilter_torch.core.blocks import CACHED
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.newton import PixelScaling, scaling_from_moment
+from nlfilter_torch.operator.nystrom import Affinity
+from nlfilter_torch.operator.spectrum import CUT
+from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.sampling import Image, Pilot, Report, Sample, patches_at, scaled_patches
+from nlfilter_torch.tiled.sources import Picture
+from nlfilter_torch.tiled.statistics import sum_up
 
 SKETCHED = 16  # random projections; they tell squared lengths to a third
 EVEN = 0.1  # share of a sample that is spread evenly over the picture

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.brush import Stroke, coloured, mask_of, paint, painted
-from nlfilter_torch.recipe import Recipe
-from nlfilter_torch.steps import Colorize, Detail, Recolor, Step, seeded
-from nlfilter_torch.streaming.colorize import colorize_rows
-from nlfilter_torch.streaming.detail import detail_rows
-from nlfilter_torch.streaming.recolor import recolor_rows
-from nlfilter_torch.streaming.rows import Picture, Rows, RowSource
-from nlfilter_torch.streaming.tiles import TILE_PIXELS, Passes
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke, coloured, mask_of, paint, painted
+from nlfilter_torch.edits.steps import Colorize, Detail, Recolor, Step, seeded
+from nlfilter_torch.tiled.colorize import colorize_rows
+from nlfilter_torch.tiled.detail import detail_rows
+from nlfilter_torch.tiled.recolor import recolor_rows
+from nlfilter_torch.tiled.sources import Picture, Rows, RowSource
+from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
 
 Floats = NDArray[np.float32]
 LOOKED_AT = 64  # rows at once

@@ -4,22 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from nlfilter_torch.checks import check_count, check_patch_size, check_share
+from nlfilter_torch.core.checks import check_count, check_patch_size, check_share
 from nlfilter_torch.edits.recolor import colour_guide
-from nlfilter_torch.streaming.dye import Marked, fit_dye
-from nlfilter_torch.streaming.fitting import fit_spectrum
-from nlfilter_torch.streaming.painted import Guide, check_room, floats_of_painted, read_mask, read_strokes
-from nlfilter_torch.streaming.rows import Picture, Rows, RowSource, RowTarget
-from nlfilter_torch.streaming.sampling import Report
-from nlfilter_torch.streaming.tiles import (
-    SAMPLE,
-    Passes,
-    Statistics,
-    check_target,
-    fill,
-    in_silence,
-    rows_that_fit,
-)
+from nlfilter_torch.tiled.fitting import fit_spectrum
+from nlfilter_torch.tiled.recoloring import Marked, fit_dye
+from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.scribbles import Guide, check_room, floats_of_painted, read_mask, read_strokes
+from nlfilter_torch.tiled.sources import Picture, Rows, RowSource, RowTarget
+from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill, in_silence, rows_that_fit
 
 
 def stream_recolor(

@@ -6,17 +6,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.chroma import group_colours, split_luminance
+from nlfilter_torch.edits.components import Pixels, Spots, label_spots, spot_sums, unit_vectors
 from nlfilter_torch.edits.recolor import Dye, divide
-from nlfilter_torch.edits.spots import Pixels, Spots, label_spots, spot_sums, unit_vectors
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.precision import full_precision
-from nlfilter_torch.spectrum import RitzPairs
-from nlfilter_torch.streaming.painted import Guide, Painted, gather
-from nlfilter_torch.streaming.rows import Picture, Tile
-from nlfilter_torch.streaming.sampling import Report, Sample
-from nlfilter_torch.streaming.tiles import row_by_row
-from nlfilter_torch.strokes import walk_basis
+from nlfilter_torch.filtering.scribbles import walk_basis
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.tiled.sampling import Report, Sample
+from nlfilter_torch.tiled.scribbles import Guide, Painted, gather
+from nlfilter_torch.tiled.sources import Picture, Tile
+from nlfilter_torch.tiled.tiles import row_by_row
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.bandwidth import bandwidth_of_gradient, gradients
-from nlfilter_torch.checks import check_choice, check_count, check_positive, warn
-from nlfilter_torch.features import GuideChannels, pad_border, reduce_channels, unit_window
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.nystrom import Completion, whitener
-from nlfilter_torch.streaming.rows import Picture, Tile
-from nlfilter_torch.streaming.statistics import Block, start_balancing
+from nlfilter_torch.core.checks import check_choice, check_count, check_positive, warn
+from nlfilter_torch.operator.bandwidth import bandwidth_of_gradient, gradients
+from nlfilter_torch.operator.features import GuideChannels, pad_border, reduce_channels, unit_window
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
+from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.tiled.sources import Picture, Tile
+from nlfilter_torch.tiled.statistics import Block, start_balancing
 
 PILOT = 1 << 17  # pixels of the first sample: their factor, 52 MB at m = 100, is balanced in memory
 CHUNK = 1 << 16  # pixels of a sample whose factor is there at once

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.features import reduce_channels
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.streaming.rows import Picture, RowSource, Tile, transparency
-from nlfilter_torch.streaming.sampling import Report, Sample, patches_at, scaled_patches
-from nlfilter_torch.streaming.tiles import Passes
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.tiled.sampling import Report, Sample, patches_at, scaled_patches
+from nlfilter_torch.tiled.sources import Picture, RowSource, Tile, transparency
+from nlfilter_torch.tiled.tiles import Passes
 
 Look = Callable[[Tensor], Tensor]  # colours (1, C, H, W) to the guide that is compared
 Planes = Callable[[int, int], Tensor]  # of the rows from the first to before the second

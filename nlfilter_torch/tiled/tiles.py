@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.checks import check_choice, check_count
-from nlfilter_torch.kernel import Kernel
-from nlfilter_torch.streaming import sampling
-from nlfilter_torch.streaming.rows import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
-from nlfilter_torch.streaming.sampling import Report
+from nlfilter_torch.core.checks import check_choice, check_count
+from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 
 SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
 TILE_PIXELS = 1 << 17  # longer tiles are no faster

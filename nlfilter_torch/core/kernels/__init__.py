@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from nlfilter_torch import instruction_sets
-from nlfilter_torch.checks import is_transformed
+from nlfilter_torch.core import instruction_sets
+from nlfilter_torch.core.checks import is_transformed
 
 if TYPE_CHECKING:
-    from nlfilter_torch.nystrom import Affinity
+    from nlfilter_torch.operator.nystrom import Affinity
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
 LEVELS = instruction_sets.NAMES

@@ -122,7 +122,7 @@ INLINE const float *NAME(fetch)(const float *source, long width, float fill, flo
 #include "backward.h"
 #include "grams.h"
 #include "landmarks.h"
-#include "thin.h"
+#include "tall_skinny.h"
 
 #undef FLOATS
 #undef INTS

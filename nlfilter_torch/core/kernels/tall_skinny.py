@@ -8,9 +8,9 @@ the same products run on all cores.
 import torch
 from torch import Tensor
 
-from nlfilter_torch import native
-from nlfilter_torch.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
-from nlfilter_torch.sharding import Shard, reduce_sum
+from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
+from nlfilter_torch.core.communicator import Shard, reduce_sum
 
 FEW = range(1, 9)  # rows for which the kernels in C are the quickest
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower

@@ -1,0 +1,5 @@
+"""Image files: photographs in memory, TIFF, and pictures that are read and written by rows."""
+
+from nlfilter_torch.io.photographs import Photograph, TooLarge, check_output, read_photograph, write_photograph
+
+__all__ = ["Photograph", "TooLarge", "check_output", "read_photograph", "write_photograph"]

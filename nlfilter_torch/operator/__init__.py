@@ -1,0 +1,1 @@
+"""Guide to W: features, landmarks, Nystrom factor, balancing, products, spectrum, operator."""
