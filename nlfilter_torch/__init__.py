@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from nlfilter_torch.edits.denoise import denoise as denoise
     from nlfilter_torch.edits.denoise import estimate_noise as estimate_noise
     from nlfilter_torch.edits.detail import enhance as enhance
+    from nlfilter_torch.edits.frames import filter_frames as filter_frames
     from nlfilter_torch.edits.recolor import recolor as recolor
     from nlfilter_torch.edits.sharpen import sharpen as sharpen
     from nlfilter_torch.edits.tone import adjust_tone as adjust_tone
     from nlfilter_torch.filtering.filters import captured_energy as captured_energy
+    from nlfilter_torch.filtering.filters import compose_alpha as compose_alpha
     from nlfilter_torch.filtering.filters import detail_layers as detail_layers
+    from nlfilter_torch.filtering.filters import filter_regions as filter_regions
     from nlfilter_torch.filtering.filters import polynomial_filter as polynomial_filter
     from nlfilter_torch.filtering.filters import spectral_filter as spectral_filter
     from nlfilter_torch.filtering.fit import fit_alpha as fit_alpha
     from nlfilter_torch.filtering.fitted import FittedFilter as FittedFilter
-    from nlfilter_torch.filtering.fitted import filter_frames as filter_frames
     from nlfilter_torch.filtering.fitted import fit_filter as fit_filter
-    from nlfilter_torch.filtering.masks import compose_alpha as compose_alpha
     from nlfilter_torch.filtering.masks import diffusion_map as diffusion_map
     from nlfilter_torch.filtering.masks import diffusion_mask as diffusion_mask
-    from nlfilter_torch.filtering.masks import filter_regions as filter_regions
     from nlfilter_torch.filtering.masks import segment_mask as segment_mask
     from nlfilter_torch.filtering.response import polynomial_response as polynomial_response
     from nlfilter_torch.filtering.scribbles import propagate_strokes as propagate_strokes
@@ -64,7 +64,7 @@ _DEFINED_IN = {
     "adjust_tone": "edits.tone",
     "captured_energy": "filtering.filters",
     "colorize": "edits.colorize",
-    "compose_alpha": "filtering.masks",
+    "compose_alpha": "filtering.filters",
     "defocus": "edits.defocus",
     "denoise": "edits.denoise",
     "detail_layers": "filtering.filters",
@@ -73,8 +73,8 @@ _DEFINED_IN = {
     "enhance": "edits.detail",
     "estimate_bandwidth": "operator.bandwidth",
     "estimate_noise": "edits.denoise",
-    "filter_frames": "filtering.fitted",
-    "filter_regions": "filtering.masks",
+    "filter_frames": "edits.frames",
+    "filter_regions": "filtering.filters",
     "fit_alpha": "filtering.fit",
     "fit_filter": "filtering.fitted",
     "nonlocal_operator": "operator.operator",

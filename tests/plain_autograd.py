@@ -9,9 +9,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.affinity import SMALLEST_EXPONENT
 from nlfilter_torch.operator.features import extract_features, patch_window
 from nlfilter_torch.operator.landmarks import choose_landmarks
-from nlfilter_torch.operator.nystrom import JITTER, SMALLEST_EXPONENT
+from nlfilter_torch.operator.nystrom import JITTER
 
 RELAXATION = 2.0 / 3.0
 

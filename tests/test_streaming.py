@@ -13,7 +13,7 @@ from torch import Tensor
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import colour_masks
-from nlfilter_torch.filtering.masks import filter_regions
+from nlfilter_torch.filtering.filters import filter_regions
 from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels

@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from nlfilter_torch.app.preview import PIXELS, Preview
-from nlfilter_torch.cli.options import working_bytes
+from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.recipe import STEPS, Recipe
 from nlfilter_torch.edits.scribbles import Stroke, thin
 from nlfilter_torch.io.photographs import (

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.presets import PRESETS, find_preset
 
 
@@ -91,8 +92,7 @@ def detail(
     from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
     from nlfilter_torch.edits.colour import edit_luminance
     from nlfilter_torch.edits.detail import colour_masks
-    from nlfilter_torch.filtering.filters import polynomial_filter
-    from nlfilter_torch.filtering.masks import filter_regions
+    from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter
     from nlfilter_torch.io.photographs import check_output, write_photograph
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.tiled.detail import detail_rows
@@ -100,7 +100,7 @@ def detail(
 
     sliders = torch.tensor(numbers)
     # A mask is worked out before the filter, from coordinates as large as a factor beside its own factor.
-    needed = options.working_bytes(landmarks, patch_size, factors=2 if region or mask else 1)
+    needed = working_bytes(landmarks, patch_size, factors=2 if region or mask else 1)
     allowed = allowed_memory(memory)
     with steps(4) as begin:
         begin("Reading")

@@ -11,6 +11,7 @@ from torch import Tensor
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
+from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.io.photographs import Photograph, check_output, read_photograph, write_photograph
 from nlfilter_torch.operator.operator import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.tiled.sources import Rows
@@ -43,7 +44,7 @@ def edit_file(
         by_rows: the edit of a photograph that is larger, or None where there is no such edit.
         coloured: that the edit by rows gives colours to a grey photograph.
     """
-    needed = options.working_bytes(landmarks, patch_size, factors=factors)
+    needed = working_bytes(landmarks, patch_size, factors=factors)
     allowed = None if by_rows is None else allowed_memory(memory)
     with steps(3) as begin:
         begin("Reading")

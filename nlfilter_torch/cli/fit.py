@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.presets import Preset
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def fit(
     check_file(preset)
     with steps(3) as begin:
         begin("Reading")
-        memory = options.working_bytes(landmarks, patch_size)
+        memory = working_bytes(landmarks, patch_size)
         source, target = (read_photograph(path, bytes_per_pixel=memory) for path in (before, after))
         image, edited = (reduce_channels(photograph.pixels, "luminance") for photograph in (source, target))
         if image.shape != edited.shape:

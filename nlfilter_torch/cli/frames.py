@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.core.memory import working_bytes
 
 Frames = Annotated[
     Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
@@ -48,14 +49,14 @@ def frames(
     import torch
 
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.filtering.fitted import filter_frames
+    from nlfilter_torch.edits.frames import filter_frames
     from nlfilter_torch.io.photographs import Photograph, check_folder, check_output, read_photograph, write_photograph
 
     paths = _pictures(folder)
     if target.exists() and target.resolve() == folder.resolve():
         raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
     check_folder(target)
-    needed = (1 + min(references, len(paths))) * options.working_bytes(landmarks, patch_size)
+    needed = (1 + min(references, len(paths))) * working_bytes(landmarks, patch_size)
     with steps(len(paths) + 1) as begin:
         begin("Learning from some frames")
         spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()

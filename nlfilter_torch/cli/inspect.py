@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.core.memory import working_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -67,7 +68,7 @@ def inspect(
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
-        photograph = read_photograph(source, bytes_per_pixel=options.working_bytes(landmarks, patch_size, factors=5))
+        photograph = read_photograph(source, bytes_per_pixel=working_bytes(landmarks, patch_size, factors=5))
         guide = reduce_channels(photograph.pixels, "luminance")
         begin("Comparing patches")
         operator = editing.build_operator(

@@ -7,8 +7,8 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_image, check_photograph, check_positive, check_tensor
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.filtering.masks import diffusion_mask, filter_regions
+from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter
+from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import nonlocal_operator
 

@@ -1,28 +1,20 @@
 """Spectrum and regions to masks that reach every similar pixel. Paper: Sec. IV, eq. (15) to (17), Fig. 11; Sec. V-A."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED, block_length
 from nlfilter_torch.core.checks import (
-    check_dtype,
-    check_finite,
     check_image,
     check_instance,
     check_positive,
     check_same_size,
-    check_tensor,
-    check_unit_range,
     is_hidden,
     warn,
 )
 from nlfilter_torch.core.communicator import reduce_max, reduce_sum, replicate
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
@@ -230,106 +222,3 @@ def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:
     """Number (B, N) of the centre (B, M, K) nearest to every pixel in the coordinates ``basis @ F``."""
     inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor, spectrum.scaling)
     return (inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)).max(1).indices  # ten times as quick as argmax
-
-
-def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
-    """Sliders for every pixel from sliders for every region: inside a mask its own, outside of all the image as it is.
-
-    Paper: Figs. 12, 13, where eq. (12) acts inside a propagated mask. The result is an ``alpha`` of
-    :func:`polynomial_filter`; with one region it is the edit blended by its mask.
-
-    Args:
-        masks: (B, K, H, W) in [0, 1] of K regions, soft or hard. Where they add up to more than 1 they share the pixel
-            in proportion.
-        alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
-
-    Returns:
-        (B, k+1, H, W), ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in both.
-
-    Raises:
-        TypeError, ValueError: if ``masks`` is no such tensor or leaves [0, 1], or ``alpha`` has another number of
-            regions.
-
-    Example:
-        >>> masks = torch.tensor([1.0, 0.0, 0.5]).view(1, 1, 1, 3)
-        >>> compose_alpha(masks, torch.tensor([[3.0, 1.0]]))[0, :, 0]
-        tensor([[3., 1., 2.],
-                [1., 1., 1.]])
-    """
-    check_image(masks, "masks")
-    check_unit_range(masks, "masks")
-    check_tensor(alpha, "alpha")
-    check_dtype(alpha, "alpha", "write 1.0 instead of 1")
-    if alpha.ndim not in (2, 3) or alpha.shape[-2] != masks.shape[1] or alpha.shape[-1] < 2:
-        raise ValueError(
-            f"alpha must have shape ({masks.shape[1]}, k+1) or (B, {masks.shape[1]}, k+1), a row of sliders for every "
-            f"mask, got {tuple(alpha.shape)}; reshape it"
-        )
-    check_finite(alpha, "alpha")
-    shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
-    change = alpha.to(masks) - 1.0
-    batch = max(masks.shape[0], change.shape[0] if change.ndim == 3 else 1)
-    return 1.0 + torch.einsum("bkhw,bkl->blhw", shares.expand(batch, -1, -1, -1), change.expand(batch, -1, -1))
-
-
-def filter_regions(
-    operator: NonlocalOperator,
-    image: Tensor,
-    masks: Tensor,
-    alpha: Tensor,
-    *,
-    residual: float | Tensor | None = None,
-) -> Tensor:
-    """Filter every region with its own sliders and leave the rest of the image as it is.
-
-    Paper: eq. (12), (13) inside masks, Figs. 12, 13. With one region it is the filtered image blended by its mask.
-
-    Args:
-        operator: W.
-        image: (B, C, H, W).
-        masks: (B, K, H, W) in [0, 1], soft or hard; where they add up to more than 1 they share the pixel.
-        alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
-        residual: of :func:`polynomial_filter`, for all regions.
-
-    Returns:
-        (B, C, H, W) in the image's dtype, equal to it where all masks are 0. Differentiable in everything.
-
-    Raises:
-        TypeError, ValueError: if ``image`` does not fit the operator, or ``masks`` and ``alpha`` do not fit the image
-            or each other.
-
-    Example:
-        >>> from nlfilter_torch import nonlocal_operator
-        >>> image = torch.rand(1, 1, 12, 12, generator=torch.Generator().manual_seed(0))
-        >>> mask = torch.zeros(1, 1, 12, 12)
-        >>> mask[..., :6] = 1
-        >>> edited = filter_regions(nonlocal_operator(image, num_landmarks=20), image, mask, torch.tensor([[3.0, 1.0]]))
-        >>> torch.equal(edited[..., 6:], image[..., 6:]), torch.equal(edited[..., :6], image[..., :6])
-        (True, False)
-    """
-    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
-    check_image(image, "image")
-    check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
-    check_same_size(masks, operator.size, "masks", "operator")
-    alpha = replicate(alpha, operator.shard)
-    return blend_regions(
-        image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)
-    )
-
-
-def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
-    """:func:`filter_regions`, where ``edit`` filters the image with sliders (B, k+1, H, W) for every pixel."""
-    inside, share = _within(masks, alpha)
-    return torch.lerp(image, edit(inside), share.to(image))
-
-
-def blend_sliders(masks: Tensor, alpha: Tensor, outside: Tensor) -> Tensor:
-    """Sliders (B, k+1, H, W) of all pixels: those of :func:`blend_regions`, and ``outside`` (k+1,) where no mask is."""
-    inside, share = _within(masks, alpha)
-    return torch.lerp(outside.to(inside).view(1, -1, 1, 1).expand_as(inside), inside, share)
-
-
-def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Sliders (B, k+1, H, W), of all regions in proportion to their masks, and how much they count, (B, 1, H, W)."""
-    total = masks.sum(1, keepdim=True)
-    return compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha), total.clamp(max=1.0)

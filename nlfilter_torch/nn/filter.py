@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_image, check_same_size
-from nlfilter_torch.filtering.masks import filter_regions
+from nlfilter_torch.filtering.filters import filter_regions
 from nlfilter_torch.nn import affinity, sliders
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.parameters import check_learn

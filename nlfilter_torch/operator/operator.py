@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import fold_batch, unfold_batch
 from nlfilter_torch.core.checks import (
     called_by_edit,
     check_choice,
@@ -34,7 +35,7 @@ from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.operator.newton import PixelScaling, isolated, row_sums
 from nlfilter_torch.operator.nystrom import Completion, whitener
-from nlfilter_torch.operator.products import apply_powers, fold_batch, unfold_batch
+from nlfilter_torch.operator.products import apply_powers
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
 ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule

@@ -45,31 +45,6 @@ def _powers(
     return images, moments
 
 
-def fold_batch(image: Tensor, batch: int) -> Tensor:
-    """Images (b, C, H, W) as (batch, C', N) for an operator of ``batch`` images; either batch may be 1.
-
-    Several images under one operator become its channels, so that the factor is read once for all.
-
-    Raises:
-        ValueError: if the batches differ and neither is 1.
-    """
-    if image.shape[0] != batch and 1 not in (image.shape[0], batch):
-        raise ValueError(
-            f"image must have the operator's batch size, {batch}, or 1, got {image.shape[0]}; "
-            "build the operator from as many guides"
-        )
-    if batch == 1:
-        return image.flatten(2).flatten(0, 1).unsqueeze(0)
-    return image.flatten(2).expand(batch, -1, -1)
-
-
-def unfold_batch(planes: Tensor, images: int, size: tuple[int, int]) -> Tensor:
-    """Stacks (batch, k, C', N) back to (B, k, C, H, W), B the larger batch: the inverse of :func:`fold_batch`."""
-    if planes.shape[0] == 1:
-        planes = planes.squeeze(0).unflatten(1, (images, -1)).transpose(0, 1)
-    return planes.unflatten(-1, size)
-
-
 class _Powers(torch.autograd.Function):
     """All products share one gradient of the factor: a single matrix product, where autograd would write 2k full ones.
 

@@ -16,13 +16,20 @@ from torch import Tensor
 
 from nlfilter_torch.core import kernels as native
 from nlfilter_torch.core.autograd import once_differentiable
-from nlfilter_torch.core.blocks import SWEPT, buffered_blocks, pixel_blocks, strip_count, strips
+from nlfilter_torch.core.blocks import (
+    SWEPT,
+    buffered_blocks,
+    fold_batch,
+    pixel_blocks,
+    strip_count,
+    strips,
+    unfold_batch,
+)
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.core.communicator import Shard, reduce_sum
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.operator.products import fold_batch, unfold_batch
 
 # Directions of G below this are rounding.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha, check_choice, check_count, check_positive
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
 from nlfilter_torch.filtering.fitted import FittedFilter
-from nlfilter_torch.filtering.masks import blend_regions, blend_sliders
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.tiled.fitting import FittedMasks, fit_masks, fit_picture, for_masks
 from nlfilter_torch.tiled.sampling import Report

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED
+from nlfilter_torch.core.kernels.affinity import Affinity
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.newton import PixelScaling, scaling_from_moment
-from nlfilter_torch.operator.nystrom import Affinity
 from nlfilter_torch.operator.spectrum import CUT
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Image, Pilot, Report, Sample, patches_at, scaled_patches

@@ -18,7 +18,7 @@ from nlfilter_torch.core import instruction_sets
 from nlfilter_torch.core.checks import is_transformed
 
 if TYPE_CHECKING:
-    from nlfilter_torch.operator.nystrom import Affinity
+    from nlfilter_torch.core.kernels.affinity import Affinity
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
 LEVELS = instruction_sets.NAMES

@@ -1,0 +1,78 @@
+"""One edit for all frames of a film, by a filter fitted to some of them."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import (
+    check_alpha,
+    check_image,
+    check_photograph,
+    check_same_size,
+    check_weight,
+)
+from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.filtering.fitted import fit_filter
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import nonlocal_operator
+
+
+def filter_frames(
+    frames: Iterable[Tensor],
+    alpha: Tensor,
+    *,
+    references: Sequence[Tensor],
+    residual: float | Tensor | None = None,
+    **options: Any,
+) -> Iterator[Tensor]:
+    """Filter the frames of a film, or any set of like images, with one filter, so that the edit does not flicker.
+
+    Args:
+        frames: images (B, C, H, W) in [0, 1], read one at a time; with C = 3 they are RGB, and their colours are kept.
+        alpha: sliders (k+1,) of :func:`polynomial_filter`.
+        references: one or a few frames (1, C, H, W) of one size that show what there is to see; the filter is fitted to
+            all of them. What looks like nothing in them stays as it is.
+        residual: of :func:`polynomial_filter`.
+        **options: of :func:`nonlocal_operator`, for the luminance of the references.
+
+    Returns:
+        The edited frames, in their order, each worked out when it is asked for; values may leave [0, 1].
+
+    Raises:
+        TypeError, ValueError: if there is no reference, references differ in size, several of them come with a
+            ``spatial_bandwidth``, or a frame is no image.
+
+    Example:
+        >>> film = [torch.rand(1, 3, 16, 20, generator=torch.Generator().manual_seed(i)) for i in range(3)]
+        >>> edited = filter_frames(film, torch.tensor([2.0, 1.0]), references=film[:1], num_landmarks=20)
+        >>> [frame.shape for frame in edited]
+        [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
+    """
+    check_alpha(alpha, dimensions=(1,))
+    if not isinstance(references, Sequence):
+        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
+    if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
+        raise TypeError(f"frames must be images, got {type(frames).__name__}; pass a list or a generator")
+    if residual is not None:
+        check_weight(residual, "residual")
+    if len(references) == 0:
+        raise ValueError("references must hold at least one frame, got none; pass the first of the film")
+    if len(references) > 1 and options.get("spatial_bandwidth") is not None:
+        raise ValueError(
+            f"references must be a single frame where spatial_bandwidth is set, got {len(references)}; "
+            "their coordinates would mean several places at once"
+        )
+    for frame in references:
+        check_photograph(frame, "references", batch=1)
+        check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
+    # One above the other they are one image; the few patches across a seam are the price.
+    tall = torch.cat([reduce_channels(frame, "luminance") for frame in references], dim=2)
+    fitted = fit_filter(nonlocal_operator(tall, **options), tall, order=alpha.shape[-1] - 1)
+
+    def edit(frame: Tensor) -> Tensor:
+        check_image(frame, "frames")
+        return edit_luminance(frame, lambda planes: fitted(planes, alpha, residual=residual))
+
+    return map(edit, frames)
