@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.levin import propagate
 from benchmarks.photographs import photograph
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 
 PICTURES = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket")
 SIZE = (160, 240)

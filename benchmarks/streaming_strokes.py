@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
-from nlfilter_torch.edits.chroma import split_luminance
+from nlfilter_torch.edits.colour import split_luminance
 from nlfilter_torch.edits.recolor import colour_guide
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_colorize, stream_recolor

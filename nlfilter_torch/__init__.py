@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.filtering.filters import detail_layers as detail_layers
     from nlfilter_torch.filtering.filters import filter_regions as filter_regions
     from nlfilter_torch.filtering.filters import polynomial_filter as polynomial_filter
+    from nlfilter_torch.filtering.filters import polynomial_response as polynomial_response
     from nlfilter_torch.filtering.filters import spectral_filter as spectral_filter
     from nlfilter_torch.filtering.fit import fit_alpha as fit_alpha
     from nlfilter_torch.filtering.fitted import FittedFilter as FittedFilter
@@ -32,14 +33,13 @@ if TYPE_CHECKING:
     from nlfilter_torch.filtering.masks import diffusion_map as diffusion_map
     from nlfilter_torch.filtering.masks import diffusion_mask as diffusion_mask
     from nlfilter_torch.filtering.masks import segment_mask as segment_mask
-    from nlfilter_torch.filtering.response import polynomial_response as polynomial_response
     from nlfilter_torch.filtering.scribbles import propagate_strokes as propagate_strokes
     from nlfilter_torch.nn import DiffusionMask as DiffusionMask
     from nlfilter_torch.nn import NonlocalAffinity as NonlocalAffinity
     from nlfilter_torch.nn import NonlocalFilter as NonlocalFilter
     from nlfilter_torch.nn import PolynomialSliders as PolynomialSliders
     from nlfilter_torch.nn import SegmentMask as SegmentMask
-    from nlfilter_torch.operator.bandwidth import estimate_bandwidth as estimate_bandwidth
+    from nlfilter_torch.operator.features import estimate_bandwidth as estimate_bandwidth
     from nlfilter_torch.operator.operator import Certificate as Certificate
     from nlfilter_torch.operator.operator import Diagnostics as Diagnostics
     from nlfilter_torch.operator.operator import NonlocalOperator as NonlocalOperator
@@ -71,7 +71,7 @@ _DEFINED_IN = {
     "diffusion_map": "filtering.masks",
     "diffusion_mask": "filtering.masks",
     "enhance": "edits.detail",
-    "estimate_bandwidth": "operator.bandwidth",
+    "estimate_bandwidth": "operator.features",
     "estimate_noise": "edits.denoise",
     "filter_frames": "edits.frames",
     "filter_regions": "filtering.filters",
@@ -79,7 +79,7 @@ _DEFINED_IN = {
     "fit_filter": "filtering.fitted",
     "nonlocal_operator": "operator.operator",
     "polynomial_filter": "filtering.filters",
-    "polynomial_response": "filtering.response",
+    "polynomial_response": "filtering.filters",
     "propagate_strokes": "filtering.scribbles",
     "recolor": "edits.recolor",
     "segment_mask": "filtering.masks",

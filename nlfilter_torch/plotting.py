@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch.filtering.response import polynomial_response
+from nlfilter_torch.filtering.filters import polynomial_response
 from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.operator.spectrum import Spectrum
 

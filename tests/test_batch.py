@@ -18,7 +18,7 @@ from PIL import Image
 
 from nlfilter_torch.cli import folders, main
 from nlfilter_torch.cli.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
-from nlfilter_torch.core.ranks import Ranks, connected_ranks
+from nlfilter_torch.core.communicator import Ranks, connected_ranks
 from nlfilter_torch.edits.presets import PRESETS
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")

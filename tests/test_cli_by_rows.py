@@ -20,7 +20,7 @@ from PIL import Image
 
 from nlfilter_torch.cli import main
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.io.tiff_rows import TiffRows
+from nlfilter_torch.io.tiff import TiffRows
 from tests.test_streaming_files import PROFILE, Array, cat
 
 LITTLE = "0.03"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks

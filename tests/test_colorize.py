@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 from tests.problems import box, colour, luminance, paint
 
 

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from skimage.measure import label
 
 from nlfilter_torch import nonlocal_operator, recolor
-from nlfilter_torch.edits.chroma import group_colours, region_means, split_luminance
+from nlfilter_torch.edits.colour import group_colours, region_means, split_luminance
 from nlfilter_torch.edits.components import MAX_SPOTS, Pixels, find_spots, label_spots, unit_vectors
 from nlfilter_torch.edits.recolor import colour_guide
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint

@@ -19,7 +19,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
 from nlfilter_torch.tiled.detail import rows_in_memory
-from nlfilter_torch.tiled.leverage import draw, sample_by_influence
+from nlfilter_torch.tiled.sampling import draw, sample_by_influence
 from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.statistics import balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes

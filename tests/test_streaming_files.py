@@ -18,7 +18,7 @@ from nlfilter_torch.io import tiff
 from nlfilter_torch.io.exif import upright
 from nlfilter_torch.io.photographs import read_photograph
 from nlfilter_torch.io.rows import StoredPicture, open_picture, write_picture
-from nlfilter_torch.io.tiff_rows import TiffRows
+from nlfilter_torch.io.tiff import TiffRows
 
 Array = NDArray[Any]
 PLENTY = 1 << 30

@@ -13,7 +13,7 @@ from PIL import Image
 
 from nlfilter_torch import colorize, recolor
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.chroma import split_luminance
+from nlfilter_torch.edits.colour import split_luminance
 from nlfilter_torch.io.photographs import read_photograph
 from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor
 from nlfilter_torch.tiled.scribbles import read_strokes

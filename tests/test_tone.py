@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nlfilter_torch import adjust_tone, enhance, nonlocal_operator, polynomial_filter, sharpen
-from nlfilter_torch.edits.chroma import split_luminance
+from nlfilter_torch.edits.colour import split_luminance
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance
 
 

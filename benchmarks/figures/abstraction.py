@@ -6,7 +6,7 @@ from torch import Tensor
 from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, scene
 from nlfilter_torch import abstract
 from nlfilter_torch.edits.abstract import edge_lines, quantize
-from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
+from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 from nlfilter_torch.plotting import show_images
 
 TONES, LINES = 8, 0.8

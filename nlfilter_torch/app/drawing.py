@@ -9,7 +9,7 @@ from PIL import Image
 from torch import Tensor
 
 from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.filtering.response import polynomial_response
+from nlfilter_torch.filtering.filters import polynomial_response
 
 QUALITY = 95
 TINT, OPACITY = (255, 40, 80), 120  # of the mask

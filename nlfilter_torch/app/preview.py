@@ -20,9 +20,8 @@ from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Detail, FilterStep
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.operator.bandwidth import estimate_bandwidth
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
-from nlfilter_torch.operator.features import GuideChannels, pad_border, reduce_channels, unit_window
+from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, pad_border, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import choose_landmarks
 from nlfilter_torch.operator.nystrom import whitener

@@ -65,7 +65,7 @@ def batch(
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.cli.tiled import allowed_memory
     from nlfilter_torch.core.checks import check_patch_size
-    from nlfilter_torch.core.ranks import connected_ranks
+    from nlfilter_torch.core.communicator import connected_ranks
 
     check_patch_size(patch_size)
     allowed_memory(memory)

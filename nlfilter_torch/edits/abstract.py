@@ -21,8 +21,7 @@ from nlfilter_torch.core.checks import (
     check_share,
 )
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
-from nlfilter_torch.edits.locality import nearby
+from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
 from nlfilter_torch.operator.operator import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 

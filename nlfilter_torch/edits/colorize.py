@@ -19,8 +19,7 @@ from nlfilter_torch.core.checks import (
     check_share,
 )
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.chroma import group_colours, merge_luminance, split_luminance
-from nlfilter_torch.edits.locality import nearby
+from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import check_painted, propagate_strokes
 from nlfilter_torch.operator.operator import nonlocal_operator

@@ -1,7 +1,8 @@
-"""An edit of the luminance of a photograph that leaves its colour alone."""
+"""What edits share: luminance edited with the colours kept, chroma within the gamut, the default of spatial bandwidths."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import torch
 from torch import Tensor
 
 
@@ -32,3 +33,80 @@ def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
 
     luminance = rgb_to_grayscale(image)
     return image + (edit(luminance) - luminance)
+
+
+MAX_COLOURS = 16
+ALIKE = 0.05  # strokes whose chroma differs by less, in units of RGB, are one colour
+
+
+def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Luminance (B, 1, H, W) and chroma ``image - luminance`` (B, 3, H, W), a multiple of YCbCr's, of an RGB image."""
+    from kornia.color import rgb_to_grayscale  # kornia takes half a second to import: only who needs it waits
+
+    luminance = rgb_to_grayscale(image)
+    return luminance, image - luminance
+
+
+def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:
+    """RGB (B, 3, H, W) of that luminance, chroma scaled down where a channel would leave [0, 1].
+
+    Clipping the channels would change luminance instead, which the eye sees first.
+    """
+    # Room towards white where a channel goes up, towards black where it goes down.
+    room = torch.where(chroma > 0, 1 - luminance, luminance).clamp(min=0.0)
+    scale = (room / chroma.abs().clamp(min=1e-6)).amin(1, keepdim=True).clamp(max=1.0)
+    return luminance + scale * chroma
+
+
+def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tell the colours of strokes apart.
+
+    Args:
+        chroma: (B, 3, H, W), read where painted.
+        weights: (B, 1, H, W), above 0 where painted.
+
+    Returns:
+        Regions (B, K, H, W), the weights divided among the K colours; their mean chroma (B, K, 3); and which of them
+        count, (B, K) bool, since an image of fewer colours than others repeats its first one. At most 16 colours:
+        further ones join the nearest. Differentiable in chroma and weights with the grouping held.
+    """
+    with torch.no_grad():
+        labels = torch.stack([_label(c.flatten(1), w.flatten() > 0) for c, w in zip(chroma, weights, strict=True)])
+        numbers = torch.arange(int(labels.max()) + 1, device=labels.device)
+        counts = numbers <= labels.amax(1, keepdim=True)  # (B, K)
+        members = labels.unsqueeze(1) == torch.where(counts, numbers, 0).unsqueeze(2)  # (B, K, N)
+    regions = (members * weights.flatten(2)).unflatten(2, chroma.shape[-2:])
+    return regions, region_means(chroma, regions), counts
+
+
+def region_means(image: Tensor, regions: Tensor) -> Tensor:
+    """Means (B, K, C) of an image (B, C, H, W) over regions (B, K, H, W) of weights; summed up in float64.
+
+    In float32 the sums over megapixels would differ in the fifth digit from those over the painted pixels alone.
+    """
+    weights = regions.flatten(2).double()
+    return (weights @ image.flatten(2).double().mT / weights.sum(2, keepdim=True)).to(image)
+
+
+def _label(chroma: Tensor, painted: Tensor) -> Tensor:
+    """Number (N,) of the colour of every painted pixel of chroma (3, N), -1 for the others."""
+    paint = chroma[:, painted]  # (3, n)
+    numbers = torch.full_like(paint[0], -1, dtype=torch.long)
+    leaders: list[Tensor] = []
+    while len(leaders) < MAX_COLOURS and bool((numbers < 0).any()):
+        leader = paint[:, (numbers < 0).nonzero()[0]]  # (3, 1)
+        numbers[(numbers < 0) & ((paint - leader).norm(dim=0) < ALIKE)] = len(leaders)
+        leaders.append(leader)
+    left = numbers < 0
+    if bool(left.any()):
+        distance = (paint[:, left].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
+        numbers[left] = distance.argmin(1)
+    return torch.full_like(painted, -1, dtype=torch.long).masked_scatter(painted, numbers)
+
+
+def nearby(given: float | Tensor | None, share: float, size: Sequence[int]) -> float | Tensor:
+    """A spatial bandwidth in pixels: the one given, or for None a share of the short side of a picture (H, W).
+
+    A share, so that a preview and the photograph agree.
+    """
+    return share * min(size) if given is None else given

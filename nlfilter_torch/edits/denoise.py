@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_image, check_not_negative, check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.locality import nearby
+from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.operator.operator import NonlocalOperator, nonlocal_operator

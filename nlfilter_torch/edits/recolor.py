@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_share, check_unit_range
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.chroma import group_colours, merge_luminance, region_means, split_luminance
+from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.components import Spots, find_spots
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.operator import nonlocal_operator

@@ -1,4 +1,4 @@
-"""Operator, response and image to filtered image. Paper: Sec. III, eq. (10) to (14), Fig. 4; Appendix A, eq. (19)."""
+"""Operator, response and image to filtered image. Paper: Sec. III, eq. (10) to (14), Figs. 4 and 6; Appendix A, eq. (19)."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_dtype,
+    check_eigenvalues,
     check_finite,
     check_image,
     check_instance,
@@ -341,3 +342,32 @@ def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Sliders (B, k+1, H, W), of all regions in proportion to their masks, and how much they count, (B, 1, H, W)."""
     total = masks.sum(1, keepdim=True)
     return compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha), total.clamp(max=1.0)
+
+
+def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
+    """Gain of every eigenvalue under the sliders ``alpha``: f(0) = alpha_1 and f(1) = alpha_{k+1}.
+
+    Paper: eq. (14), in the form ``sum_i alpha_i lambda^(i-1) (1 - lambda) + alpha_{k+1} lambda^k``.
+
+    Args:
+        eigenvalues: (..., R), usually in [0, 1].
+        alpha: (k+1,) or (B, k+1) with ``eigenvalues`` (B, R); fine to coarse, at least two entries.
+
+    Returns:
+        (..., R), differentiable in both.
+
+    Raises:
+        TypeError, ValueError: if ``alpha`` is not a floating-point tensor of such a shape with at least two entries.
+
+    Example:
+        >>> import torch
+        >>> polynomial_response(torch.tensor([0.0, 0.5, 1.0]), torch.tensor([3.0, 1.0, 1.0, 1.5]))
+        tensor([3.0000, 2.0625, 1.5000])
+    """
+    check_eigenvalues(eigenvalues)
+    check_alpha(alpha, dimensions=(1, 2))
+    weights = alpha.to(eigenvalues)
+    gain = weights[..., -1:]  # Horner's scheme from the coarsest layer down
+    for i in range(weights.shape[-1] - 2, -1, -1):
+        gain = weights[..., i : i + 1] + eigenvalues * (gain - weights[..., i : i + 1])
+    return gain

@@ -4,14 +4,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED, block_length
-from nlfilter_torch.core.checks import (
-    check_image,
-    check_instance,
-    check_positive,
-    check_same_size,
-    is_hidden,
-    warn,
-)
+from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, is_hidden, warn
 from nlfilter_torch.core.communicator import reduce_max, reduce_sum, replicate
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision

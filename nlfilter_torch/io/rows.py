@@ -32,7 +32,7 @@ from nlfilter_torch.io.photographs import (
     remove_stale,
     unfinished,
 )
-from nlfilter_torch.io.tiff_rows import TiffRows
+from nlfilter_torch.io.tiff import TiffRows
 from nlfilter_torch.tiled.sources import Rows, RowSource
 
 ZARR = ".zarr"

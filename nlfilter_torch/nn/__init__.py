@@ -1,8 +1,7 @@
 """The functions of this package as ``torch.nn`` layers: parameters here, mathematics there."""
 
 from nlfilter_torch.nn.affinity import NonlocalAffinity
-from nlfilter_torch.nn.filter import NonlocalFilter
 from nlfilter_torch.nn.masks import DiffusionMask, SegmentMask
-from nlfilter_torch.nn.sliders import PolynomialSliders
+from nlfilter_torch.nn.sliders import NonlocalFilter, PolynomialSliders
 
 __all__ = ["DiffusionMask", "NonlocalAffinity", "NonlocalFilter", "PolynomialSliders", "SegmentMask"]

@@ -1,4 +1,7 @@
-"""Operator and image to filtered image, as a layer."""
+"""Operator and image to filtered image, as a layer.
+
+Image to edited image, as a layer.
+"""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -6,8 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.core.checks import check_alpha, check_tensor, check_weight, described
-from nlfilter_torch.filtering.filters import polynomial_filter, weigh_layers
+from nlfilter_torch.core.checks import check_alpha, check_image, check_same_size, check_tensor, check_weight, described
+from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
+from nlfilter_torch.nn import affinity, sliders
+from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
 
@@ -93,3 +98,81 @@ def _sliders(alpha: Any) -> Tensor:
         raise TypeError(
             f"alpha must be numbers or rows of equal length of them, got {described(alpha)}; pass (1.0, 1.0, 1.0, 1.0)"
         ) from None
+
+
+class NonlocalFilter(nn.Module):
+    """Image to edited image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` in one layer.
+
+    Paper: eq. (12), (13). The operator is built anew for every call, from the guide as it is; to move sliders over one
+    image, hold its operator or its layers and call the parts.
+
+    Args:
+        alpha: start of the sliders, fine to coarse; ones leave the image as it is. For K regions K rows of them, each
+            for the mask of its number.
+        residual: weight of what the eigenvectors do not explain; None is alpha_1.
+        learn: what trains: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``, ``"spatial_bandwidth"`` and
+            ``"patch_weights"``; see the two layers. Gradients reach image and guide in any case.
+        **options: of :func:`nonlocal_operator`.
+
+    Raises:
+        TypeError, ValueError: if ``learn`` has another name, or ``alpha``, ``residual`` or an option is not as the two
+            layers take it.
+
+    Example:
+        >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), photometric_bandwidth=0.1, num_landmarks=30)
+        >>> layer(torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))).shape
+        torch.Size([2, 3, 32, 32])
+        >>> list(layer.state_dict())
+        ['sliders.alpha']
+        >>> layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.1)
+        >>> list(layer.state_dict())
+        ['affinity.photometric_bandwidth.logarithm', 'sliders.alpha']
+    """
+
+    def __init__(
+        self,
+        alpha: Sequence[float] | Sequence[Sequence[float]] = (1.0, 1.0, 1.0, 1.0),
+        *,
+        residual: float | None = None,
+        learn: Collection[str] = ("alpha",),
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        names = check_learn(learn, sliders.LEARNABLE + affinity.LEARNABLE)
+        self.affinity = NonlocalAffinity(learn=names.intersection(affinity.LEARNABLE), **options)
+        self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(sliders.LEARNABLE))
+
+    def forward(
+        self, image: Tensor, guide: Tensor | None = None, mask: Tensor | None = None, alpha: Tensor | None = None
+    ) -> Tensor:
+        """Filter an image.
+
+        Args:
+            image: (B, C, H, W).
+            guide: (B, C', H, W) from which the operator is built; None is the image itself.
+            mask: (B, K, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
+            alpha: sliders of this call in place of the layer's own, such as another network finds them: (k+1,),
+                (B, k+1) per image or (B, k+1, H, W) per pixel; for K > 1 masks (K, k+1) or (B, K, k+1).
+
+        Returns:
+            (B, C, H, W) in the image's dtype.
+
+        Raises:
+            TypeError, ValueError: if a tensor does not fit, or there are sliders for K regions but not K masks.
+        """
+        check_image(image, "image")
+        operator = self.affinity(image if guide is None else guide)
+        if mask is not None:
+            check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]))
+            check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
+        rows = self.sliders.alpha if alpha is None else alpha
+        own_rows = alpha is None and rows.ndim == 2
+        if own_rows and mask is None:
+            raise ValueError(f"mask must have {len(rows)} channels, one for each row of sliders, got None; pass masks")
+        if mask is not None and (own_rows or mask.shape[1] > 1):
+            rows = rows.expand(mask.shape[1], -1) if rows.ndim == 1 else rows
+            return filter_regions(operator, image, mask, rows, residual=self.sliders.residual)
+        filtered: Tensor = self.sliders(operator, image, alpha)
+        if mask is None:
+            return filtered
+        return torch.lerp(image, filtered, mask.to(image))

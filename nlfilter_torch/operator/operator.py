@@ -28,9 +28,14 @@ from nlfilter_torch.core.compilation import uncompiled
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.balancing import balance, warn_of_residual
-from nlfilter_torch.operator.bandwidth import bandwidth_of_rows
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, largest_eigenvalue, limiter, shifted_gram
-from nlfilter_torch.operator.features import GuideChannels, extract_features, reduce_channels, unit_window
+from nlfilter_torch.operator.features import (
+    GuideChannels,
+    bandwidth_of_rows,
+    extract_features,
+    reduce_channels,
+    unit_window,
+)
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.operator.newton import PixelScaling, isolated, row_sums

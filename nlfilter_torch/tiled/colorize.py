@@ -9,9 +9,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count, check_patch_size, check_positive, check_share
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.chroma import merge_luminance, split_luminance
 from nlfilter_torch.edits.colorize import FAR, LOCALITY, NEAR, Stage
-from nlfilter_torch.edits.locality import nearby
+from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
 from nlfilter_torch.filtering.scribbles import FittedStrokes, fit_strokes
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel

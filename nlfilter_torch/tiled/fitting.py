@@ -17,8 +17,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.newton import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
-from nlfilter_torch.tiled.leverage import sample_by_influence
-from nlfilter_torch.tiled.sampling import Image, Report, all_blocks, take_pilot
+from nlfilter_torch.tiled.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
 from nlfilter_torch.tiled.sources import Picture, RowSource, Tile
 from nlfilter_torch.tiled.statistics import Block, Sums, balance_by_passes, limiter_by_passes, sum_up
 from nlfilter_torch.tiled.tiles import Passes, row_by_row
