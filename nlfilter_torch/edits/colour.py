@@ -1,4 +1,4 @@
-"""What edits share: luminance edited with the colours kept, chroma within the gamut, the default of spatial bandwidths."""
+"""What edits share: luminance edited with the colours kept, chroma in gamut, the default of spatial bandwidths."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""Operator, response and image to filtered image. Paper: Sec. III, eq. (10) to (14), Figs. 4 and 6; Appendix A, eq. (19)."""
+"""Operator, response and image to filtered image. Paper: Sec. III, eq. (10) to (14); Appendix A, eq. (19)."""
 
 from collections.abc import Callable
 
