@@ -39,11 +39,12 @@ if TYPE_CHECKING:
     from nlfilter_torch.nn import NonlocalFilter as NonlocalFilter
     from nlfilter_torch.nn import PolynomialSliders as PolynomialSliders
     from nlfilter_torch.nn import SegmentMask as SegmentMask
+    from nlfilter_torch.operator.build import nonlocal_operator as nonlocal_operator
+    from nlfilter_torch.operator.build import operator_from_features as operator_from_features
     from nlfilter_torch.operator.features import estimate_bandwidth as estimate_bandwidth
     from nlfilter_torch.operator.operator import Certificate as Certificate
     from nlfilter_torch.operator.operator import Diagnostics as Diagnostics
     from nlfilter_torch.operator.operator import NonlocalOperator as NonlocalOperator
-    from nlfilter_torch.operator.operator import nonlocal_operator as nonlocal_operator
     from nlfilter_torch.operator.spectrum import Spectrum as Spectrum
 
 __version__ = "0.1.0"
@@ -77,7 +78,8 @@ _DEFINED_IN = {
     "filter_regions": "filtering.filters",
     "fit_alpha": "filtering.fit",
     "fit_filter": "filtering.fitted",
-    "nonlocal_operator": "operator.operator",
+    "nonlocal_operator": "operator.build",
+    "operator_from_features": "operator.build",
     "polynomial_filter": "filtering.filters",
     "polynomial_response": "filtering.filters",
     "propagate_strokes": "filtering.scribbles",

@@ -164,7 +164,7 @@ def limited() -> tuple[Tensor, NonlocalOperator]:
 def test_a_limited_operator_is_the_unlimited_one_below_one() -> None:
     """Only what exceeded 1 changes, and it becomes 1; many products stay bounded."""
     image, operator = limited()
-    whole = operator.kernel.features(image, origin=(0, 0), halo=(0, 0))
+    whole = operator.kernel.recipe(image, origin=(0, 0), halo=(0, 0))
     factor, _ = replace(operator.kernel, limiter=None).factor(whole)
     scaled = factor * operator.scaling.unsqueeze(1)
     before = torch.linalg.eigvalsh(scaled.mT @ scaled + torch.diag_embed(operator.remainder))[0]
@@ -181,7 +181,7 @@ def test_other_pixels_follow_a_limited_operator() -> None:
     image, operator = limited()
     fitted = fit_filter(operator, image)
     torch.testing.assert_close(fitted.layers(image), detail_layers(operator, image), atol=1e-9, rtol=0)
-    again = operator.balancing(*operator.kernel.factor(operator.kernel.features(image, origin=(0, 0), halo=(0, 0))))
+    again = operator.balancing(*operator.kernel.factor(operator.kernel.recipe(image, origin=(0, 0), halo=(0, 0))))
     torch.testing.assert_close(again[1], operator.remainder, atol=1e-9, rtol=0)
 
 

@@ -18,8 +18,8 @@ from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
 from nlfilter_torch.edits.steps import Abstract, Colorize, Defocus, Detail, Recolor
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.operator import nonlocal_operator
 
 SIZE = (48, 64)
 LINE = ((0.25, 0.25), (0.5, 0.25))

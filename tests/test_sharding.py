@@ -119,7 +119,7 @@ def options(rows: slice, group: Any, dtype: torch.dtype) -> Results:
         found[f"rows {name}"] = layers.flatten(1, 2)
         assert own.grad is not None
         found[f"rows gradient {name}"] = own.grad
-        found[f"bandwidth {name}"] = torch.as_tensor(operator.kernel.photometric_bandwidth)
+        found[f"bandwidth {name}"] = torch.as_tensor(operator.kernel.recipe.photometric_bandwidth)
     return {name: value.detach() for name, value in found.items()}
 
 

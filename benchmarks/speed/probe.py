@@ -55,16 +55,16 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
         given = (operator @ image).double()
         kernel = operator.kernel
         points = kernel.landmarks.double()
-        exact_kernel = replace(
-            kernel,
-            patch_weights=kernel.patch_weights.double(),
-            photometric_bandwidth=torch.as_tensor(kernel.photometric_bandwidth).double(),
-            landmarks=points,
-            whitening=whitener(points),
+        recipe = replace(
+            kernel.recipe,
+            patch_weights=kernel.recipe.patch_weights.double(),
+            photometric_bandwidth=torch.as_tensor(kernel.recipe.photometric_bandwidth).double(),
         )
+        exact_kernel = replace(kernel, landmarks=points, whitening=whitener(points), features=recipe)
         factor, diagonal = exact_kernel.columns(image.double())
         scaling = balance(factor, diagonal).scaling
-        exact = replace(operator, factor=factor, diagonal=diagonal, scaling=scaling, kernel=exact_kernel)
+        remainder = scaling.square() * diagonal
+        exact = replace(operator, factor=factor, diagonal=diagonal, scaling=scaling, remainder=remainder)
         difference = 255 * (given - exact @ image.double())
     return {"rms": difference.square().mean().sqrt().item(), "max": difference.abs().max().item()}
 

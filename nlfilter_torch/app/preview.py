@@ -20,12 +20,10 @@ from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Detail, FilterStep
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.operator.eigenvalue_bound import is_bounded
-from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, pad_border, reduce_channels, unit_window
-from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.landmarks import choose_landmarks
-from nlfilter_torch.operator.nystrom import whitener
-from nlfilter_torch.operator.operator import NonlocalOperator, assemble, nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator, operator_from_features
+from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
+from nlfilter_torch.operator.kernel import GuideFeatures
+from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 Key = tuple[object, ...]  # the settings that something was worked out from
@@ -67,26 +65,15 @@ def sampled_operator(
             guide_channels=channels,
             generator=generator,
         )
-    weights = unit_window(patch_size, None).to(guide)
-    reduced = reduce_channels(guide, channels)
+    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, detail.spatial_bandwidth, channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
-    # The sample of a square is the pixel in its middle.
-    first, margin = (stride - 1) // 2, patch_size // 2
-    padded = pad_border(reduced, margin)[..., first:, first:]
-    patches = F.unfold(padded, patch_size, stride=stride).unflatten(1, (reduced.shape[1], -1))  # (1, C, p^2, L)
-    rows = (padded.shape[-2] - patch_size) // stride + 1
-    patches = patches.unflatten(3, (rows, -1))[..., : size[0], : size[1]].flatten(3)
-    scale = (weights.flatten() / reduced.shape[1]).sqrt() / torch.as_tensor(bandwidth).to(guide).reshape(-1, 1)
-    features = (patches * scale.view(1, 1, -1, 1)).flatten(1, 2)  # (1, C p^2, N)
-    if detail.spatial_bandwidth is not None:
-        axes = [torch.arange(n, dtype=guide.dtype) * stride / detail.spatial_bandwidth for n in size]
-        features = torch.cat([features, torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(1)[None]], dim=1)
-    count = min(detail.landmarks, features.shape[2])
-    points = choose_landmarks(features, size, count, detail.sampling, generator)  # type: ignore[arg-type]
-    kernel = Kernel(
-        weights, bandwidth, detail.spatial_bandwidth, channels, points, whitener(points), completion="diagonal"
+    return operator_from_features(
+        recipe(guide, stride=stride),
+        size=size,
+        num_landmarks=min(detail.landmarks, size[0] * size[1]),
+        landmarks=detail.sampling,  # type: ignore[arg-type]  # checked there
+        generator=generator,
     )
-    return assemble(features, kernel, size, bounded=is_bounded(detail.sampling, features.shape[2], count))
 
 
 @dataclass(frozen=True, eq=False)

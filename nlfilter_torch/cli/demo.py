@@ -34,8 +34,8 @@ def demo(
     from nlfilter_torch.filtering.filters import detail_layers, polynomial_filter
     from nlfilter_torch.filtering.masks import diffusion_mask
     from nlfilter_torch.io.photographs import check_folder
+    from nlfilter_torch.operator.build import nonlocal_operator
     from nlfilter_torch.operator.features import reduce_channels
-    from nlfilter_torch.operator.operator import nonlocal_operator
     from nlfilter_torch.plotting import (
         plot_response,
         save_figure,

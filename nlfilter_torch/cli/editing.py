@@ -13,7 +13,8 @@ from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.io.photographs import Photograph, check_output, read_photograph, write_photograph
-from nlfilter_torch.operator.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.tiled.sources import Rows
 
 

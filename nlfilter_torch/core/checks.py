@@ -346,6 +346,57 @@ def check_eigenvalues(values: Tensor) -> None:
         )
 
 
+def check_features(features: Tensor, name: str, size: int | None = None) -> None:
+    """Raise unless ``features`` is a finite floating-point (B, D, N) tensor, of ``size`` D if that is given."""
+    check_tensor(features, name)
+    check_dtype(features, name, "convert them")
+    if features.ndim != 3 or features.numel() == 0:
+        raise ValueError(
+            f"{name} must have shape (B, D, N) with at least one point, got {tuple(features.shape)}; "
+            "put points last and add the missing dimensions"
+        )
+    if size is not None and features.shape[1] != size:
+        raise ValueError(
+            f"{name} must have the {size} features of each point that the operator was made from, got "
+            f"{features.shape[1]}; work them out in the same way"
+        )
+    check_finite(features, name)
+
+
+def check_size(size: object, points: int) -> tuple[int, int]:
+    """The ``size`` (H, W) of ``points`` pixels as two integers.
+
+    Raises:
+        TypeError, ValueError: if it is no pair of positive integers with that product.
+    """
+    if not isinstance(size, tuple | list) or len(size) != 2 or any(type(length) is not int for length in size):
+        raise TypeError(f"size must be a pair of integers (H, W), got {described(size)}; pass (1, {points}), say")
+    if size[0] < 1 or size[1] < 1 or size[0] * size[1] != points:
+        raise ValueError(
+            f"size must have as many pixels as there are features, {points}, got {size[0]}x{size[1]}; "
+            f"pass (1, {points}) for points in no order"
+        )
+    return (size[0], size[1])
+
+
+def check_weights(weights: Tensor, features: Tensor) -> Tensor:
+    """Weights (B, N) in the dtype of the features (B, D, N), from (N,) or (B, N).
+
+    Raises:
+        TypeError, ValueError: if they are not positive and finite, or of another shape.
+    """
+    check_tensor(weights, "weights")
+    batch, _, points = features.shape
+    if tuple(weights.shape) not in ((points,), (1, points), (batch, points)):
+        raise ValueError(
+            f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; give one each"
+        )
+    weights = weights.detach().to(features).expand(batch, points).contiguous()
+    if not is_hidden(weights) and not bool(((weights > 0) & weights.isfinite()).all()):
+        raise ValueError("weights must be positive and finite, got others; leave out points that stand for no pixel")
+    return weights
+
+
 def warn(message: str) -> None:
     """Warn at the line that called this package, however many wrappers and modules lie between."""
     level, frame = 1, sys._getframe()

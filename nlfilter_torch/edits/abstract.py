@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
-from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 PATCH_SIZE, LANDMARKS = 3, 200  # by default

@@ -22,7 +22,7 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import check_painted, propagate_strokes
-from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 Method = Literal["regression", "kmeans"]

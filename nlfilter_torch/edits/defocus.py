@@ -21,7 +21,7 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.components import Pixels, Spots, find_spots
 from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 Aperture = Literal["disc", "gaussian"]

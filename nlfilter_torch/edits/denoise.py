@@ -11,8 +11,9 @@ from nlfilter_torch.core.checks import check_count, check_image, check_not_negat
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import pad_border
-from nlfilter_torch.operator.operator import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.operator.operator import NonlocalOperator
 
 LOCALITY = 0.2  # default spatial bandwidth as a share of the short side
 GUIDE_BLUR = 0.7  # pixels; the guide's own noise would link pixels by it

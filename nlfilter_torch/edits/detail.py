@@ -9,8 +9,8 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter
 from nlfilter_torch.filtering.masks import diffusion_mask
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.operator import nonlocal_operator
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
 SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter

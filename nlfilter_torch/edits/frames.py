@@ -9,8 +9,8 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.filtering.fitted import fit_filter
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.operator import nonlocal_operator
 
 
 def filter_frames(

@@ -13,7 +13,7 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.components import Spots, find_spots
 from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.operator.operator import nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red

@@ -10,8 +10,8 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.denoise import soften
 from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.operator import nonlocal_operator
 
 BANDWIDTH = 10 / 255  # of softened patches
 

@@ -21,8 +21,8 @@ from nlfilter_torch.edits.presets import ENTRIES, Preset, is_count, is_sliders, 
 from nlfilter_torch.edits.recolor import Recoloring
 from nlfilter_torch.edits.scribbles import Stroke, coloured, mask_of, paint, painted
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.operator import nonlocal_operator
 
 Valid = tuple[str, Callable[[Any], bool]]  # what an entry must be, in words and as a test
 

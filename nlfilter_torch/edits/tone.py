@@ -9,8 +9,8 @@ from nlfilter_torch.core.checks import check_order, check_photograph, check_weig
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.operator import nonlocal_operator
 
 
 @full_precision

@@ -24,7 +24,7 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling
+from nlfilter_torch.operator.newton import PixelScaling, weighted
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 
@@ -124,7 +124,7 @@ class FittedFilter:
         kernel = replace(
             self.kernel, landmarks=self.kernel.landmarks.expand(batch), whitening=self.kernel.whitening.expand(batch)
         )
-        features = kernel.features(image if guide is None else guide, origin=origin, halo=halo)
+        features = kernel.recipe(image if guide is None else guide, origin=origin, halo=halo)
         image = _without(image, halo)
         size = (image.shape[-2], image.shape[-1])
         step = size[1] if by_rows else features.shape[2]
@@ -184,7 +184,7 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
         )
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
-    scaling = operator.scaling.unsqueeze(1)  # (1, 1, N)
+    scaling = weighted(operator.scaling, operator.weights).unsqueeze(1)  # (1, 1, N)
     # The moment of the factor itself has a gradient.
     balancing = replace(operator.balancing, moment=moment(operator.factor, scaling, operator.shard))
     moments = torch.stack([moment(operator.factor, scaling * y, operator.shard) for y in before.unsqueeze(1)], dim=1)

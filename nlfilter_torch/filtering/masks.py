@@ -8,6 +8,7 @@ from nlfilter_torch.core.checks import check_image, check_instance, check_positi
 from nlfilter_torch.core.communicator import reduce_max, reduce_sum, replicate
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
@@ -152,13 +153,13 @@ def squared_distances(coordinates: Tensor, centres: Tensor) -> Tensor:
 
 
 def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") -> Tensor:
-    """Check regions (B, K, H, W) and scale each to unit sum, (B, K, N), in the spectrum's dtype."""
+    """Check regions (B, K, H, W) and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
     check_image(region, name, batch=spectrum.factor.shape[0])
     check_same_size(region, spectrum.size, name, "spectrum")
     flat = region.to(spectrum.factor).flatten(2)
     if bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
-    total = reduce_sum(flat.sum(2, keepdim=True), spectrum.shard)
+    total = reduce_sum(weighted(flat, spectrum.weights).sum(2, keepdim=True), spectrum.shard)
     if bool((total <= 0).any()):
         raise ValueError(
             f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
@@ -195,7 +196,8 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         assignment = _nearest(spectrum, basis, centres)
         for _ in range(ITERATIONS):
             members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
-            sizes = reduce_sum(members.sum(2, dtype=torch.float64), spectrum.shard).unsqueeze(1)  # (B, 1, K)
+            counts = weighted(members, spectrum.weights).sum(2, dtype=torch.float64)
+            sizes = reduce_sum(counts, spectrum.shard).unsqueeze(1)  # (B, 1, K)
             centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
             if members.device.type != "cpu":  # a look would be a wait
@@ -208,7 +210,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
 
 def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     """Weighted sums (B, M, K) of the coordinates ``basis @ F`` of all pixels, with weights (B, K, N); float64."""
-    return basis @ moment(spectrum.factor, spectrum.scaling.unsqueeze(1) * weights, spectrum.shard)
+    return basis @ moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights, spectrum.shard)
 
 
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:

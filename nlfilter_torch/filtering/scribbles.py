@@ -26,6 +26,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum, replicate
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 SPOT = 25 / 38400  # share of the image that a dab of a brush covers: 5x5 pixels of 160x240
@@ -90,7 +91,7 @@ def propagate_strokes(
 
     strength, reach, smoothness = (replicate(value, shard) for value in (strength, reach, smoothness))
     factor = spectrum.factor
-    weights = stroke_mask.to(factor).flatten(2)  # (B or 1, 1, N)
+    weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
     if not weights.requires_grad:  # the weight of an unpainted pixel has a derivative, but no effect
         painted = (weights > 0).any(0).squeeze(0).nonzero().squeeze(1)

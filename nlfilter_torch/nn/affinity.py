@@ -9,10 +9,11 @@ from torch import Tensor, nn
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.communicator import check_group
 from nlfilter_torch.nn.parameters import Positive, UnitWindow, check_learn, current, shown, start_or_positive
+from nlfilter_torch.operator.build import check_options, nonlocal_operator
 from nlfilter_torch.operator.features import GuideChannels, unit_window
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
-from nlfilter_torch.operator.operator import NonlocalOperator, check_options, nonlocal_operator
+from nlfilter_torch.operator.operator import NonlocalOperator
 
 LEARNABLE = ("photometric_bandwidth", "spatial_bandwidth", "patch_weights")
 

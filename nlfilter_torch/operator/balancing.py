@@ -44,6 +44,7 @@ def balance(
     tolerance: float | None = None,
     completed: bool = False,
     shard: Shard | None = None,
+    weights: Tensor | None = None,
 ) -> Balancing:
     """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
 
@@ -54,9 +55,10 @@ def balance(
             that ends above it and above 1e-4 (1e-9 in float64) raises a warning.
         completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
         shard: of the image, where other ranks have the rest of it.
+        weights: how many equal pixels each point stands for, (B, N), a constant; None is one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard)  # type: ignore[no-untyped-call]
+    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard, weights)  # type: ignore[no-untyped-call]
     warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return Balancing(scaling, total, residual, int(steps))
 
@@ -83,11 +85,17 @@ class _Balance(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, shard: Shard | None
+        ctx: Any,
+        factor: Tensor,
+        diagonal: Tensor,
+        tolerance: float,
+        completed: bool,
+        shard: Shard | None,
+        weights: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, int]:
         solve = newton.solve if completed else chebyshev.solve
-        found = solve(factor, diagonal, tolerance, shard)
-        ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse)
+        found = solve(factor, diagonal, tolerance, shard, weights)
+        ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
         ctx.shard, ctx.completed = shard, completed
         ctx.mark_non_differentiable(found.moment, found.residual)
         return found.scaling, found.moment, found.residual, found.sweeps
@@ -95,16 +103,16 @@ class _Balance(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        factor, diagonal, scaling, total, inverse = ctx.saved_tensors
+        factor, diagonal, scaling, total, inverse, weights = ctx.saved_tensors
         dtype = factor.dtype
         if not ctx.completed:  # d may be 1e25 without completion, its square too large for float32
             factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
         right = moment(factor, (weight * grad).unsqueeze(1), ctx.shard)
-        solution = newton.conjugate_gradients(factor, weight, right, inverse, ctx.shard)
-        affinity = spread(solution.to(factor).mT, factor).squeeze(1)
+        solution = newton.conjugate_gradients(factor, newton.weighted(weight, weights), right, inverse, ctx.shard)
+        affinity = newton.weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
-        grad_factor = outer_product(totals, torch.stack([-a, -scaling], dim=1).to(dtype))
-        return grad_factor, (-a * scaling).to(dtype), None, None, None
+        grad_factor = outer_product(totals, torch.stack([-a, -newton.weighted(scaling, weights)], dim=1).to(dtype))
+        return grad_factor, (-a * scaling).to(dtype), None, None, None, None

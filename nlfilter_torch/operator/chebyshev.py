@@ -13,7 +13,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
-from nlfilter_torch.operator.newton import Solution, accepted, damped
+from nlfilter_torch.operator.newton import Solution, accepted, damped, weighted
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
@@ -36,16 +36,18 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
         yield rho * previous, 2 * rho / radius
 
 
-def _start(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
+def _start(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
     """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
-    total = moment(factor, torch.ones_like(diagonal).unsqueeze(1), shard).to(factor)
+    total = moment(factor, weighted(torch.ones_like(diagonal), weights).unsqueeze(1), shard).to(factor)
     return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_SUM).rsqrt()
 
 
-def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None) -> Solution:
+def solve(
+    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None, weights: Tensor | None = None
+) -> Solution:
     """Balance any kernel: by Chebyshev's method where it converges, otherwise on processors by damped Newton steps."""
-    scaling = _start(factor, diagonal, shard)
-    total = moment(factor, scaling.unsqueeze(1), shard)
+    scaling = _start(factor, diagonal, shard, weights)
+    total = moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
     move = torch.zeros_like(scaling)
     watched = factor.device.type == "cpu"
     worst, slow = float("inf"), 0
@@ -60,7 +62,8 @@ def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | Non
             # Far from the solution the logarithm is no guide: bounded steps keep the iteration in its basin.
             step = move[:, block].mul_(momentum).sub_(sums.clamp(*TRUSTED).log_(), alpha=gain)
             torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
-            next_total += gather(following[:, None, block], rows).mT
+            part = None if weights is None else weights[:, block]
+            next_total += gather(weighted(following[:, None, block], part), rows).mT
         residual, next_total = reduce_max(residual, shard), reduce_sum(next_total, shard)
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0
@@ -72,4 +75,4 @@ def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | Non
     found = Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
     if not watched or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
         return found
-    return damped(factor, diagonal, found, tolerance, shard)
+    return damped(factor, diagonal, found, tolerance, shard, weights)

@@ -79,6 +79,7 @@ def extract_features(
     spatial_bandwidth: Bandwidth = None,
     origin: tuple[int, int] = (0, 0),
     halo: tuple[int, int] = (0, 0),
+    stride: int = 1,
 ) -> Tensor:
     """Features whose squared distance is the exponent of the kernel: ``K_ij = exp(-||x_i - x_j||^2)``.
 
@@ -91,6 +92,7 @@ def extract_features(
         spatial_bandwidth: h_x in pixels, likewise; None leaves the coordinates out.
         origin: coordinates (row, column) of the first pixel.
         halo: rows at the top and at the bottom that patches reach into, but that get no features themselves.
+        stride: n, to take only the pixel in the middle of each whole square of n x n pixels.
 
     Returns:
         (B, D, N) with D = C p^2, plus 2 with coordinates, N pixels in the rows without the halo. Pixels come last: each
@@ -102,14 +104,28 @@ def extract_features(
     padded = pad_border(guide, size // 2)
     # Real rows push as many reflected ones out: where the halo is shorter than the margin, the border is near.
     padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
-    features: Tensor = _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
+    features: Tensor = (
+        _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
+        if stride == 1
+        else _strided_patches(padded, scale, stride)
+    )
     if spatial_bandwidth is None:
         return features
-    rows = origin[0] + torch.arange(halo[0], height - halo[1], dtype=guide.dtype, device=guide.device)
-    columns = origin[1] + torch.arange(width, dtype=guide.dtype, device=guide.device)
+    height, width = (height - halo[0] - halo[1]) // stride, width // stride
+    rows = origin[0] + halo[0] + stride * torch.arange(height, dtype=guide.dtype, device=guide.device)
+    columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
     coordinates = grid / _per_image(spatial_bandwidth, guide).view(-1, 1, 1)
     return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
+
+
+def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:
+    """Weighted patches (B, C p^2, n) of every ``stride``-th pixel of a padded image."""
+    size, first = scale.shape[-1], (stride - 1) // 2
+    height, width = ((length - size + 1) // stride for length in padded.shape[-2:])
+    patches = padded.unfold(2, size, 1).unfold(3, size, 1)[:, :, first::stride, first::stride]
+    patches = patches[:, :, :height, :width].permute(0, 1, 4, 5, 2, 3)  # (B, C, p, p, h, w)
+    return (patches * scale[:, None, :, :, None, None]).flatten(4).flatten(1, 3)
 
 
 class _ScaledPatches(torch.autograd.Function):

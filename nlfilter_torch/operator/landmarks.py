@@ -39,6 +39,7 @@ def choose_landmarks(
     sampling: Sampling,
     generator: torch.Generator | None,
     shard: Shard | None = None,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Choose or compute ``count`` landmarks.
 
@@ -50,6 +51,7 @@ def choose_landmarks(
             ``"random"``: distinct random pixels.
         generator: source of randomness; None seeds a new one with 0, so that equal calls give equal landmarks.
         shard: of the image; N is then the pixels here, and the first rank's choices hold.
+        weights: (B, N), how many pixels each point stands for: candidates of k-means are drawn in proportion to them.
 
     Returns:
         (B, D, M), differentiable in the features (k-means with the assignment held). All images of a batch draw the
@@ -58,7 +60,12 @@ def choose_landmarks(
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if count == features.shape[-1] and shard is None:
         return features
-    pixels = from_first(candidate_pixels(size, count, sampling, generator).to(features.device), shard)
+    pixels = (
+        _candidates_by_weight(weights.mean(0), count, generator)
+        if weights is not None and sampling == "kmeans"
+        else candidate_pixels(size, count, sampling, generator)
+    )
+    pixels = from_first(pixels.to(features.device), shard)
     return condense(gather_columns(features, pixels, shard), count, generator, shard)
 
 
@@ -75,6 +82,16 @@ def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, gene
     if sampling == "random":
         return torch.randperm(pixels, generator=generator, device=generator.device)[:count]
     return stratified(pixels, min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count)), generator)
+
+
+def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Candidates of k-means among points with weights (N,): what :func:`stratified` picks of the pixels in order."""
+    summed = weights.double().cumsum(0).cpu()
+    pixels = round(float(summed[-1]))
+    wanted = min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count))
+    return torch.searchsorted(summed, stratified(pixels, wanted, generator).double(), right=True).clamp_(
+        max=len(summed) - 1
+    )
 
 
 def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shard | None = None) -> Tensor:

@@ -135,36 +135,52 @@ class Sample:
         return reduce_max(lacking.abs().amax((1, 2)), self.shard)
 
 
+def weighted(values: Tensor, weights: Tensor | None) -> Tensor:
+    """Values (B, ..., N) times how many pixels each point stands for, (B, N); None is one each."""
+    if weights is None:
+        return values
+    return values * weights.view(weights.shape[0], *[1] * (values.ndim - 2), -1).to(values)
+
+
+def root_mass(scaling: Tensor, weights: Tensor | None) -> Tensor:
+    """``d sqrt(w)``, (B, N): the scaling of the symmetric operator with the eigenvalues of W."""
+    return scaling if weights is None else scaling * weights.sqrt()
+
+
 def row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor, found: Tensor) -> Tensor:
     """Row sums (B, N) of W for any scaling d whose moment ``factor @ d`` is ``found``."""
     return scaling * (spread(found.to(factor).mT, factor).squeeze(1) + diagonal * scaling)
 
 
-def _draw(factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None) -> tuple[Sample, Tensor]:
+def _draw(
+    factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None, weights: Tensor | None
+) -> tuple[Sample, Tensor]:
     """A systematic sample in proportion to leverage, and its part of ``scaling``, (B, n)."""
     if 2 * count >= factor.shape[2]:
-        return Sample(factor, diagonal, torch.ones_like(diagonal), shard), scaling
+        return Sample(factor, diagonal, weighted(torch.ones_like(diagonal), weights), shard), scaling
     slope = scaling.square()
-    leverage = slope * (1 - diagonal) / (1 + slope * diagonal)  # |u|^2 is 1 - c
+    leverage = weighted(slope * (1 - diagonal) / (1 + slope * diagonal), weights)  # |u|^2 is 1 - c
     leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
     summed = leverage.double().cumsum(1)
     ticks = (torch.arange(count, dtype=torch.float64, device=factor.device) + 0.5) / count
     chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
+    weight = weight if weights is None else weight * weights.gather(1, chosen)
     columns = factor.gather(2, chosen.unsqueeze(1).expand(-1, factor.shape[1], -1))
     return Sample(columns, diagonal.gather(1, chosen), weight, shard), scaling.gather(1, chosen)
 
 
-def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
+def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
     """A first t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
     pixels = factor.shape[2]
-    few, rest = factor, diagonal
+    few, rest, each = factor, diagonal, weighted(torch.ones_like(diagonal), weights)
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
         # One at random from every stretch: a fixed stride would meet the periods of a texture.
         chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
         few, rest = factor.gather(2, chosen.expand(*factor.shape[:2], -1)), diagonal[:, chosen]
-    sample = Sample(few, rest, torch.full_like(rest, pixels / few.shape[2]), shard)
+        each = each[:, chosen] * (each.sum(1, keepdim=True) / each[:, chosen].sum(1, keepdim=True))
+    sample = Sample(few, rest, each, shard)
     sums = spread(sample.moment(torch.ones_like(rest)).to(few).mT, few).squeeze(1) + rest
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):
@@ -172,18 +188,23 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None) -> Tensor:
     return total
 
 
-def _sweep(factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None) -> tuple[Tensor, Tensor]:
-    """d(t) for all pixels, (B, N), and its moment (B, M, 1): one read of the factor."""
+def _sweep(
+    factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None, weights: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor, two if they have weights."""
     half = (total / 2).squeeze(2).to(factor)
     if native.suits(factor, diagonal, half):
         scaling, found = native.sweep(factor, diagonal, half, LARGEST)
+        if weights is not None:
+            return scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
         return scaling, reduce_sum(found.unsqueeze(2), shard)
     scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
     row = total.to(factor)
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
         torch.clamp(scaling_from_moment(columns, diagonal[:, block], row), max=LARGEST, out=scaling[:, block])
-        found += gather(scaling[:, None, block], columns).mT
+        part = None if weights is None else weights[:, block]
+        found += gather(weighted(scaling[:, None, block], part), columns).mT
     return scaling, reduce_sum(found, shard)
 
 
@@ -206,7 +227,9 @@ class Solution:
     inverse: Tensor
 
 
-def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None) -> Solution:
+def solve(
+    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None, weights: Tensor | None = None
+) -> Solution:
     """Balance a kernel with a unit diagonal, quickly where sweeps converge and by damped steps where they do not.
 
     On a processor the result has a residual of at most ``tolerance`` or of rounding, unless no scaling balances the
@@ -215,13 +238,13 @@ def solve(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | Non
     single = factor.detach().float() if factor.dtype == torch.float64 and native.level else factor
     quick = single is not factor and native.suits(single)
     found = (
-        _refined(factor, single, diagonal, tolerance, shard)
+        _refined(factor, single, diagonal, tolerance, shard, weights)
         if quick
-        else _quasi_newton(factor, diagonal, tolerance, shard)
+        else _quasi_newton(factor, diagonal, tolerance, shard, weights)
     )
     if factor.device.type != "cpu" or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
         return found
-    return damped(factor, diagonal, found, tolerance, shard)
+    return damped(factor, diagonal, found, tolerance, shard, weights)
 
 
 def accepted(factor: Tensor, tolerance: float, shard: Shard | None) -> float:
@@ -231,20 +254,22 @@ def accepted(factor: Tensor, tolerance: float, shard: Shard | None) -> float:
     return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
 
 
-def _quasi_newton(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None) -> Solution:
+def _quasi_newton(
+    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None, weights: Tensor | None
+) -> Solution:
     """Newton's method with the Jacobian of a sample, updated by what the sweeps show of the true one (BFGS)."""
     watched = factor.device.type == "cpu"
     marks, pixels = factor.shape[1:]
     ranks = 1 if shard is None else len(shard.rows)
     least, usual, most = (bound * marks // ranks for bound in PER_LANDMARK)
     count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
-    total = _guess(factor, diagonal, shard)
-    scaling, found = _sweep(factor, diagonal, total, shard)
+    total = _guess(factor, diagonal, shard, weights)
+    scaling, found = _sweep(factor, diagonal, total, shard, weights)
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), marks, marks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         before, error = total, total - found
         if gain > ROUGH if watched else sweeps < 3:
-            sample, part = _draw(factor, diagonal, scaling, count, shard)
+            sample, part = _draw(factor, diagonal, scaling, count, shard, weights)
             # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
             bias = found - sample.moment(part)
             total = found
@@ -256,7 +281,7 @@ def _quasi_newton(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Sha
             inverse = torch.cholesky_inverse(lower)
         else:
             total = total - inverse @ error
-        scaling, found = _sweep(factor, diagonal, total, shard)
+        scaling, found = _sweep(factor, diagonal, total, shard, weights)
         inverse = _updated(inverse, total - before, total - found - error)
         if not watched:
             continue
@@ -272,17 +297,25 @@ def _quasi_newton(factor: Tensor, diagonal: Tensor, tolerance: float, shard: Sha
     return Solution(scaling, found, measured[0], sweeps, inverse)
 
 
-def _refined(factor: Tensor, single: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None) -> Solution:
+def _refined(
+    factor: Tensor,
+    single: Tensor,
+    diagonal: Tensor,
+    tolerance: float,
+    shard: Shard | None,
+    weights: Tensor | None,
+) -> Solution:
     """A solution in float64, by steps worked out from the factor in float32, for which there are kernels in C."""
-    rough = _quasi_newton(single, diagonal.float(), max(tolerance, ROUGHLY), shard)
+    each = None if weights is None else weights.float()
+    rough = _quasi_newton(single, diagonal.float(), max(tolerance, ROUGHLY), shard, each)
     total, sweeps = rough.moment, rough.sweeps
     for _ in range(MAX_SWEEPS):
-        scaling, found = _sweep(factor, diagonal, total, shard)
+        scaling, found = _sweep(factor, diagonal, total, shard, weights)
         sweeps += 1
         error, d = total - found, scaling.float()
         if bool((_largest(spread(error.to(single).mT, single, d).squeeze(1), shard) <= tolerance / 2).all()):
             break
-        weight = d.square() / (1 + d.square() * diagonal.float())
+        weight = weighted(d.square() / (1 + d.square() * diagonal.float()), each)
         total = total - conjugate_gradients(single, weight, error, rough.inverse, shard)
     residual = _largest(row_sums(factor, diagonal, scaling, found) - 1, shard)
     return Solution(scaling, found, residual, sweeps, rough.inverse)
@@ -312,7 +345,14 @@ def _largest(values: Tensor, shard: Shard | None) -> Tensor:
     return reduce_max(values.abs().nan_to_num(nan=torch.inf).amax(1), shard)
 
 
-def damped(factor: Tensor, diagonal: Tensor, start: Solution, tolerance: float, shard: Shard | None) -> Solution:
+def damped(
+    factor: Tensor,
+    diagonal: Tensor,
+    start: Solution,
+    tolerance: float,
+    shard: Shard | None,
+    weights: Tensor | None = None,
+) -> Solution:
     """Balance by Newton's method on d itself, with an exact line search: it converges from any start.
 
     A balanced d is the one minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
@@ -325,39 +365,42 @@ def damped(factor: Tensor, diagonal: Tensor, start: Solution, tolerance: float, 
     scaling = torch.where(usable, start.scaling, torch.ones_like(start.scaling))
     goal, best, slow = accepted(factor, tolerance, shard), start, 0
     for steps in range(1, MAX_STEPS + 1):
-        total = moment(factor, scaling.unsqueeze(1), shard)
+        total = moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
         lacking = 1 - row_sums(factor, diagonal, scaling, total)
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
-        gram = reduce_sum(sum_grams(factor, scaling * share.sqrt(), None, 1)[:, 0], shard)
+        gram = reduce_sum(sum_grams(factor, scaling * weighted(share, weights).sqrt(), None, 1)[:, 0], shard)
         lower = torch.linalg.cholesky_ex(gram + torch.eye(gram.shape[1], dtype=gram.dtype, device=gram.device)).L
         residual = _largest(lacking, shard)
         found = Solution(scaling, total, residual, start.sweeps + 3 * steps, torch.cholesky_inverse(lower))
         slow = 0 if bool((residual.max() < 0.5 * best.residual.max()).all()) else slow + 1
         if bool(residual.max() <= best.residual.max()):
             best = found
-        right = moment(factor, (scaling * (share * lacking)).unsqueeze(1), shard)
+        right = moment(factor, weighted(scaling * (share * lacking), weights).unsqueeze(1), shard)
         affinity = spread(torch.cholesky_solve(right, lower).to(factor).mT, factor, scaling).squeeze(1)
         step = share * (lacking - affinity)
         small = bool(_largest(step, shard).max() < SMALL_STEP)
         if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
             break
-        length = 1.0 if small else _line_search(step.double(), lacking.double(), shard)
+        length = 1.0 if small else _line_search(step.double(), lacking.double(), shard, weights)
         scaling = (scaling * (1 + length * step)).clamp(min=tiny).to(factor)
     return best
 
 
-def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None) -> Tensor:
+def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
     """The s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
     # W 1 = 1 - lacking and W x = lacking - x make the quadratic known.
-    linear = reduce_sum((step * (1 - lacking)).sum(1, keepdim=True), shard)
-    square = reduce_sum((step * (lacking - step)).sum(1, keepdim=True), shard)
+
+    def total(values: Tensor) -> Tensor:
+        return reduce_sum(weighted(values, weights).sum(1, keepdim=True), shard)
+
+    linear, square = total(step * (1 - lacking)), total(step * (lacking - step))
     longest = reduce_max((-step).amax(1, keepdim=True), shard).clamp(min=1e-12).reciprocal()  # where a d reaches zero
     low, high = torch.zeros_like(longest), 0.999 * longest
     length = torch.minimum(torch.ones_like(high), 0.5 * high)
     for _ in range(40):
         ratio = step / (1 + length * step)
-        slope = linear + length * square - reduce_sum(ratio.sum(1, keepdim=True), shard)
-        bend = square + reduce_sum(ratio.square().sum(1, keepdim=True), shard)
+        slope = linear + length * square - total(ratio)
+        bend = square + total(ratio.square())
         low, high = torch.where(slope < 0, length, low), torch.where(slope < 0, high, length)
         following = length - slope / bend
         inside = (following > low) & (following < high)

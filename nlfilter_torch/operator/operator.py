@@ -1,50 +1,44 @@
-"""Guide to operator: the filter W as an object. Paper: Sec. II."""
+"""The filter W as an object. Paper: Sec. II."""
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import fold_batch, unfold_batch
 from nlfilter_torch.core.checks import (
-    called_by_edit,
-    check_choice,
     check_count,
+    check_features,
     check_image,
-    check_instance,
-    check_number,
     check_order,
-    check_positive,
     check_same_size,
-    check_scale,
-    described,
-    is_hidden,
-    warn,
-    warn_of_scale,
 )
-from nlfilter_torch.core.communicator import Shard, check_whole, meet, reduce_max, reduce_sum, replicate, with_halo
+from nlfilter_torch.core.communicator import Shard, check_whole, reduce_max, reduce_sum
 from nlfilter_torch.core.compilation import uncompiled
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.operator.balancing import balance, warn_of_residual
-from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, largest_eigenvalue, limiter, shifted_gram
-from nlfilter_torch.operator.features import (
-    GuideChannels,
-    bandwidth_of_rows,
-    extract_features,
-    reduce_channels,
-    unit_window,
-)
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
-from nlfilter_torch.operator.newton import PixelScaling, isolated, row_sums
-from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.newton import PixelScaling, root_mass, weighted
 from nlfilter_torch.operator.products import apply_powers
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
-ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What an operator knows of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i and j are one.
+
+    Attributes:
+        factor: u, (B, M, n).
+        scaling: d, (B, n).
+        remainder: r, (B, n).
+    """
+
+    factor: Tensor
+    scaling: Tensor
+    remainder: Tensor
 
 
 @dataclass(frozen=True)
@@ -55,7 +49,7 @@ class Diagnostics:
         pixels: N.
         num_landmarks: M.
         rank: eigenvectors that rise above rounding.
-        photometric_bandwidth: h_y in units of the guide.
+        photometric_bandwidth: h_y in units of the guide; 1 for an operator that was made from features.
         balancing_steps: sweeps over the factor that balancing took.
         row_sum_residual: largest deviation of a row sum from 1.
         smallest_row_sum: the least row sum of the kernel before balancing; the plain method fails as it nears zero.
@@ -111,6 +105,8 @@ class NonlocalOperator:
         size: (H, W).
         kernel: the recipe of factor and diagonal, for the pixels of other guides.
         remainder: r, (B, N), the diagonal part of W.
+        weights: how many pixels each point stands for, (B, N); None is one each. ``W y`` is then
+            ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points stand for.
         balancing: what the scaling of other pixels is a function of.
         residual: largest deviation of a row sum of W from 1, (B,).
         balancing_steps: sweeps over the factor that balancing took.
@@ -126,7 +122,22 @@ class NonlocalOperator:
     balancing: PixelScaling
     residual: Tensor
     balancing_steps: int
+    weights: Tensor | None = None
     shard: Shard | None = None
+
+    def at(self, features: Tensor) -> Columns:
+        """What W knows of any points: their columns, as functions of their own features and of sums over the image.
+
+        Args:
+            features: (B, D, n), of points of the image or of another one, with the meaning and scale of the features
+                that the operator was made from.
+
+        Raises:
+            TypeError, ValueError: if ``features`` is no finite floating-point tensor of that size D.
+        """
+        check_features(features, "features", self.kernel.landmarks.shape[1])
+        factor, diagonal = self.kernel.factor(features.to(self.kernel.landmarks))
+        return Columns(factor, *self.balancing(factor, diagonal))
 
     def matmul(self, image: Tensor) -> Tensor:
         """``W y``, also written ``operator @ image``. Paper: eq. (2).
@@ -153,7 +164,7 @@ class NonlocalOperator:
         check_image(image, "image")
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
-        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.shard)
+        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.shard, self.weights)
         return unfold_batch(planes, image.shape[0], self.size)
 
     @property
@@ -168,7 +179,7 @@ class NonlocalOperator:
 
     @full_precision
     def to_dense(self) -> Tensor:
-        """The whole matrix W, (B, N, N), symmetric. For small images.
+        """The whole matrix W, (B, N, N), symmetric unless its points have weights. For small images.
 
         Raises:
             ValueError: if the image has more than 16384 pixels, or not all of them are here.
@@ -180,7 +191,9 @@ class NonlocalOperator:
                 f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
             )
         scaled = self.factor * self.scaling.unsqueeze(1)  # F first: without completion U may be too small to square
-        return scaled.mT @ scaled + torch.diag_embed(self.remainder)
+        matrix = scaled.mT @ scaled
+        matrix = matrix if self.weights is None else matrix * self.weights.unsqueeze(1)
+        return matrix + torch.diag_embed(self.remainder)
 
     @uncompiled
     @full_precision
@@ -196,7 +209,7 @@ class NonlocalOperator:
         if rank is not None:
             check_count(rank, "rank")
         remainder = self.remainder if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.shard)
+        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.shard, self.weights)
 
     @full_precision
     @torch.no_grad()
@@ -214,11 +227,12 @@ class NonlocalOperator:
         batch, generator = self.factor.shape[0], torch.Generator().manual_seed(0)
         images = torch.randn(1, 2, *self.size, generator=generator, dtype=torch.float64).to(self.factor)
         x, y = images.expand(batch, -1, -1, -1).split(1, dim=1)
-        products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().sum((2, 3))
+        products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().flatten(2)
+        products = weighted(products, self.weights).sum(2)
         inner = reduce_sum(products, self.shard)
         lengths = reduce_sum(images.double().square().sum((0, 2, 3)), self.shard)
         highest, lowest = (reduce_max((sign * self.remainder).amax(1), self.shard) for sign in (1, -1))
-        gram = shifted_gram(self.factor, self.scaling, self.remainder, self.shard)
+        gram = shifted_gram(self.factor, root_mass(self.scaling, self.weights), self.remainder, self.shard)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
             row_sums=reduce_max((self.row_sums() - 1).abs().amax((1, 2, 3)), self.shard).tolist(),
@@ -234,217 +248,29 @@ class NonlocalOperator:
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]
         image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
-        error = (image - spectrum.eigenvalues[:, :, None, None] * vectors).square().sum((2, 3))
+        error = (image - spectrum.eigenvalues[:, :, None, None] * vectors).square().flatten(2)
+        error = weighted(error, self.weights).sum(2)
         residual = reduce_sum(error, self.shard).sqrt()
         flat = vectors.flatten(2)
+        inner = reduce_sum(weighted(flat, self.weights) @ flat.mT, self.shard)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
-        total = moment(self.factor, torch.ones_like(self.scaling).unsqueeze(1), self.shard).to(self.factor)
+        ones = weighted(torch.ones_like(self.scaling), self.weights).unsqueeze(1)
+        total = moment(self.factor, ones, self.shard).to(self.factor)
         kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
-        bandwidth = torch.as_tensor(self.kernel.photometric_bandwidth).reshape(-1).expand(self.factor.shape[0])
+        recipe = self.kernel.features
+        bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)
         return Diagnostics(
             pixels=spectrum.pixels,
             num_landmarks=self.factor.shape[1],
             rank=spectrum.support.sum(1).tolist(),
-            photometric_bandwidth=bandwidth.tolist(),
+            photometric_bandwidth=bandwidth.expand(self.factor.shape[0]).tolist(),
             balancing_steps=self.balancing_steps,
             row_sum_residual=certificate.row_sums,
             smallest_row_sum=(-reduce_max(-kernel_sums.amin(1), self.shard)).tolist(),
             largest_eigenvalue=certificate.largest_eigenvalue,
             eigenvector_residual=residual.amax(1).tolist(),
-            orthogonality=(reduce_sum(flat @ flat.mT, self.shard) - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(reduce_sum(self.diagonal_share.sum((1, 2, 3)), self.shard) / spectrum.pixels).tolist(),
+            orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
+            diagonal_share=(
+                reduce_sum(weighted(self.remainder, self.weights).sum(1), self.shard) / spectrum.pixels
+            ).tolist(),
         )
-
-
-def check_options(
-    *,
-    num_landmarks: int,
-    landmarks: str,
-    completion: str,
-    guide_channels: str,
-    tolerance: float | None,
-    generator: torch.Generator | None,
-) -> None:
-    """Raise unless those options of :func:`nonlocal_operator` are right that can be checked without its guide."""
-    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    remedy = "choose one of these, and pass how many there are as num_landmarks"
-    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
-    check_choice(completion, "completion", ("diagonal", "none"))
-    check_count(num_landmarks, "num_landmarks")
-    if tolerance is not None:
-        check_number(tolerance, "tolerance", "pass a float or None")
-        check_positive(tolerance, "tolerance")
-    if generator is not None:
-        check_instance(generator, torch.Generator, "generator", "make one with torch.Generator()")
-
-
-def _is_small(bandwidth: float | Tensor | str) -> bool:
-    """Whether a photometric bandwidth is one for an image in [0, 1], or ``"auto"``."""
-    if isinstance(bandwidth, Tensor):
-        return not is_hidden(bandwidth) and bool((bandwidth.detach() < 1).all())
-    return isinstance(bandwidth, str) or bandwidth < 1
-
-
-@uncompiled
-@full_precision
-def nonlocal_operator(
-    guide: Tensor,
-    *,
-    patch_size: int = 5,
-    photometric_bandwidth: float | Tensor | Literal["auto"] = "auto",
-    spatial_bandwidth: float | Tensor | None = None,
-    num_landmarks: int = 100,
-    landmarks: Sampling = "kmeans",
-    completion: Completion = "diagonal",
-    guide_channels: GuideChannels = "luminance",
-    patch_weights: Tensor | None = None,
-    tolerance: float | None = None,
-    generator: torch.Generator | None = None,
-    group: Any = None,
-) -> NonlocalOperator:
-    """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
-
-    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
-    autocast too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks
-    (for k-means, the assignment of pixels to centroids) held.
-
-    Args:
-        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
-            channels with values above 16 is worth a warning, on processors, if the bandwidth is ``"auto"`` or below 1:
-            it is probably in [0, 255].
-        patch_size: p, odd, at most 101; pixels outside the image are reflected.
-        photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
-            shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
-        spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
-        num_landmarks: M; reduced with a warning where the image has fewer pixels.
-        landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
-        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method,
-            which fails at small bandwidths.
-        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides
-            of another number of channels are taken whole.
-        patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
-        tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
-        generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
-            never used.
-        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
-            this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
-            process would, for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, which
-            ``torch.distributed.group.WORLD`` is as well before there is one, is the whole image here.
-
-    Returns:
-        The operator, with row sums of 1 to ``tolerance`` or to rounding.
-
-    Raises:
-        TypeError, ValueError: naming the argument, what it must be, and what it was.
-        ConnectionError: if another rank of the group is gone; it says which.
-
-    Example:
-        >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
-        >>> operator = nonlocal_operator(guide, photometric_bandwidth=0.2, num_landmarks=20)
-        >>> (operator @ guide).shape
-        torch.Size([1, 1, 32, 48])
-        >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
-        True
-    """
-    check_image(guide, "guide")
-    check_options(
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        tolerance=tolerance,
-        generator=generator,
-    )
-    if isinstance(photometric_bandwidth, str):
-        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
-    else:
-        check_positive(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
-    if _is_small(photometric_bandwidth) and not called_by_edit():
-        warn_of_scale(guide, "guide")
-    guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-    shard = meet(guide, group)
-    size = (guide.shape[2], guide.shape[3])  # here
-    height, width = size if shard is None else (shard.height, shard.width)
-    weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
-    guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
-    if isinstance(photometric_bandwidth, str):
-        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
-    else:
-        bandwidth = replicate(photometric_bandwidth, shard)
-    largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
-    check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
-    if spatial_bandwidth is not None:
-        farthest = torch.full_like(largest, max(height, width))
-        check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
-        spatial_bandwidth = replicate(spatial_bandwidth, shard)
-    if num_landmarks > height * width:
-        warn(
-            f"num_landmarks must be at most the number of pixels, {height * width}, got {described(num_landmarks)}; "
-            "using every pixel"
-        )
-        num_landmarks = height * width
-
-    features = extract_features(
-        guide,
-        patch_weights=weights,
-        photometric_bandwidth=bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        origin=(0 if shard is None else shard.first - halo[0], 0),
-        halo=halo,
-    )
-    points = choose_landmarks(features, (height, width), num_landmarks, landmarks, generator, shard)
-    kernel = Kernel(weights, bandwidth, spatial_bandwidth, guide_channels, points, whitener(points), completion)
-    bounded = is_bounded(landmarks, height * width, num_landmarks)
-    return assemble(features, kernel, size, tolerance=tolerance, bounded=bounded, shard=shard)
-
-
-def assemble(
-    features: Tensor,
-    kernel: Kernel,
-    size: tuple[int, int],
-    *,
-    bounded: bool,
-    tolerance: float | None = None,
-    shard: Shard | None = None,
-) -> NonlocalOperator:
-    """The operator of pixels with features (B, D, N); ``bounded``, on processors, keeps its eigenvalues at most 1."""
-    factor, diagonal = kernel.factor(features)
-    completed, watched = kernel.completion == "diagonal", factor.device.type == "cpu"
-    balancing = balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard)
-    before: list[Tensor] = []
-    while completed and watched and len(before) < ROUNDS:
-        alone = isolated(balancing.scaling.detach())
-        if not bool(reduce_max(alone.any().to(factor), shard)):
-            break
-        before.append(balancing.moment)
-        factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
-        balancing = balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard)
-    scaling, residual = balancing.scaling, balancing.residual
-    remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = shifted_gram(factor, scaling, remainder, shard)
-    if bounded and watched and exceeds(gram, factor):
-        limit = limiter(gram, moment(factor, scaling.unsqueeze(1), shard), factor)
-        factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
-        before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
-        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard)
-        warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
-    return NonlocalOperator(
-        factor=factor,
-        diagonal=diagonal,
-        scaling=scaling,
-        size=size,
-        kernel=kernel,
-        remainder=remainder,
-        balancing=PixelScaling(balancing.moment, completed, tuple(before)),
-        residual=residual,
-        balancing_steps=balancing.steps,
-        shard=shard,
-    )
-
-
-def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, shard: Shard | None) -> Tensor:
-    """Largest deviation of a row sum from 1, (B,)."""
-    sums = row_sums(factor, diagonal, scaling, moment(factor, scaling.unsqueeze(1), shard))
-    return reduce_max((sums - 1).abs().amax(1), shard)

@@ -11,7 +11,13 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 
 
 def apply_powers(
-    factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int, shard: Shard | None = None
+    factor: Tensor,
+    scaling: Tensor,
+    remainder: Tensor,
+    image: Tensor,
+    order: int,
+    shard: Shard | None = None,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """``W y, W^2 y, ..., W^k y``.
 
@@ -22,24 +28,33 @@ def apply_powers(
         image: y, (B, C, N).
         order: k, at least 1.
         shard: of the image, where other ranks have the rest of it.
+        weights: how many equal pixels each point stands for, (B, N); None is one each.
 
     Returns:
         (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
         as the operator needs no gradient.
     """
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
-        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, shard)  # type: ignore[no-untyped-call]
+        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, shard, weights)  # type: ignore[no-untyped-call]
         return result
-    return torch.stack(_powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard)[0][1:], dim=1)
+    images, _ = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard, weights)
+    return torch.stack(images[1:], dim=1)
 
 
 def _powers(
-    factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int, shard: Shard | None
+    factor: Tensor,
+    scaling: Tensor,
+    remainder: Tensor,
+    image: Tensor,
+    order: int,
+    shard: Shard | None,
+    weights: Tensor | None,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """The k + 1 images from y to W^k y, and the k moments (B, M, C) that they passed through."""
     images, moments = [image], []
+    each = scaling if weights is None else scaling * weights.unsqueeze(1)
     for _ in range(order):
-        moments.append(moment(factor, scaling * images[-1], shard).to(factor))
+        moments.append(moment(factor, each * images[-1], shard).to(factor))
         smooth = spread(moments[-1].mT, factor, scaling.squeeze(1))
         images.append(torch.addcmul(smooth, remainder, images[-1]))
     return images, moments
@@ -48,23 +63,30 @@ def _powers(
 class _Powers(torch.autograd.Function):
     """All products share one gradient of the factor: a single matrix product, where autograd would write 2k full ones.
 
-    With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W A_i`` backwards, the loss changes by ``sum_i A_i^T dW
-    P_(i-1)``.
+    With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W^T A_i`` backwards, the loss changes by ``sum_i A_i^T dW
+    P_(i-1)``. Weights are on the right of W: they multiply its columns.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor, image: Tensor, order: int, shard: Shard | None
+        ctx: Any,
+        factor: Tensor,
+        scaling: Tensor,
+        remainder: Tensor,
+        image: Tensor,
+        order: int,
+        shard: Shard | None,
+        weights: Tensor | None,
     ) -> Tensor:
-        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard)
+        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard, weights)
         ctx.shard = shard
-        ctx.save_for_backward(factor, scaling, remainder, *images, *moments)
+        ctx.save_for_backward(factor, scaling, remainder, weights, *images, *moments)
         return torch.stack(images[1:], dim=1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder, *rest = ctx.saved_tensors
+        factor, scaling, remainder, weights, *rest = ctx.saved_tensors
         order = len(rest) // 2
         images, moments = rest[: order + 1], rest[order + 1 :]
         d, r = scaling.unsqueeze(1), remainder.unsqueeze(1)
@@ -76,11 +98,13 @@ class _Powers(torch.autograd.Function):
             before = images[i - 1]
             total = moment(factor, d * adjoint, ctx.shard).to(factor)
             affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
+            summed = before if weights is None else before * weights.unsqueeze(1)
             # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
-            grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + before * affinity).sum(1)
+            grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
             grad_remainder += (adjoint * before).sum(1)
             left += [moments[i - 1], total]
-            right += [d * adjoint, d * before]
-            adjoint = d * affinity + r * adjoint
+            right += [d * adjoint, d * summed]
+            pulled = d * affinity
+            adjoint = (pulled if weights is None else pulled * weights.unsqueeze(1)) + r * adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
-        return grad_factor, grad_scaling, grad_remainder, adjoint, None, None
+        return grad_factor, grad_scaling, grad_remainder, adjoint, None, None, None

@@ -99,6 +99,8 @@ class Spectrum(RitzPairs):
         scaling: d, (B, N).
         size: (H, W).
         largest: the first eigenvalue before it was clamped to 1, (B,).
+        weights: how many pixels each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum over
+            points with these weights.
         shard: of the image, where other ranks have the rest of it.
     """
 
@@ -107,12 +109,20 @@ class Spectrum(RitzPairs):
     scaling: Tensor
     size: tuple[int, int]
     largest: Tensor
+    weights: Tensor | None = None
     shard: Shard | None = None
 
     @property
     def pixels(self) -> int:
-        """N, of the whole image."""
+        """N, of the whole image; of weighted points the sum of their weights."""
+        if self.weights is not None:
+            return round(float(reduce_sum(self.weights[0].sum(), self.shard)))
         return self.scaling.shape[1] if self.shard is None else self.shard.pixels
+
+    @property
+    def mass(self) -> Tensor:
+        """The scaling (B, N) of values that are summed up over points: d times their weights."""
+        return self.scaling if self.weights is None else self.scaling * self.weights
 
     @property
     def eigenvectors(self) -> Tensor:
@@ -161,7 +171,7 @@ class Spectrum(RitzPairs):
         check_image(image, "image")
         check_same_size(image, self.size, "image", "spectrum")
         planes = fold_batch(image.to(self.factor), self.factor.shape[0])
-        total = moment(self.factor, self.scaling.unsqueeze(1) * planes, self.shard)  # (B, M, C)
+        total = moment(self.factor, self.mass.unsqueeze(1) * planes, self.shard)  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
@@ -176,7 +186,7 @@ class Spectrum(RitzPairs):
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
         with torch.no_grad():
-            ones = moment(self.factor, self.scaling.unsqueeze(1), self.shard)  # F 1, (B, M, 1)
+            ones = moment(self.factor, self.mass.unsqueeze(1), self.shard)  # F 1, (B, M, 1)
             cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
             cluster[:, :1] = True
             target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
@@ -197,14 +207,16 @@ def compute_spectrum(
     size: tuple[int, int],
     rank: int | None,
     shard: Shard | None = None,
+    weights: Tensor | None = None,
 ) -> Spectrum:
     """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
-    pairs = RitzPairs.of_sums(reduce_sum(compute_grams(factor, scaling, remainder, count), shard), factor.dtype)
+    each = scaling if weights is None else scaling * weights.sqrt()
+    pairs = RitzPairs.of_sums(reduce_sum(compute_grams(factor, each, remainder, count), shard), factor.dtype)
     checked = factor.dtype == torch.float32 and factor.device.type == "cpu"
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
-        grams = compute_grams(factor, scaling, remainder, count, exact=True)
+        grams = compute_grams(factor, each, remainder, count, exact=True)
         pairs = RitzPairs.of_sums(reduce_sum(grams, shard), factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
@@ -213,7 +225,9 @@ def compute_spectrum(
     vectors = pairs.ritz.vectors
     values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
-    return Spectrum(pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), shard)
+    return Spectrum(
+        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, shard
+    )
 
 
 def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

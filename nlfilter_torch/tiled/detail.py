@@ -141,7 +141,7 @@ def detail_rows(
     def edit(tile: Tile) -> Tensor:
         return _edit(tile, fitted, masks, alpha, outside, residual, channels)
 
-    yield from passes.work_out(picture, edit, fitted.kernel.patch_weights.shape[0] // 2, rows)
+    yield from passes.work_out(picture, edit, fitted.kernel.recipe.patch_weights.shape[0] // 2, rows)
 
 
 def _edit(

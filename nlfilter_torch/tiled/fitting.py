@@ -129,7 +129,7 @@ def _region_means(
     picture: Picture, regions: RowSource, name: str, kernel: Kernel, balancing: PixelScaling, report: Report
 ) -> Tensor:
     """The mean column of F over each region, (1, M, K) in float64."""
-    margin, rows = kernel.patch_weights.shape[0] // 2, picture.statistics_rows
+    margin, rows = kernel.recipe.patch_weights.shape[0] // 2, picture.statistics_rows
     total = torch.zeros(1, balancing.moment.shape[1], regions.shape[2], dtype=torch.float64)
     weight = torch.zeros(regions.shape[2], dtype=torch.float64)
     for start in range(0, picture.size[0], rows):
@@ -141,7 +141,7 @@ def _region_means(
         if not bool((weights > 0).any()):
             continue
         tile = picture.tile(start, stop, margin)
-        columns = _columns(kernel, kernel.features(tile.pixels, origin=tile.origin, halo=tile.halo), balancing)
+        columns = _columns(kernel, kernel.recipe(tile.pixels, origin=tile.origin, halo=tile.halo), balancing)
         total += (columns @ weights.to(columns)).double()
         weight += weights.double().sum(0)
     if not bool((weight > 0).all()):

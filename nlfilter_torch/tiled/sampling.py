@@ -23,7 +23,7 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.newton import PixelScaling, scaling_from_moment
 from nlfilter_torch.operator.nystrom import Completion, whitener
@@ -72,7 +72,7 @@ class Sample:
 
 def all_blocks(picture: Picture, kernel: Kernel, image: Image, report: Report, stage: str) -> Iterator[Block]:
     """Factor and diagonal of every pixel of a picture."""
-    margin = kernel.patch_weights.shape[0] // 2
+    margin = kernel.recipe.patch_weights.shape[0] // 2
     for tile in picture.tiles(margin, picture.statistics_rows):
         columns = kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
         report(stage, tile.start, picture.size[0])
@@ -152,7 +152,7 @@ def take_pilot(
     recipe = (window, photometric_bandwidth, spatial_bandwidth)
     features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
     points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
-    kernel = Kernel(*recipe, guide_channels, points, whitener(points), completion)
+    kernel = Kernel(points, whitener(points), completion, features=GuideFeatures(*recipe, guide_channels))
     weight = picture.pixels / len(even)
     sample = Sample(
         features[:, :, len(candidates) :],
@@ -215,17 +215,17 @@ def sample_by_influence(
     projects on eigenvectors (``spectral``) divides by small eigenvalues, and pixels that these depend on come in, too.
     """
     kernel, generator = pilot.kernel, np.random.default_rng(pilot.seed)
-    size = kernel.patch_weights.shape[0]
+    size = kernel.recipe.patch_weights.shape[0]
     even = EVEN * count / picture.pixels
     influence = Influence.of(pilot, spectral=spectral)
     rate = _rate(influence(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
-    recipe = (kernel.patch_weights, kernel.photometric_bandwidth, kernel.spatial_bandwidth)
+    recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
     done: list[Sample] = []
     waiting: list[Sample] = []  # of single tiles, much smaller than a chunk
     for tile in picture.tiles(size // 2, picture.statistics_rows):
         report("Sampling", tile.start, picture.size[0])
-        guide = reduce_channels(tile.pixels, kernel.guide_channels)
-        features = kernel.features(tile.pixels, origin=tile.origin, halo=tile.halo)
+        guide = reduce_channels(tile.pixels, kernel.recipe.guide_channels)
+        features = kernel.recipe(tile.pixels, origin=tile.origin, halo=tile.halo)
         likely = (even + rate * influence(features)).clamp(max=1.0)
         chosen, counts = draw(likely, generator)
         patches, places = patches_at(guide, tile, chosen, size), chosen + tile.start * picture.size[1]

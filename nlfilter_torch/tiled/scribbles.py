@@ -158,7 +158,7 @@ def gather(
     report: Report,
 ) -> Sample:
     """Pixels (n,), ascending, with their features and with ``image`` of their colours, from the rows that hold some."""
-    size, (height, width), step = kernel.patch_weights.shape[0], picture.size, picture.statistics_rows
+    size, (height, width), step = kernel.recipe.patch_weights.shape[0], picture.size, picture.statistics_rows
     patches, values = [], []
     for start in range(0, height, step):
         report("Comparing strokes", start, height)
@@ -169,8 +169,8 @@ def gather(
         chosen = places[first:last] - start * width
         tile = picture.tile(start, stop, size // 2)
         seen = guide.seen(tile)
-        patches.append(patches_at(reduce_channels(seen.pixels, kernel.guide_channels), seen, chosen, size))
+        patches.append(patches_at(reduce_channels(seen.pixels, kernel.recipe.guide_channels), seen, chosen, size))
         values.append(image(tile.inner).flatten(2)[:, :, chosen])
-    recipe = (kernel.patch_weights, kernel.photometric_bandwidth, kernel.spatial_bandwidth)
+    recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
     features = scaled_patches(torch.cat(patches, dim=2), places, picture, *recipe)
     return Sample(features, torch.cat(values, dim=2), weights[None])

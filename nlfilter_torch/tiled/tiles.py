@@ -84,7 +84,7 @@ def row_by_row(kernel: Kernel, tile: Tile, work: Callable[[Tensor], Tensor]) -> 
 
     The rounding of a product depends on its shape: a row's is the same in tiles of any height.
     """
-    features = kernel.features(tile.pixels, origin=tile.origin, halo=tile.halo)
+    features = kernel.recipe(tile.pixels, origin=tile.origin, halo=tile.halo)
     return torch.stack([work(row) for row in features.split(tile.inner.shape[-1], dim=2)], dim=2)
 
 

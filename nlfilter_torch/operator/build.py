@@ -1,0 +1,315 @@
+"""Guide, or features, to operator: landmarks, Nystrom factor, completion, balancing. Paper: Sec. II."""
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import (
+    called_by_edit,
+    check_choice,
+    check_count,
+    check_features,
+    check_image,
+    check_instance,
+    check_number,
+    check_positive,
+    check_scale,
+    check_size,
+    check_weights,
+    described,
+    is_hidden,
+    warn,
+    warn_of_scale,
+)
+from nlfilter_torch.core.communicator import Shard, meet, reduce_max, replicate, with_halo
+from nlfilter_torch.core.compilation import uncompiled
+from nlfilter_torch.core.kernels.tall_skinny import moment
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.operator.balancing import Balancing, balance, warn_of_residual
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram
+from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
+from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
+from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
+from nlfilter_torch.operator.newton import PixelScaling, isolated, root_mass, row_sums, weighted
+from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.operator import NonlocalOperator
+
+ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
+
+
+def check_options(
+    *,
+    num_landmarks: int,
+    landmarks: str,
+    completion: str,
+    tolerance: float | None,
+    generator: torch.Generator | None,
+    guide_channels: str = "all",
+) -> None:
+    """Raise unless those options of :func:`nonlocal_operator` are right that can be checked without its guide."""
+    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    remedy = "choose one of these, and pass how many there are as num_landmarks"
+    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
+    check_choice(completion, "completion", ("diagonal", "none"))
+    check_count(num_landmarks, "num_landmarks")
+    if tolerance is not None:
+        check_number(tolerance, "tolerance", "pass a float or None")
+        check_positive(tolerance, "tolerance")
+    if generator is not None:
+        check_instance(generator, torch.Generator, "generator", "make one with torch.Generator()")
+
+
+def _is_small(bandwidth: float | Tensor | str) -> bool:
+    """Whether a photometric bandwidth is one for an image in [0, 1], or ``"auto"``."""
+    if isinstance(bandwidth, Tensor):
+        return not is_hidden(bandwidth) and bool((bandwidth.detach() < 1).all())
+    return isinstance(bandwidth, str) or bandwidth < 1
+
+
+@uncompiled
+@full_precision
+def nonlocal_operator(
+    guide: Tensor,
+    *,
+    patch_size: int = 5,
+    photometric_bandwidth: float | Tensor | Literal["auto"] = "auto",
+    spatial_bandwidth: float | Tensor | None = None,
+    num_landmarks: int = 100,
+    landmarks: Sampling = "kmeans",
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "luminance",
+    patch_weights: Tensor | None = None,
+    tolerance: float | None = None,
+    generator: torch.Generator | None = None,
+    group: Any = None,
+) -> NonlocalOperator:
+    """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
+
+    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
+    autocast too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks
+    (for k-means, the assignment of pixels to centroids) held.
+
+    Args:
+        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
+            channels with values above 16 is worth a warning, on processors, if the bandwidth is ``"auto"`` or below 1:
+            it is probably in [0, 255].
+        patch_size: p, odd, at most 101; pixels outside the image are reflected.
+        photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
+            shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
+        spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
+        num_landmarks: M; reduced with a warning where the image has fewer pixels.
+        landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
+        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method,
+            which fails at small bandwidths.
+        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides
+            of another number of channels are taken whole.
+        patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
+        tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
+        generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
+            never used.
+        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
+            this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
+            process would, for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, which
+            ``torch.distributed.group.WORLD`` is as well before there is one, is the whole image here.
+
+    Returns:
+        The operator, with row sums of 1 to ``tolerance`` or to rounding.
+
+    Raises:
+        TypeError, ValueError: naming the argument, what it must be, and what it was.
+        ConnectionError: if another rank of the group is gone; it says which.
+
+    Example:
+        >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
+        >>> operator = nonlocal_operator(guide, photometric_bandwidth=0.2, num_landmarks=20)
+        >>> (operator @ guide).shape
+        torch.Size([1, 1, 32, 48])
+        >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
+        True
+    """
+    check_image(guide, "guide")
+    check_options(
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        tolerance=tolerance,
+        generator=generator,
+    )
+    if isinstance(photometric_bandwidth, str):
+        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
+    else:
+        check_positive(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+    if _is_small(photometric_bandwidth) and not called_by_edit():
+        warn_of_scale(guide, "guide")
+    guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
+    shard = meet(guide, group)
+    size = (guide.shape[2], guide.shape[3])  # here
+    height, width = size if shard is None else (shard.height, shard.width)
+    weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
+    guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
+    if isinstance(photometric_bandwidth, str):
+        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
+    else:
+        bandwidth = replicate(photometric_bandwidth, shard)
+    largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
+    check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
+    if spatial_bandwidth is not None:
+        farthest = torch.full_like(largest, max(height, width))
+        check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
+        spatial_bandwidth = replicate(spatial_bandwidth, shard)
+    recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
+    return assemble(
+        recipe(guide, origin=(0 if shard is None else shard.first - halo[0], 0), halo=halo),
+        size,
+        recipe=recipe,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        tolerance=tolerance,
+        generator=generator,
+        shard=shard,
+    )
+
+
+@uncompiled
+@full_precision
+def operator_from_features(
+    features: Tensor,
+    *,
+    size: tuple[int, int],
+    weights: Tensor | None = None,
+    num_landmarks: int = 100,
+    landmarks: Sampling = "kmeans",
+    completion: Completion = "diagonal",
+    tolerance: float | None = None,
+    generator: torch.Generator | None = None,
+    group: Any = None,
+) -> NonlocalOperator:
+    """The filter of any points, given what is compared: landmarks, Nystrom factor, completion and balancing.
+
+    Points may be the pixels of an image, every n-th of them, a weighted sample, the voxels of a volume, a point cloud.
+    :func:`nonlocal_operator` is this function on the weighted patches of a guide.
+
+    Args:
+        features: (B, D, N), for which the affinity of two points is ``exp(-|x_i - x_j|^2)``: divide them by bandwidths.
+        size: (H, W) with H * W = N, the shape of images that are filtered; (1, N) for points in no order.
+        weights: (N,) or (B, N), positive: how many equal pixels each point stands for. Landmarks are drawn in
+            proportion to them. None is one each. Constant for gradients.
+        num_landmarks: M; reduced with a warning where there are fewer points.
+        landmarks: as for :func:`nonlocal_operator`, as are ``completion``, ``tolerance``, ``generator`` and ``group``.
+        completion: see there.
+        tolerance: see there.
+        generator: see there.
+        group: see there; ``features`` and ``size`` are then what this rank has of whole rows.
+
+    Returns:
+        The operator. Differentiable once in the features.
+
+    Raises:
+        TypeError, ValueError: naming the argument, what it must be, and what it was.
+
+    Example:
+        >>> points = torch.rand(1, 3, 500, generator=torch.Generator().manual_seed(0))
+        >>> operator = operator_from_features(points / 0.3, size=(1, 500), num_landmarks=20)
+        >>> smoothed = operator @ torch.ones(1, 1, 1, 500)
+        >>> bool((smoothed - 1).abs().max() < 1e-4)
+        True
+    """
+    check_features(features, "features")
+    check_options(
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        tolerance=tolerance,
+        generator=generator,
+    )
+    size = check_size(size, features.shape[2])
+    features = features.to(working_dtype(features))
+    if weights is not None:
+        weights = check_weights(weights, features)
+    shard = meet(features.unflatten(2, size), group)
+    return assemble(
+        features,
+        size,
+        weights=weights,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        tolerance=tolerance,
+        generator=generator,
+        shard=shard,
+    )
+
+
+def assemble(
+    features: Tensor,
+    size: tuple[int, int],
+    *,
+    num_landmarks: int,
+    landmarks: Sampling,
+    completion: Completion,
+    tolerance: float | None,
+    generator: torch.Generator | None,
+    recipe: GuideFeatures | None = None,
+    weights: Tensor | None = None,
+    shard: Shard | None = None,
+) -> NonlocalOperator:
+    """The one way from features (B, D, N) to an operator; ``recipe`` is how they came from a guide, if they did."""
+    whole = size if shard is None else (shard.height, shard.width)
+    points = whole[0] * whole[1]
+    if num_landmarks > points:
+        warn(
+            f"num_landmarks must be at most the number of pixels, {points}, got {described(num_landmarks)}; "
+            "using every pixel"
+        )
+        num_landmarks = points
+    chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, shard, weights)
+    kernel = Kernel(chosen, whitener(chosen), completion, features=recipe)
+    factor, diagonal = kernel.factor(features)
+    completed, watched = completion == "diagonal", factor.device.type == "cpu"
+
+    def balanced() -> Balancing:
+        return balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard, weights=weights)
+
+    balancing = balanced()
+    before: list[Tensor] = []
+    while completed and watched and len(before) < ROUNDS:
+        alone = isolated(balancing.scaling.detach())
+        if not bool(reduce_max(alone.any().to(factor), shard)):
+            break
+        before.append(balancing.moment)
+        factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
+        balancing = balanced()
+    scaling, residual = balancing.scaling, balancing.residual
+    remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
+    gram = shifted_gram(factor, root_mass(scaling, weights), remainder, shard)
+    if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, factor):
+        limit = limiter(gram, moment(factor, weighted(scaling, weights).unsqueeze(1), shard), factor)
+        factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
+        before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
+        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard, weights)
+        warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
+    return NonlocalOperator(
+        factor=factor,
+        diagonal=diagonal,
+        scaling=scaling,
+        size=size,
+        kernel=kernel,
+        remainder=remainder,
+        balancing=PixelScaling(balancing.moment, completed, tuple(before)),
+        residual=residual,
+        balancing_steps=balancing.steps,
+        weights=weights,
+        shard=shard,
+    )
+
+
+def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
+    """Largest deviation of a row sum from 1, (B,)."""
+    sums = row_sums(factor, diagonal, scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard))
+    return reduce_max((sums - 1).abs().amax(1), shard)

@@ -1,0 +1,221 @@
+"""Operators of weighted points: against the pixels that the points stand for, and against guides."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch import (
+    NonlocalOperator,
+    captured_energy,
+    detail_layers,
+    diffusion_mask,
+    fit_filter,
+    nonlocal_operator,
+    operator_from_features,
+    polynomial_filter,
+    spectral_filter,
+)
+from nlfilter_torch.operator.newton import Solution, damped
+from nlfilter_torch.operator.operator import Columns
+from tests import reference
+from tests.problems import noise, picture, seeded
+
+COPIES = 4
+ALPHA = (3.0, 0.5, 2.0, 1.05)
+FLOATS = (torch.float32, torch.float64)
+
+
+def features_of(image: Tensor) -> Tensor:
+    """Features (1, 9, N) of an image, as an operator makes them."""
+    operator = nonlocal_operator(image, patch_size=3, photometric_bandwidth=0.2, num_landmarks=2)
+    return operator.kernel.recipe(image)
+
+
+def pair(dtype: torch.dtype, **options: Any) -> tuple[Tensor, NonlocalOperator, NonlocalOperator]:
+    """An image of 4,096 pixels, the operator of its points with weight 4, and that of the 16,384 pixels."""
+    image = picture("camera", 64, 64, dtype)
+    features = features_of(image)
+    options = {"num_landmarks": 40, "generator": None, **options}
+    points = operator_from_features(features, size=(64, 64), weights=features.new_full((4096,), COPIES), **options)
+    pixels = operator_from_features(features.repeat_interleave(COPIES, dim=2), size=(64, 256), **options)
+    return image, points, pixels
+
+
+def repeated(image: Tensor) -> Tensor:
+    return image.repeat_interleave(COPIES, dim=3)
+
+
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize(("dtype", "precision"), [(torch.float32, 1e-4), (torch.float64, 1e-9)])
+def test_points_of_weight_four_are_the_pixels_they_stand_for(
+    dtype: torch.dtype, precision: float, completion: str
+) -> None:
+    image, points, pixels = pair(dtype, completion=completion, tolerance=1e-7 if dtype == torch.float32 else None)
+
+    def assert_same(found: Tensor, expected: Tensor) -> None:
+        torch.testing.assert_close(repeated(found), expected, atol=precision, rtol=0)
+
+    torch.testing.assert_close(points.kernel.landmarks, pixels.kernel.landmarks, atol=1e-5, rtol=0)
+    assert_same(points @ image, pixels @ repeated(image))
+    assert_same(points.row_sums(), torch.ones(1, 1, 64, 256, dtype=dtype))
+    assert_same(points.diagonal_share, pixels.diagonal_share)
+    alpha = torch.tensor(ALPHA, dtype=dtype)
+    filtered = polynomial_filter(points, image, alpha, residual=0.5)
+    assert_same(filtered, polynomial_filter(pixels, repeated(image), alpha, residual=0.5))
+    spectra = points.spectrum(), pixels.spectrum()
+    ranks = min(spectrum.eigenvalues.shape[1] for spectrum in spectra)
+    values = [spectrum.eigenvalues[:, :ranks] for spectrum in spectra]
+    torch.testing.assert_close(values[0], values[1], atol=precision, rtol=0)
+    responses = [spectral_filter(s, y, torch.sqrt) for s, y in zip(spectra, (image, repeated(image)), strict=True)]
+    assert_same(*responses)
+    energies = [captured_energy(s, y) for s, y in zip(spectra, (image, repeated(image)), strict=True)]
+    torch.testing.assert_close(*energies, atol=precision, rtol=0)
+    region = torch.zeros_like(image)
+    region[..., 10:20, 10:20] = 1
+    assert_same(diffusion_mask(spectra[0], region), diffusion_mask(spectra[1], repeated(region)))
+    fits = [fit_filter(w, y).moments for w, y in ((points, image), (pixels, repeated(image)))]
+    torch.testing.assert_close(*fits, atol=1e-2, rtol=precision)
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_what_a_weighted_operator_reports_is_true_of_the_pixels(dtype: torch.dtype) -> None:
+    _, points, pixels = pair(dtype)
+    found, expected = points.diagnostics(), pixels.diagnostics()
+    assert found.pixels == expected.pixels == 16384
+    assert found.rank == expected.rank
+    for name in ("smallest_row_sum", "largest_eigenvalue", "diagonal_share"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-3, rtol=1e-4)
+    assert max(found.orthogonality) < 1e-3
+    assert max(found.eigenvector_residual) < max(expected.eigenvector_residual) + 1e-4
+    assert max(points.certify().symmetry) < 1e-5
+
+
+def test_gradients_of_weighted_points_are_those_of_the_pixels() -> None:
+    image, weights = picture("coffee", 12, 12), noise(1, 1, 12, 12, seed=2)
+    gradients = []
+    for copies in (1, COPIES):
+        features = features_of(image).detach().requires_grad_()
+        each = None if copies > 1 else torch.full((144,), float(COPIES), dtype=torch.float64)
+        operator = operator_from_features(
+            features.repeat_interleave(copies, dim=2), size=(12, 12 * copies), weights=each, num_landmarks=10
+        )
+        filtered = polynomial_filter(operator, repeated(image) if copies > 1 else image, torch.tensor(ALPHA).double())
+        by = repeated(weights) / COPIES if copies > 1 else weights
+        gradients.append(torch.autograd.grad((by * filtered).sum(), features)[0])
+    torch.testing.assert_close(*gradients, atol=1e-8, rtol=1e-6)
+
+
+def test_gradcheck_with_weights() -> None:
+    weights = noise(2, 20, seed=4) * 5 + 0.5
+    image, by = noise(2, 1, 4, 5, seed=1), noise(2, 1, 4, 5, seed=2)
+
+    def loss(features: Tensor) -> Tensor:
+        options = {"num_landmarks": 5, "landmarks": "uniform"}
+        operator = operator_from_features(features, size=(4, 5), weights=weights, **options)
+        filtered = polynomial_filter(operator, image, torch.tensor(ALPHA).double())
+        energy = captured_energy(operator.spectrum(), image)
+        return (by * filtered).sum() + energy.sum() + operator.spectrum().eigenvalues[:, 1:4].sum()
+
+    features = (noise(2, 3, 20) * 2).requires_grad_()
+    assert torch.autograd.gradcheck(loss, (features,), eps=1e-6, atol=1e-6)
+
+
+def test_damped_steps_balance_weighted_points() -> None:
+    factor = noise(1, 4, 30, seed=3) - 0.3
+    factor = factor / factor.norm(dim=1, keepdim=True).clamp(min=1.0)
+    diagonal, weights = (1 - factor.square().sum(1)).clamp(min=0.01), noise(1, 30, seed=5) * 9 + 0.5
+    scaling = torch.full((1, 30), 1e4, dtype=torch.float64)
+    start = Solution(
+        scaling, factor @ scaling.unsqueeze(2), torch.full((1,), torch.inf).double(), 0, torch.eye(4).double()
+    )
+    found = damped(factor, diagonal, start, 1e-12, None, weights)
+    sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
+    torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
+    total = factor @ (weights * found.scaling).unsqueeze(2)
+    torch.testing.assert_close(found.moment, total, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("spatial", [None, 9.0])
+def test_a_guide_is_its_features(spatial: float | None) -> None:
+    """Bit for bit: there is one assembly."""
+    image = picture("camera", 40, 50, torch.float32)
+    options = {"num_landmarks": 30}
+    operator = nonlocal_operator(image, photometric_bandwidth=0.1, spatial_bandwidth=spatial, **options)
+    points = operator_from_features(operator.kernel.recipe(image), size=(40, 50), **options)
+    for name in ("factor", "diagonal", "scaling", "remainder", "residual"):
+        assert torch.equal(getattr(points, name), getattr(operator, name))
+
+
+def test_columns_at_the_points_themselves_are_those_of_the_operator() -> None:
+    image = picture("coffee", 30, 30)
+    operator = nonlocal_operator(image)
+    columns = operator.at(operator.kernel.recipe(image))
+    assert isinstance(columns, Columns)
+    torch.testing.assert_close(columns.factor, operator.factor, atol=1e-12, rtol=0)
+    torch.testing.assert_close(columns.scaling, operator.scaling, atol=1e-9, rtol=0)
+    torch.testing.assert_close(columns.remainder, operator.remainder, atol=1e-9, rtol=0)
+
+
+def test_a_strided_guide_takes_patches_of_the_whole_one() -> None:
+    image = picture("camera", 41, 50)
+    recipe = nonlocal_operator(image, spatial_bandwidth=7.0).kernel.recipe
+    whole = recipe(image).unflatten(2, (41, 50))
+    strided = recipe(image, stride=3).unflatten(2, (13, 16))
+    torch.testing.assert_close(strided[:, :-2], whole[:, :-2, 1::3, 1::3][..., :13, :16], atol=0, rtol=0)
+    torch.testing.assert_close(strided[:, -2:], whole[:, -2:, ::3, ::3][..., :13, :16], atol=1e-12, rtol=0)
+
+
+def test_voxels_of_a_volume_are_filtered_as_by_the_dense_filter() -> None:
+    volume = noise(1, 1, 5, 6, 7)
+    places = torch.stack(torch.meshgrid(*(torch.arange(n).double() for n in (5, 6, 7)), indexing="ij")).flatten(1)
+    features = torch.cat([volume.flatten(2) / 0.2, places[None] / 2], dim=1)
+    operator = operator_from_features(features, size=(5, 42), num_landmarks=210)
+    exact = reference.balanced(reference.affinity(features[0].mT.numpy(), features[0].mT.numpy()))
+    torch.testing.assert_close(operator.to_dense()[0], torch.from_numpy(exact), atol=1e-4, rtol=0)
+
+
+def test_an_operator_of_features_has_no_guide() -> None:
+    operator = operator_from_features(noise(1, 2, 12), size=(3, 4), num_landmarks=4)
+    layers = detail_layers(operator, noise(1, 1, 3, 4))
+    assert layers.shape == (1, 4, 1, 3, 4)
+    with pytest.raises(ValueError, match=r"operator must come from nonlocal_operator .* use operator.at\(features\)"):
+        fit_filter(operator, noise(1, 1, 3, 4)).layers(noise(1, 1, 3, 4))
+    assert operator.diagnostics().photometric_bandwidth == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "sentence"),
+    [
+        ({"features": [1.0]}, TypeError, r"features must be a torch.Tensor"),
+        ({"features": noise(3, 12)}, ValueError, r"features must have shape \(B, D, N\)"),
+        ({"features": noise(1, 3, 12).round().int()}, TypeError, r"features must be of a floating-point dtype"),
+        ({"features": noise(1, 3, 12) * torch.nan}, ValueError, r"features must be finite"),
+        ({"size": 12}, TypeError, r"size must be a pair of integers .* pass \(1, 12\)"),
+        ({"size": (3, 5)}, ValueError, r"size must have as many pixels as there are features, 12, got 3x5"),
+        ({"size": (-3, -4)}, ValueError, r"size must have as many pixels"),
+        ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
+        ({"weights": torch.zeros(12)}, ValueError, r"weights must be positive and finite"),
+        ({"weights": 4.0}, TypeError, r"weights must be a torch.Tensor"),
+        ({"landmarks": 5}, ValueError, r"num_landmarks"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_sentence(changes: dict[str, Any], error: type, sentence: str) -> None:
+    arguments = {"features": noise(1, 3, 12), "size": (3, 4), "num_landmarks": 4, **changes}
+    features = arguments.pop("features")
+    with pytest.raises(error, match=sentence):
+        operator_from_features(features, **arguments)
+
+
+def test_more_landmarks_than_points_are_reduced() -> None:
+    with pytest.warns(UserWarning, match="num_landmarks must be at most the number of pixels, 12, got 100"):
+        operator = operator_from_features(noise(1, 3, 12), size=(3, 4), generator=seeded())
+    assert operator.factor.shape == (1, 12, 12)
+
+
+def test_columns_of_other_features_are_checked() -> None:
+    operator = operator_from_features(noise(1, 3, 12), size=(3, 4), num_landmarks=4)
+    assert operator.at(noise(1, 3, 5, dtype=torch.float32)).factor.shape == (1, 4, 5)
+    with pytest.raises(ValueError, match="features must have the 3 features of each point"):
+        operator.at(noise(1, 2, 5))
