@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.speed.claims import Claim, claims
+from benchmarks.speed.comparisons import SUITE
 from benchmarks.speed.floor import READS
 from benchmarks.speed.output import write
 from benchmarks.speed.plan import Record, Results, records_of
@@ -34,8 +35,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def claims_table(given: Sequence[Claim]) -> str:
-    """Every claim with its limit, what was measured, and whether it holds."""
+    """Every claim with its limit, what was measured, with quartiles where calls alternated, and whether it holds."""
     verdicts = {True: "holds", False: "**falls short**", None: "not measured"}
+
+    def measured(claim: Claim) -> str:
+        quartiles = " ({:.2f} to {:.2f})".format(*claim.quartiles) if claim.quartiles else ""
+        return figure(claim, claim.measured) + quartiles
 
     def figure(claim: Claim, value: float | None) -> str:
         digits = 0 if claim.unit == "MiB" else 1 if value is not None and value >= 20 else 2
@@ -47,7 +52,7 @@ def claims_table(given: Sequence[Claim]) -> str:
             [
                 claim.text,
                 f"{'at most' if claim.at_most else 'at least'} {figure(claim, claim.limit)}",
-                figure(claim, claim.measured),
+                measured(claim),
                 verdicts[claim.holds],
             ]
             for claim in given
@@ -101,14 +106,29 @@ def series_table(records: Sequence[Record], column: str, key: Any) -> str:
     return table(header, rows)
 
 
+def comparisons_table(records: Sequence[Record]) -> str:
+    """Two calls that alternated per row: the median of each, and median and quartiles of the ratios of their pairs."""
+    rows = []
+    for record in records:
+        ratio, (first, second) = record["ratio"], record["timings"].items()
+        rows.append(
+            [
+                record["label"],
+                *(f"{name}: {seconds(timing['median'])}" for name, timing in (first, second)),
+                f"{ratio['median']:.2f}",
+                f"{ratio['lower']:.2f} to {ratio['upper']:.2f}",
+                str(ratio["pairs"]),
+            ]
+        )
+    return table(["comparison", "first", "second", "second / first", "quartiles", "pairs"], rows)
+
+
 def other_tables(results: Results) -> list[str]:
     """Sections for what is not a series with a floor."""
-    parts = []
+    compared = records_of(results, SUITE)
+    parts = [f"## Two at a time, alternating\n\n{comparisons_table(compared)}"] if compared else []
     for suite, title in (
-        ("growth in pixels", "Twice the pixels, taking turns"),
-        ("growth in landmarks", "More landmarks, taking turns"),
         ("pictures", "Other photographs, enlarged or reduced, taking turns"),
-        ("batches", "A batch of crops and one image of as many pixels, taking turns"),
         ("dense", "Beside the dense filter, on an image that it can do"),
         ("autograd", "Beside the same filter in plain autograd"),
         ("pauses", "In a loop, and after idle seconds"),
@@ -167,8 +187,9 @@ def explanation(results: Results) -> str:
     floor = main["floor"]
     return (
         "Times are medians of calls that take turns on the same image, each after a call that does not count, as in a "
-        "loop over pictures; what it costs to come after idle seconds is measured apart. The floor is what cannot be "
-        "avoided with the matrix products of torch: "
+        "loop over pictures; what it costs to come after idle seconds is measured apart. A claim with quartiles "
+        "compares two calls that alternate: its figure is the median of the ratios of neighbouring samples. "
+        "The floor is what cannot be avoided with the matrix products of torch: "
         f"N x D x M and twice N x M x M ({seconds(floor['products'])} here) and {READS} reads of the factor "
         f"({seconds(floor['read'])} each), every part measured beside the rest in several ways of which the quickest "
         "counts; exponentials, features, landmarks and the memory for the factor are not in it. The kernels in C skip "

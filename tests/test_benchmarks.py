@@ -3,9 +3,12 @@
 import copy
 import itertools
 import json
+import math
 import sys
+from dataclasses import replace
 
 import pytest
+import torch
 
 from benchmarks import report
 from benchmarks.speed import peers
@@ -13,12 +16,23 @@ from benchmarks.speed.__main__ import main as measure
 from benchmarks.speed.__main__ import run
 from benchmarks.speed.cases import Case
 from benchmarks.speed.claims import claims
+from benchmarks.speed.comparisons import (
+    CROPS,
+    DOUBLE_PRECISION,
+    DOUBLED,
+    GROWTH,
+    MANY,
+    RESPONSE,
+    SLIDER,
+    THREADS,
+    comparisons,
+)
 from benchmarks.speed.floor import READS, floor_calls, floor_summary
 from benchmarks.speed.plan import QUICK
 from benchmarks.speed.suites import SUITES
-from benchmarks.speed.timing import Timing, take_turns
+from benchmarks.speed.timing import Timing, compare, on_threads, take_turns
 
-MEASURED = ("main", "growth", "batches", "pictures", "pauses", "slow", "dense", "autograd", "landmarks", "dtypes")
+MEASURED = ("main", "comparisons", "pictures", "pauses", "slow", "dense", "autograd", "landmarks", "dtypes")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +48,7 @@ def test_quick_run_measures_every_suite_it_was_asked_for(results):
     assert results["quick"]
     assert not results["cut"]
     ran = {record["suite"] for record in results["results"]}
-    assert ran == {*MEASURED, "growth in pixels", "growth in landmarks"} - {"growth"}
+    assert ran == set(MEASURED)
     for record in results["results"]:
         for timing in record["timings"].values():
             assert timing["median"] > 0
@@ -51,7 +65,13 @@ def test_report_of_a_run_has_its_tables_and_plots(results, tmp_path):
     source.write_text(json.dumps(results))
     report.main([str(source)])
     text = (tmp_path / "speed.md").read_text()
-    for part in ("## Claims", "scikit-image NLM 7/11", "## Over the number of landmarks", "dense filter by attention"):
+    for part in (
+        "## Claims",
+        "scikit-image NLM 7/11",
+        "## Over the number of landmarks",
+        "dense filter by attention",
+        "## Two at a time, alternating",
+    ):
         assert part in text
     assert "not measured" in text  # of a quick run, no claim is judged
     assert "holds" not in text
@@ -129,6 +149,111 @@ def test_claims_are_ratios_of_medians():
     timings["operator"] = Timing(1.7, 0.0, 1, 1)
     record["timings"]["operator"] = timings["operator"].to_json()
     assert claims({"quick": False, "results": [record]})[0].holds is False
+
+
+COMPARED = {
+    DOUBLED: "time of twice the pixels",
+    GROWTH: "exponent of m",
+    MANY: "operator of 256x256: m = 1000 / m = 250",
+    DOUBLE_PRECISION: "operator of 384x384: float64 / float32",
+    CROPS: "training step on 16 crops",
+    SLIDER: "slider move, layers held / one read",
+    RESPONSE: "any other response",
+}
+
+
+@pytest.fixture(scope="module")
+def compared():
+    """The records of a quick run of all comparisons, as JSON holds them."""
+    plan = replace(QUICK, threads=(1, 2))
+    return json.loads(json.dumps(list(comparisons(plan))))
+
+
+def test_every_comparison_has_two_timings_and_their_ratio(compared):
+    assert {record["label"] for record in compared} == {*COMPARED, THREADS, "an operator of crops"}
+    for record in compared:
+        first, second = (timing["median"] for timing in record["timings"].values())
+        assert record["ratio"]["pairs"] == 1  # of a single pair, all three are its ratio
+        assert [record["ratio"][name] for name in ("lower", "median", "upper")] == pytest.approx([second / first] * 3)
+    assert compared[0]["case"]["width"] == 2 * compared[0]["case"]["height"]  # the doubled one is the second
+
+
+def test_one_thread_is_not_compared_with_itself():
+    assert THREADS not in {record["label"] for record in comparisons(replace(QUICK, threads=(1,)))}
+
+
+@pytest.mark.parametrize(("label", "text"), COMPARED.items())
+def test_a_claim_is_judged_by_the_median_ratio_and_shows_its_quartiles(compared, label, text):
+    def judged(median):
+        ratio = {"lower": 0.5 * median, "median": median, "upper": 1.25 * median, "pairs": 5}
+        records = [record | {"ratio": ratio} for record in compared if record["label"] == label]
+        found = claims({"quick": False, "results": records})
+        (claim,) = (claim for claim in found if claim.text.startswith(text))
+        assert [other.holds for other in found if other is not claim] == [None] * (len(found) - 1)
+        return claim
+
+    limit = judged(1.0).limit
+    edge = 4**limit if label == GROWTH else limit  # the exponent from a quarter of the landmarks
+    assert judged(0.99 * edge).holds
+    assert judged(1.01 * edge).holds is False
+    expected = [value / math.log(4) for value in (math.log(2), math.log(5))] if label == GROWTH else [2.0, 5.0]
+    assert judged(4.0).quartiles == pytest.approx(expected)
+    assert "({:.2f} to {:.2f})".format(*expected) in report.claims_table([judged(4.0)])
+
+
+def test_the_worst_of_several_comparisons_counts(compared):
+    medians = iter([1.9, 2.3, 2.0, 2.1])
+    doubled = next(record for record in compared if record["label"] == DOUBLED)
+    records = [
+        doubled | {"ratio": {"lower": median - 0.1, "median": median, "upper": median + 0.1, "pairs": 5}}
+        for median in medians
+    ]
+    (claim,) = (c for c in claims({"quick": False, "results": records}) if c.holds is not None)
+    assert claim.measured == 2.3
+    assert claim.holds is False
+    assert claim.quartiles == pytest.approx((2.2, 2.4))
+
+
+def test_a_slow_moment_does_not_change_the_ratio_of_calls_that_alternate(monkeypatch):
+    """B takes twice as long as A; between A and B of the third of five pairs the machine becomes ten times slower."""
+    order, now = [], [0.0]
+
+    def call(name, cost):
+        def run():
+            order.append(name)
+            now[0] += cost * (10 if len(order) > 12 else 1)  # a warm-up each, then two calls of each per pair
+
+        return run
+
+    monkeypatch.setattr("benchmarks.speed.timing.timer", lambda: now[0])
+    timings, ratio = compare({"a": call("a", 1.0), "b": call("b", 2.0)}, threads=1, seconds=0.0, least=5)
+    rounds = [name for name, previous in zip(order, [None, *order], strict=False) if name != previous]
+    assert rounds == ["a", "b"] * 6  # a warm-up, then five pairs
+    assert timings["b"].median / timings["a"].median == pytest.approx(20)  # what the medians alone would say
+    assert ratio.pairs == 5
+    assert [ratio.lower, ratio.median, ratio.upper] == pytest.approx([2.0] * 3)
+    assert {timing.samples for timing in timings.values()} == {5}
+
+
+def test_the_ratio_is_of_one_call_each_however_many_a_sample_takes(monkeypatch):
+    now = [0.0]
+
+    def call(cost):
+        def run():
+            now[0] += cost
+
+        return run
+
+    monkeypatch.setattr("benchmarks.speed.timing.timer", lambda: now[0])
+    _, ratio = compare({"a": call(0.001), "b": call(0.5)}, threads=1, seconds=0.0, least=2)
+    assert ratio.median == pytest.approx(500)
+
+
+def test_calls_on_threads_of_their_own_leave_those_of_the_others():
+    before, seen = torch.get_num_threads(), []
+    on_threads(lambda: seen.append(torch.get_num_threads()), before + 1)()
+    assert seen == [before + 1]
+    assert torch.get_num_threads() == before
 
 
 def test_calls_take_turns():

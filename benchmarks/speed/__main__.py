@@ -61,6 +61,13 @@ def show(result: Record) -> None:
         print(f"  {name:34}{1e3 * timing['median']:10.2f} ms  (IQR {1e3 * timing['iqr']:.2f}){multiple}")
     if floor:
         print(f"  {'floor':34}{1e3 * floor['seconds']:10.2f} ms, of which a read {1e3 * floor['read']:.2f} ms")
+    if "ratio" in result:
+        first, second = result["timings"]
+        print(
+            "  {1} / {0}: {median:.2f}, quartiles {lower:.2f} to {upper:.2f} of {pairs} pairs".format(
+                first, second, **result["ratio"]
+            )
+        )
     if "error" in result:
         print("  against float64: RMS {rms:.1e}, at most {max:.1e} grey levels".format(**result["error"]))
     if "memory" in result:

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 from benchmarks.memory import MIB
+from benchmarks.speed.comparisons import CROPS, DOUBLE_PRECISION, DOUBLED, GROWTH, MANY, RESPONSE, SLIDER, SUITE
 from benchmarks.speed.plan import Plan, Record, Results, records_of
 
 MAIN = Plan()
@@ -21,6 +21,7 @@ class Claim:
         limit: the limit.
         measured: None where this run did not measure it.
         unit: of both; empty for ratios.
+        quartiles: of what was measured, where two calls alternated.
     """
 
     text: str
@@ -28,6 +29,7 @@ class Claim:
     limit: float
     measured: float | None
     unit: str = ""
+    quartiles: tuple[float, float] | None = None
 
     @property
     def holds(self) -> bool | None:
@@ -38,11 +40,14 @@ class Claim:
 
 
 def claims(results: Results) -> list[Claim]:
-    """All promises, judged by the medians of one run; a quick run keeps and breaks none."""
+    """All promises, judged by the medians of one run; a quick run keeps and breaks none.
+
+    Claims that compare two sizes or variants are judged by the median ratio of calls that alternated.
+    """
     measured = {"results": [] if results["quick"] else results["results"]}
     main = _first(measured, "main")
     operator = _median(main, "operator")
-    floor, read = (main["floor"][name] if main else None for name in ("seconds", "read"))
+    floor = main["floor"]["seconds"] if main else None
     slider = _median(main, "slider, layers held")
     side = f"{MAIN.side}x{MAIN.side}, m = {MAIN.landmarks}"
     shape = {"height": MAIN.side, "width": MAIN.side, "landmarks": MAIN.landmarks, "batch": 1}
@@ -51,36 +56,38 @@ def claims(results: Results) -> list[Claim]:
     ]
     memory = probes[0]["memory"]["added_mib"] if probes else None
     allowed = 1.3 * MAIN.case().factor_bytes / MIB + 200e6 / MIB
-    pixels = [_median(record, "operator") for record in records_of(measured, "growth in pixels")]
-    steps = [_median(record, "training step") for record in records_of(measured, "batches")]
     imported = _first(measured, "imports")
+
+    def compared(text: str, limit: float, label: str) -> Claim:
+        """At most so many times as long, in the worst of the comparisons with this label."""
+        ratios = [record["ratio"] for record in records_of(measured, SUITE) if record["label"] == label]
+        if not ratios:
+            return Claim(text, True, limit, None)
+        worst = max(ratios, key=lambda ratio: ratio["median"])
+        return Claim(text, True, limit, worst["median"], quartiles=(worst["lower"], worst["upper"]))
+
     return [
         Claim(f"operator ({side}), as a multiple of the floor", True, 1.6, _ratio(operator, floor)),
         Claim(
             "operator / OpenCV fastNlMeans 7/21", True, 1.0, _ratio(operator, _median(main, "OpenCV fastNlMeans 7/21"))
         ),
         Claim("operator / scikit-image NLM 5/6", True, 0.5, _ratio(operator, _median(main, "scikit-image NLM 5/6"))),
-        Claim("slider move, layers held / one read of the factor", True, 0.5, _ratio(slider, read)),
+        compared("slider move, layers held / one read of the factor", 0.5, SLIDER),
         Claim("OpenCV detailEnhance / slider move", False, 10.0, _ratio(_median(main, "OpenCV detailEnhance"), slider)),
-        Claim(
-            "any other response, coefficients held / one read of the factor",
-            True,
-            2.0,
-            _ratio(_median(main, "response, coefficients held"), read),
-        ),
+        compared("any other response, coefficients held / one read of the factor", 2.0, RESPONSE),
         Claim("peak memory of the operator", True, allowed, memory, "MiB"),
-        Claim(
-            "time of twice the pixels, worst of 0.25 to 4 MP",
-            True,
-            2.2,
-            max((after / before for before, after in pairwise(pixels)), default=None),
+        compared("time of twice the pixels, worst of 0.25 to 4 MP", 2.2, DOUBLED),
+        _exponent(compared("", math.inf, GROWTH)),
+        compared(
+            "operator of {0}x{0}: m = {2} / m = {1}".format(MAIN.many_side, *MAIN.many),
+            12.0,
+            MANY,
         ),
-        Claim(f"exponent of m in the time, m = {MAIN.growth[0]} to {MAIN.growth[-1]}", True, 1.6, _exponent(measured)),
-        Claim(
+        compared(f"operator of {MAIN.counts_side}x{MAIN.counts_side}: float64 / float32", 3.0, DOUBLE_PRECISION),
+        compared(
             "training step on {0} crops of {1}x{1}, m = {2} / on one image of as many pixels".format(*MAIN.crops),
-            True,
             1.3,
-            _ratio(steps[0], steps[1]) if len(steps) == 2 else None,
+            CROPS,
         ),
         Claim(
             "import of the package, after that of torch",
@@ -105,12 +112,13 @@ def _ratio(above: float | None, below: float | None) -> float | None:
     return above / below if above is not None and below is not None else None
 
 
-def _exponent(results: Results) -> float | None:
-    """Slope between the first and the last of the series over landmarks, on logarithmic axes."""
-    series = records_of(results, "growth in landmarks")
-    if len(series) < 2:
-        return None
-    first, last = series[0], series[-1]
-    return math.log(_median(last, "operator") / _median(first, "operator")) / math.log(
-        last["case"]["landmarks"] / first["case"]["landmarks"]
-    )
+def _exponent(ratio: Claim) -> Claim:
+    """Slope between the two numbers of landmarks, on logarithmic axes, from the ratio of the times."""
+    first, last = MAIN.growth
+
+    def slope(value: float) -> float:
+        return math.log(value) / math.log(last / first)
+
+    measured = None if ratio.measured is None else slope(ratio.measured)
+    spread = None if ratio.quartiles is None else (slope(ratio.quartiles[0]), slope(ratio.quartiles[1]))
+    return Claim(f"exponent of m in the time, m = {first} to {last}", True, 1.6, measured, quartiles=spread)

@@ -4,13 +4,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
+
 from benchmarks.speed.cases import Case
 from benchmarks.speed.floor import floor_calls, floor_summary
 from benchmarks.speed.probe import rounding_error
 from benchmarks.speed.timing import Call, Timing, take_turns
 
 # What one case showed, as JSON can hold it: suite, label, case, timings by name, and where they apply the floor, the
-# rounding error, the peak memory and notes about peers that were left out.
+# rounding error, the peak memory and notes about peers that were left out. A comparison has two timings and, as
+# "ratio", median and quartiles of the second over the first.
 Record = dict[str, Any]
 # A whole run: its machine, whether it was quick, and under "results" its records.
 Results = dict[str, Any]
@@ -24,17 +27,21 @@ class Plan:
         side: of the main image.
         landmarks: of the main operator.
         sizes: height and width of the series over pixels.
-        doublings: of the series that takes turns, each twice the pixels of the one before.
+        doublings: height and width of images, each twice the pixels of the one before, that are compared in pairs.
         counts: m of the series over landmarks.
         counts_side: side of the image of that series, and of those over patches and number types.
-        growth: m of the series that takes turns.
+        growth: the two m that are compared on the main image.
+        many: the two m that are compared beyond the usual numbers.
+        many_side: side of the image of that comparison.
         patches: sizes.
         crops: number, side and m of the batches.
         dense_side: of the image that the dense filter can do.
         pictures: that the main operator is built from, too.
         seconds: that a group of calls takes turns, after the least number of rounds.
-        claimed_seconds: the same for the groups that the claims rest on.
+        claimed_seconds: the same for the main group, which claims rest on.
         least: rounds.
+        pair_seconds: that two compared calls alternate, after the least number of pairs.
+        pairs: least number of them.
         pause: idle seconds before a call whose memory is to be fresh.
         processes: that measure what an import takes.
         probes: cases whose memory is measured.
@@ -48,7 +55,9 @@ class Plan:
     doublings: tuple[tuple[int, int], ...] = ((512, 512), (512, 1024), (1024, 1024), (1024, 2048), (2048, 2048))
     counts: tuple[int, ...] = (25, 50, 100, 200, 400)
     counts_side: int = 384
-    growth: tuple[int, ...] = (50, 100, 200)
+    growth: tuple[int, int] = (50, 200)
+    many: tuple[int, int] = (250, 1000)
+    many_side: int = 256
     patches: tuple[int, ...] = (1, 3, 5, 7, 11)
     crops: tuple[int, int, int] = (16, 128, 64)
     dense_side: int = 256
@@ -56,6 +65,8 @@ class Plan:
     seconds: float = 2.0
     claimed_seconds: float = 20.0
     least: int = 3
+    pair_seconds: float = 6.0
+    pairs: int = 5
     pause: float = 3.0
     processes: int = 5
     probes: int = 5
@@ -67,6 +78,10 @@ class Plan:
         main = Case(height=self.side, width=self.side, landmarks=self.landmarks, device=self.device)
         return replace(main, **changes)
 
+    def thread_counts(self) -> tuple[int, ...]:
+        """The counts to measure, ascending."""
+        return self.threads or tuple(sorted({1, torch.get_num_threads()}))
+
 
 QUICK = Plan(
     side=64,
@@ -76,6 +91,8 @@ QUICK = Plan(
     counts=(8, 16),
     counts_side=48,
     growth=(8, 16),
+    many=(16, 32),
+    many_side=32,
     patches=(1, 3),
     crops=(4, 16, 8),
     dense_side=32,
@@ -83,6 +100,8 @@ QUICK = Plan(
     seconds=0.0,
     claimed_seconds=0.0,
     least=1,
+    pair_seconds=0.0,
+    pairs=1,
     pause=0.0,
     processes=1,
     probes=2,

@@ -8,12 +8,12 @@ import torch
 
 from benchmarks.speed import peers
 from benchmarks.speed.cases import Case
+from benchmarks.speed.comparisons import SUITE, comparisons, held_calls, power, step_call
 from benchmarks.speed.plan import Plan, Record, measured, record
-from benchmarks.speed.probe import ALPHA, peak_memory, training_step
-from benchmarks.speed.timing import Call, Timing, after_pauses, discard, take_turns
+from benchmarks.speed.probe import ALPHA, peak_memory
+from benchmarks.speed.timing import Call, Timing, after_pauses, discard, quartiles, take_turns
 from nlfilter_torch import (
     NonlocalFilter,
-    PolynomialSliders,
     detail_layers,
     estimate_bandwidth,
     polynomial_filter,
@@ -64,28 +64,20 @@ def main_case(plan: Plan) -> Iterator[Record]:
     case = plan.case()
     image = case.image()
     operator = case.operator(image)
-    spectrum, layers = operator.spectrum(), detail_layers(operator, image)
-    sliders = PolynomialSliders(ALPHA).to(case.device)
-    held = spectrum.coefficients(image)
-
-    def power(eigenvalues: torch.Tensor) -> torch.Tensor:
-        return eigenvalues**0.1
-
+    spectrum = operator.spectrum()
     calls: dict[str, Call] = {
         "operator": discard(case.operator, image),
         "operator, without the kernels in C": without_kernels(discard(case.operator, image)),
         "spectrum": discard(operator.spectrum),
         "detail_layers": discard(detail_layers, operator, image),
         "new alpha, operator held": discard(polynomial_filter, operator, image, torch.tensor(ALPHA)),
-        "slider, layers held": discard(sliders.combine, layers),
         "response, spectrum held": discard(spectral_filter, spectrum, image, power),
-        "response, coefficients held": discard(spectral_filter, spectrum, image, power, coefficients=held),
     }
     others, missing = peers.prepare_all(peers.QUICK_PEERS, case)
     yield measured(
         "main",
         case,
-        calls | others,
+        calls | held_calls(operator, image) | others,
         seconds=plan.claimed_seconds,
         least=plan.least,
         error=True,
@@ -152,7 +144,7 @@ def autograd(plan: Plan) -> Iterator[Record]:
     calls = {
         "operator and filter": discard(NonlocalFilter(ALPHA, **case.options()), image),
         "plain operations": discard(plain, image),
-        "training step": _step(case),
+        "training step": step_call(case),
         "training step, plain autograd": plain_step,
     }
     timings = take_turns(calls, threads=case.used_threads, seconds=plan.seconds, least=min(2, plan.least))
@@ -194,23 +186,10 @@ def dtypes(plan: Plan) -> Iterator[Record]:
 
 def threads(plan: Plan) -> Iterator[Record]:
     """The main operator on one thread, and on all."""
-    counts = plan.threads or tuple(sorted({1, torch.get_num_threads()}))
-    for count in counts:
+    for count in plan.thread_counts():
         case = plan.case(threads=count)
         calls = {"operator": discard(case.operator, case.image())}
         yield measured("threads", case, calls, seconds=plan.seconds, least=plan.least)
-
-
-def growth(plan: Plan) -> Iterator[Record]:
-    """Operators of different sizes that take turns: how time grows with pixels and with landmarks."""
-    for suite, series in {
-        "growth in pixels": [plan.case(height=height, width=width) for height, width in plan.doublings],
-        "growth in landmarks": [plan.case(landmarks=count) for count in plan.growth],
-    }.items():
-        calls = {case.label(): discard(case.operator, case.image()) for case in series}
-        timings = take_turns(calls, threads=series[0].used_threads, seconds=plan.claimed_seconds, least=plan.least)
-        for case in series:
-            yield record(suite, case, {"operator": timings[case.label()]})
 
 
 def pictures(plan: Plan) -> Iterator[Record]:
@@ -222,29 +201,6 @@ def pictures(plan: Plan) -> Iterator[Record]:
         operator = case.operator(case.image())
         facts = {"steps": operator.balancing_steps, "residual": operator.residual.max().item()}
         yield record("pictures", case, {"operator": timings[case.picture]}, **facts)
-
-
-def batches(plan: Plan) -> Iterator[Record]:
-    """A training step on a batch of crops, and on one image that has as many pixels."""
-    count, side, marks = plan.crops
-    across = round(count**0.5)
-    series = [
-        plan.case(batch=count, height=side, width=side, landmarks=marks),
-        plan.case(height=across * side, width=across * side, landmarks=marks),
-    ]
-    steps = {case.label(): _step(case) for case in series}
-    operators = {f"{case.label()}, operator": discard(case.operator, case.image()) for case in series}
-    timings = take_turns(
-        steps | operators, threads=series[0].used_threads, seconds=plan.claimed_seconds / 2, least=plan.least
-    )
-    for case in series:
-        pair = {"training step": timings[case.label()], "operator": timings[f"{case.label()}, operator"]}
-        yield record("batches", case, pair)
-
-
-def _step(case: Case) -> Call:
-    image = case.image()
-    return lambda: training_step(case, image.detach())
 
 
 def memory(plan: Plan) -> Iterator[Record]:
@@ -263,14 +219,11 @@ def memory(plan: Plan) -> Iterator[Record]:
 
 def imports(plan: Plan) -> Iterator[Record]:
     """What ``import nlfilter_torch`` takes after ``import torch``, in fresh processes."""
-    runs = torch.tensor([_import_seconds() for _ in range(plan.processes + 1)], dtype=torch.float64)
-    quartiles = runs[1:].quantile(
-        torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64), dim=0
-    )  # the first reads the disk
-    timings = {
-        name: Timing(middle, high - low, plan.processes, 1)
-        for name, (low, middle, high) in zip(("torch", "nlfilter_torch"), quartiles.T.tolist(), strict=True)
-    }
+    runs = [_import_seconds() for _ in range(plan.processes + 1)][1:]  # the first reads the disk
+    timings = {}
+    for name, times in zip(("torch", "nlfilter_torch"), zip(*runs, strict=True), strict=True):
+        low, middle, high = quartiles(times)
+        timings[name] = Timing(middle, high - low, plan.processes, 1)
     yield record("imports", plan.case(), timings)
 
 
@@ -285,8 +238,7 @@ def _import_seconds() -> list[float]:
 
 SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
     "main": main_case,
-    "growth": growth,
-    "batches": batches,
+    SUITE: comparisons,
     "pictures": pictures,
     "memory": memory,
     "pauses": pauses,

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -38,6 +38,27 @@ class Timing:
         return asdict(self)
 
 
+@dataclass(frozen=True)
+class Ratio:
+    """How many times as long one call takes as another, from samples taken right after each other.
+
+    Attributes:
+        lower: quartile of the ratios.
+        median: of the ratios.
+        upper: quartile of the ratios.
+        pairs: how many ratios there are.
+    """
+
+    lower: float
+    median: float
+    upper: float
+    pairs: int
+
+    def to_json(self) -> dict[str, float]:
+        """As a plain dictionary."""
+        return asdict(self)
+
+
 def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least: int = 3) -> dict[str, Timing]:
     """Time several calls round after round, one sample of each per round.
 
@@ -53,6 +74,44 @@ def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least
     Returns:
         A timing by name. The first call of each, which pays for imports and memory, is not counted.
     """
+    samples, repeats = _rounds(calls, threads, seconds, least)
+    return {name: _summary(name, samples[name], repeats[name], threads) for name in calls}
+
+
+def compare(calls: Mapping[str, Call], *, threads: int, seconds: float, least: int) -> tuple[dict[str, Timing], Ratio]:
+    """Time two calls in turns, A B A B, and divide each sample of B by the sample of A just before it.
+
+    Other work on the machine slows both samples of a pair or, if it starts or ends between them, spoils one ratio of
+    many, which moves the median little.
+
+    Args:
+        calls: A and B, by name, in this order.
+        threads: of torch.
+        seconds: start no further pair after so many, once there have been ``least``.
+        least: pairs.
+
+    Returns:
+        A timing of each by name, and the ratio B / A.
+    """
+    samples, repeats = _rounds(calls, threads, seconds, least)
+    first, second = ([time / repeats[name] for time in samples[name]] for name in calls)
+    lower, median, upper = quartiles([after / before for before, after in zip(first, second, strict=True)])
+    timings = {name: _summary(name, samples[name], repeats[name], threads) for name in calls}
+    return timings, Ratio(lower, median, upper, len(first))
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Lower quartile, median and upper quartile."""
+    lower, median, upper = torch.tensor(values, dtype=torch.float64).quantile(
+        torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
+    )
+    return lower.item(), median.item(), upper.item()
+
+
+def _rounds(
+    calls: Mapping[str, Call], threads: int, seconds: float, least: int
+) -> tuple[dict[str, list[float]], dict[str, int]]:
+    """Samples by name, one of each per round, and how many calls each sample of a name consists of."""
     samples: dict[str, list[float]] = {name: [] for name in calls}
     with set_torch_threads(threads):
         repeats = {name: _calls_per_sample(call) for name, call in calls.items()}
@@ -64,7 +123,7 @@ def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least
                 samples[name].append(_sample(call, repeats[name]))
             if done >= least and time.perf_counter() - start >= seconds:
                 break
-    return {name: _summary(name, samples[name], repeats[name], threads) for name in calls}
+    return samples, repeats
 
 
 def after_pauses(name: str, call: Call, *, threads: int, pause: float, count: int) -> Timing:
@@ -117,5 +176,15 @@ def discard(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Call:
     def run() -> None:
         with torch.no_grad():
             call(*args, **kwargs)
+
+    return run
+
+
+def on_threads(call: Call, count: int) -> Call:
+    """The same call on so many threads of torch, whatever it runs on otherwise."""
+
+    def run() -> None:
+        with set_torch_threads(count):
+            call()
 
     return run
