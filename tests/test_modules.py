@@ -77,6 +77,7 @@ def test_ones_are_the_identity() -> None:
 def test_alpha_is_the_parameter_and_is_saved() -> None:
     layer = NonlocalFilter(ALPHA, **OPTIONS)
     assert [tuple(p.shape) for p in layer.parameters()] == [(4,)]
+    assert next(layer.parameters()) is layer.alpha
     other = NonlocalFilter((1, 1, 1, 1), **OPTIONS)
     other.load_state_dict(layer.state_dict())
     torch.testing.assert_close(other(image()), layer(image()), atol=0, rtol=0)

@@ -22,6 +22,8 @@ from nlfilter_torch.operator.features import patch_window
 from tests.layers import ALPHA, EVERYTHING, OPTIONS, backward, everything, image, untouched
 from tests.problems import noise
 
+LEARNED = ("photometric_bandwidth", "spatial_bandwidth")
+
 
 @pytest.mark.parametrize("name", EVERYTHING)
 def test_only_what_is_named_learns(name: str) -> None:
@@ -34,8 +36,8 @@ def test_only_what_is_named_learns(name: str) -> None:
 
 def test_every_parameter_gets_a_gradient() -> None:
     assert set(backward(everything(), image())) == {
-        "affinity.photometric_bandwidth.logarithm",
-        "affinity.spatial_bandwidth.logarithm",
+        "affinity.log_photometric_bandwidth",
+        "affinity.log_spatial_bandwidth",
         "affinity.patch_weights.logits",
         "sliders.alpha",
         "sliders.residual",
@@ -64,7 +66,7 @@ def test_positive_things_stay_positive_under_any_step(rate: float) -> None:
         parameter.grad = torch.ones_like(parameter)
     optimizer.step()
     torch.optim.SGD(mask.parameters(), lr=rate).step()
-    for positive in (layer.affinity.photometric_bandwidth(), mask.time(), mask.width(), layer.affinity.patch_weights()):
+    for positive in (layer.photometric_bandwidth, mask.time, mask.width, layer.affinity.patch_weights()):
         assert (positive > 0).all()
     torch.testing.assert_close(layer.affinity.patch_weights().sum(), torch.tensor(1.0))
 
@@ -205,6 +207,70 @@ def test_bad_call_leaves_the_parameters_untouched(
 def test_a_bandwidth_that_left_its_range_is_told() -> None:
     layer = everything()
     with torch.no_grad():
-        layer.affinity.photometric_bandwidth.logarithm.fill_(math.nan)
+        layer.affinity.log_photometric_bandwidth.fill_(math.nan)
     with pytest.raises(ValueError, match="photometric_bandwidth must be positive and finite"):
         layer(image())
+
+
+def test_parts_of_a_filter_are_its_own_attributes() -> None:
+    layer = everything()
+    assert layer.alpha is layer.sliders.alpha
+    assert layer.residual is layer.sliders.residual
+    assert layer.photometric_bandwidth.item() == pytest.approx(0.2)
+    assert layer.spatial_bandwidth.item() == pytest.approx(9.0)
+    layer.spatial_bandwidth.backward()
+    assert layer.affinity.log_spatial_bandwidth.grad.item() == pytest.approx(9.0)
+    fixed = NonlocalFilter(ALPHA, photometric_bandwidth=0.3)
+    assert (fixed.photometric_bandwidth, fixed.spatial_bandwidth, fixed.residual) == (0.3, None, None)
+    assert NonlocalAffinity().photometric_bandwidth == "auto"
+    assert (DiffusionMask(time=2.5).time, DiffusionMask().width) == (2.5, 4.0)
+
+
+def test_bandwidths_can_be_assigned() -> None:
+    affinity = NonlocalAffinity(photometric_bandwidth=0.3)
+    affinity.photometric_bandwidth = 0.2
+    torch.testing.assert_close(affinity(image()).factor, nonlocal_operator(image(), photometric_bandwidth=0.2).factor)
+    learned = everything().affinity
+    parameter = learned.log_photometric_bandwidth
+    learned.photometric_bandwidth = 0.4
+    assert learned.log_photometric_bandwidth is parameter
+    assert learned.photometric_bandwidth.item() == pytest.approx(0.4)
+    with pytest.raises(ValueError, match="photometric_bandwidth must be positive"):
+        learned.photometric_bandwidth = -1.0
+
+
+def test_state_dicts_of_earlier_versions_load() -> None:
+    layer = everything()
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter += 0.1
+    names = {f"affinity.log_{name}": f"affinity.{name}.logarithm" for name in LEARNED}
+    earlier = {names.get(name, name): value for name, value in layer.state_dict().items()}
+    assert set(names.values()) < earlier.keys()
+    other = everything()
+    other.load_state_dict(earlier)
+    torch.testing.assert_close(other(image()), layer(image()), atol=0, rtol=0)
+    mask = DiffusionMask(learn=("time", "width"))
+    mask.load_state_dict({"time.logarithm": torch.tensor(0.5), "width.logarithm": torch.tensor(1.5)})
+    assert (mask.time.item(), mask.width.item()) == pytest.approx((math.exp(0.5), math.exp(1.5)))
+
+
+@pytest.mark.parametrize("key", ["affinity.log_{}", "affinity.{}.logarithm"])
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_learned_bandwidth_needs_a_layer_that_learns_it(name: str, key: str) -> None:
+    saved = {"sliders.alpha": torch.ones(4), key.format(name): torch.tensor(math.log(0.25))}
+    layer = NonlocalFilter(ALPHA, **OPTIONS)
+    with pytest.raises(RuntimeError, match=rf"{name} must be learned .* add '{name}' to learn and pass {name}=0.25"):
+        layer.load_state_dict(saved)
+    layer.load_state_dict(saved, strict=False)
+    assert layer.photometric_bandwidth == 0.2
+    torch.testing.assert_close(layer.alpha, torch.ones(4))
+
+
+def test_learned_weights_and_widths_need_a_layer_that_learns_them() -> None:
+    affinity = everything().affinity
+    fixed = NonlocalAffinity(learn=LEARNED, spatial_bandwidth=9.0, photometric_bandwidth=0.2)
+    with pytest.raises(RuntimeError, match=r"patch_weights must be learned .* add 'patch_weights' to learn when"):
+        fixed.load_state_dict(affinity.state_dict())
+    with pytest.raises(RuntimeError, match=r"width must be learned .* add 'width' to learn and pass width=4 when"):
+        DiffusionMask().load_state_dict(DiffusionMask(learn="width").state_dict())

@@ -85,7 +85,7 @@ def test_state_dict_pickle_and_deep_copy(generator: bool) -> None:
         assert not {id(p) for p in other.parameters()} & {id(p) for p in layer.parameters()}
 
 
-@pytest.mark.parametrize("frozen", ["sliders.alpha", "affinity.photometric_bandwidth.logarithm"])
+@pytest.mark.parametrize("frozen", ["sliders.alpha", "affinity.log_photometric_bandwidth"])
 def test_frozen_parameters_stay_and_the_others_move(frozen: str) -> None:
     layer = everything()
     layer.get_parameter(frozen).requires_grad_(False)

@@ -52,7 +52,7 @@ def test_loss_falls_and_every_part_learns(capsys):
     assert at_last < 0.8 * at_first
     assert len(losses) == 60
     assert "step    60 of 60: loss" in capsys.readouterr().out
-    assert {f"filter.affinity.{name}_bandwidth.logarithm" for name in ("photometric", "spatial")} < before.keys()
+    assert {f"filter.affinity.log_{name}_bandwidth" for name in ("photometric", "spatial")} < before.keys()
     for name, value in model.named_parameters():
         assert not torch.equal(value, before[name]), name
 

@@ -71,7 +71,7 @@ def test_loss_falls_on_every_seed(seed: int) -> None:
 @contextmanager
 def random_bandwidths(layer: NonlocalFilter, generator: torch.Generator) -> Iterator[None]:
     """Bandwidths between a hundredth of what was learned and a hundred times as much."""
-    logarithms = [layer.affinity.photometric_bandwidth.logarithm, layer.affinity.spatial_bandwidth.logarithm]
+    logarithms = [layer.affinity.log_photometric_bandwidth, layer.affinity.log_spatial_bandwidth]
     learned = [p.detach().clone() for p in logarithms]
     for p in logarithms:
         p.data += 2 * (2 * torch.rand((), generator=generator) - 1) * math.log(10)

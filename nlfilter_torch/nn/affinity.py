@@ -1,24 +1,23 @@
 """Guide to operator, as a layer."""
 
 from collections.abc import Collection
+from types import MappingProxyType
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.communicator import check_group
-from nlfilter_torch.nn.parameters import Positive, UnitWindow, check_learn, current, shown, start_or_positive
+from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
 from nlfilter_torch.operator.build import check_options, nonlocal_operator
 from nlfilter_torch.operator.features import GuideChannels, unit_window
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.operator import NonlocalOperator
 
-LEARNABLE = ("photometric_bandwidth", "spatial_bandwidth", "patch_weights")
 
-
-class NonlocalAffinity(nn.Module):
+class NonlocalAffinity(Learnable):
     """Guide to operator, a layer around :func:`nonlocal_operator`, whose options it takes.
 
     Args:
@@ -31,6 +30,20 @@ class NonlocalAffinity(nn.Module):
     Raises:
         TypeError, ValueError: if ``learn`` has another name, or an option is not one of :func:`nonlocal_operator`.
     """
+
+    learnable = MappingProxyType(
+        {
+            "photometric_bandwidth": "log_photometric_bandwidth",
+            "spatial_bandwidth": "log_spatial_bandwidth",
+            "patch_weights": "patch_weights.logits",
+        }
+    )
+    photometric_bandwidth: float | Literal["auto"] | Tensor = positive_option(
+        "photometric_bandwidth", 'Number or ``"auto"``; a tensor of shape () if it is learned.'
+    )
+    spatial_bandwidth: float | Tensor | None = positive_option(
+        "spatial_bandwidth", "Number of pixels or None; a tensor of shape () if it is learned."
+    )
 
     def __init__(
         self,
@@ -49,7 +62,7 @@ class NonlocalAffinity(nn.Module):
         learn: Collection[str] = (),
     ) -> None:
         super().__init__()
-        names = check_learn(learn, LEARNABLE)
+        names = check_learn(learn, tuple(self.learnable))
         check_options(
             num_landmarks=num_landmarks,
             landmarks=landmarks,
@@ -69,7 +82,6 @@ class NonlocalAffinity(nn.Module):
         self.generator = generator
         self.group = group
 
-        self.photometric_bandwidth: float | Positive | Literal["auto"]
         if isinstance(photometric_bandwidth, str):
             check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
             if "photometric_bandwidth" in names:
@@ -77,17 +89,13 @@ class NonlocalAffinity(nn.Module):
                     "photometric_bandwidth must be a number to learn from, got 'auto'; "
                     "pass the mean of estimate_bandwidth over a few guides"
                 )
-            self.photometric_bandwidth = photometric_bandwidth
-        else:
-            self.photometric_bandwidth = start_or_positive(photometric_bandwidth, "photometric_bandwidth", names)
         if spatial_bandwidth is None and "spatial_bandwidth" in names:
             raise ValueError(
                 "spatial_bandwidth must be a number of pixels to learn from, got None; "
                 "a third of the image's height is a start"
             )
-        self.spatial_bandwidth = (
-            None if spatial_bandwidth is None else start_or_positive(spatial_bandwidth, "spatial_bandwidth", names)
-        )
+        self.start_positive("photometric_bandwidth", photometric_bandwidth, names, other=str)
+        self.start_positive("spatial_bandwidth", spatial_bandwidth, names, other=type(None))
         # Non-persistent: like the other options, it belongs to the constructor, not to what was learned.
         self.patch_weights: Tensor | UnitWindow | None
         if "patch_weights" in names:
@@ -97,13 +105,12 @@ class NonlocalAffinity(nn.Module):
 
     def forward(self, guide: Tensor) -> NonlocalOperator:
         """Operator of a guide (B, C, H, W)."""
-        photometric = self.photometric_bandwidth
         weights = self.patch_weights
         return nonlocal_operator(
             guide,
             patch_size=self.patch_size,
-            photometric_bandwidth=photometric if isinstance(photometric, str) else current(photometric),
-            spatial_bandwidth=current(self.spatial_bandwidth),
+            photometric_bandwidth=self.photometric_bandwidth,
+            spatial_bandwidth=self.spatial_bandwidth,
             num_landmarks=self.num_landmarks,
             landmarks=self.landmarks,
             completion=self.completion,
@@ -116,10 +123,8 @@ class NonlocalAffinity(nn.Module):
 
     def extra_repr(self) -> str:
         """The options that decide what the operator does."""
-        photometric = self.photometric_bandwidth
-        start = photometric if isinstance(photometric, str) else shown(photometric)
         return (
-            f"patch_size={self.patch_size}, photometric_bandwidth={start}, "
-            f"spatial_bandwidth={shown(self.spatial_bandwidth)}, num_landmarks={self.num_landmarks}, "
+            f"patch_size={self.patch_size}, photometric_bandwidth={self.shown('photometric_bandwidth')}, "
+            f"spatial_bandwidth={self.shown('spatial_bandwidth')}, num_landmarks={self.num_landmarks}, "
             f"landmarks={self.landmarks!r}, completion={self.completion!r}, guide_channels={self.guide_channels!r}"
         )

@@ -1,16 +1,17 @@
 """Spectrum and regions to masks, as layers."""
 
 from collections.abc import Collection
+from types import MappingProxyType
 
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_positive
 from nlfilter_torch.filtering.masks import diffusion_mask, segment_mask
-from nlfilter_torch.nn.parameters import check_learn, current, shown, start_or_positive
+from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
 from nlfilter_torch.operator.spectrum import Spectrum
 
 
-class DiffusionMask(nn.Module):
+class DiffusionMask(Learnable):
     """Spectrum and region to mask, a layer around :func:`diffusion_mask`.
 
     Args:
@@ -22,19 +23,23 @@ class DiffusionMask(nn.Module):
         TypeError, ValueError: if ``time`` or ``width`` is not positive, or ``learn`` has another name.
     """
 
+    learnable = MappingProxyType({"time": "log_time", "width": "log_width"})
+    time: float | Tensor = positive_option("time", "Number; a tensor of shape () if it is learned.")
+    width: float | Tensor = positive_option("width", "Number; a tensor of shape () if it is learned.")
+
     def __init__(self, *, time: float = 1.0, width: float = 4.0, learn: Collection[str] = ()) -> None:
         super().__init__()
-        names = check_learn(learn, ("time", "width"))
-        self.time = start_or_positive(time, "time", names)
-        self.width = start_or_positive(width, "width", names)
+        names = check_learn(learn, tuple(self.learnable))
+        self.start_positive("time", time, names)
+        self.start_positive("width", width, names)
 
     def forward(self, spectrum: Spectrum, region: Tensor, negative: Tensor | None = None) -> Tensor:
         """Mask (B, K, H, W) in (0, 1] of regions (B, K, H, W), away from the regions ``negative``."""
-        return diffusion_mask(spectrum, region, time=current(self.time), width=current(self.width), negative=negative)
+        return diffusion_mask(spectrum, region, time=self.time, width=self.width, negative=negative)
 
     def extra_repr(self) -> str:
         """Time and width."""
-        return f"time={shown(self.time)}, width={shown(self.width)}"
+        return f"time={self.shown('time')}, width={self.shown('width')}"
 
 
 class SegmentMask(nn.Module):

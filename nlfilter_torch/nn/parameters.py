@@ -1,8 +1,8 @@
-"""Parameters that cannot leave their range, however large the optimiser's steps are."""
+"""Parameters that stay in their range under steps of any size."""
 
 import math
-from collections.abc import Collection, Sequence
-from typing import overload
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -10,26 +10,83 @@ from torch import Tensor, nn
 from nlfilter_torch.core.checks import check_number, check_positive, described
 
 
-class Positive(nn.Module):
-    """A positive number that trains: the exponential of a parameter, so that steps are relative.
+class Learnable(nn.Module):
+    """A layer with options that train if ``learn`` names them, as :func:`positive_option` and :class:`UnitWindow`.
 
     Attributes:
-        logarithm: parameter of shape ().
+        learnable: each of these options, and the parameter that it has if it trains.
     """
 
-    def __init__(self, start: float, name: str) -> None:
-        super().__init__()
-        check_number(start, name, "pass the number to start from")
-        check_positive(start, name)
-        self.logarithm = nn.Parameter(torch.tensor(math.log(start)))
+    learnable: ClassVar[Mapping[str, str]]
 
-    def forward(self) -> Tensor:
-        """The number, of shape ()."""
-        return self.logarithm.exp()
+    def start_positive(self, name: str, value: Any, learn: frozenset[str], *, other: type | None = None) -> None:
+        """Give a positive option its value, as a parameter if ``learn`` has its ``name``.
 
-    def extra_repr(self) -> str:
-        """The number as it is now."""
-        return f"{math.exp(self.logarithm.item()):.4g}"
+        A value of the type ``other`` is taken as it is; the caller has checked it.
+        """
+        if name in learn:
+            check_number(value, name, "pass the number to start from")
+        if other is None or not isinstance(value, other):
+            check_positive(value, name)
+        self.register_parameter(
+            self.learnable[name], nn.Parameter(torch.tensor(math.log(value))) if name in learn else None
+        )
+        setattr(self, f"_{name}", value)
+
+    def shown(self, name: str) -> float | str | None:
+        """A positive option as ``extra_repr`` prints it."""
+        value: float | str | Tensor | None = getattr(self, name)
+        return f"{value.item():.4g}" if isinstance(value, Tensor) else value
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Tensor],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Take the names of earlier versions too, and say what to pass where the constructor lacked an option."""
+        own = dict(self.named_parameters())
+        for option, parameter in self.learnable.items():
+            earlier = f"{prefix}{option}.logarithm"
+            if earlier in state_dict:
+                state_dict[prefix + parameter] = state_dict.pop(earlier)
+            if parameter not in own and prefix + parameter in state_dict:
+                learned = state_dict.pop(prefix + parameter)
+                start = f" and pass {option}={learned.exp().item():.4g}" if learned.ndim == 0 else ""
+                # An unexpected key like any other, so that strict=False ignores it.
+                unexpected_keys.append(
+                    f"{prefix}{parameter}: {option} must be learned by the layer to load a learned one, got a fixed "
+                    f"one; add {option!r} to learn{start} when constructing the layer"
+                )
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
+
+
+def positive_option(name: str, meaning: str) -> Any:
+    """Property of a :class:`Learnable` layer: a fixed value, or the exponential of the parameter ``log_<name>``.
+
+    The exponential is positive, and steps of an optimiser become relative.
+    """
+
+    def value(layer: Learnable) -> Any:
+        logarithm = getattr(layer, f"log_{name}")
+        return getattr(layer, f"_{name}") if logarithm is None else logarithm.exp()
+
+    def assign(layer: Learnable, value: Any) -> None:
+        logarithm = getattr(layer, f"log_{name}")
+        if logarithm is not None:
+            check_number(value, name)
+            check_positive(value, name)
+            with torch.no_grad():
+                logarithm.fill_(math.log(value))
+        setattr(layer, f"_{name}", value)
+
+    return property(value, assign, doc=meaning)
 
 
 class UnitWindow(nn.Module):
@@ -70,25 +127,3 @@ def check_learn(learn: Collection[str], choices: Sequence[str]) -> frozenset[str
             "choose from these"
         )
     return names
-
-
-def start_or_positive(start: float, name: str, learn: frozenset[str]) -> float | Positive:
-    """``start`` itself, checked, or a parameter that starts from it if ``learn`` has its ``name``."""
-    if name in learn:
-        return Positive(start, name)
-    check_positive(start, name)
-    return start
-
-
-@overload
-def current(value: float | Positive) -> float | Tensor: ...
-@overload
-def current(value: float | Positive | None) -> float | Tensor | None: ...
-def current(value: float | Positive | None) -> float | Tensor | None:
-    """A number that trains or does not, as it is now."""
-    return value() if isinstance(value, Positive) else value
-
-
-def shown(value: float | Positive | None) -> float | str | None:
-    """The same for ``extra_repr``."""
-    return value.extra_repr() if isinstance(value, Positive) else value

@@ -1,17 +1,13 @@
-"""Operator and image to filtered image, as a layer.
-
-Image to edited image, as a layer.
-"""
+"""Operator and image to filtered image, and image to edited image, as layers."""
 
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_alpha, check_image, check_same_size, check_tensor, check_weight, described
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
-from nlfilter_torch.nn import affinity, sliders
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
@@ -126,8 +122,28 @@ class NonlocalFilter(nn.Module):
         ['sliders.alpha']
         >>> layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.1)
         >>> list(layer.state_dict())
-        ['affinity.photometric_bandwidth.logarithm', 'sliders.alpha']
+        ['affinity.log_photometric_bandwidth', 'sliders.alpha']
     """
+
+    @property
+    def alpha(self) -> Tensor:
+        """Sliders (k+1,) or (K, k+1), parameter or buffer."""
+        return self.sliders.alpha
+
+    @property
+    def residual(self) -> Tensor | None:
+        """Weight of what the eigenvectors do not capture, (), or None for alpha_1."""
+        return self.sliders.residual
+
+    @property
+    def photometric_bandwidth(self) -> float | Literal["auto"] | Tensor:
+        """Number or ``"auto"``; a tensor of shape () if it is learned."""
+        return self.affinity.photometric_bandwidth
+
+    @property
+    def spatial_bandwidth(self) -> float | Tensor | None:
+        """Number of pixels or None; a tensor of shape () if it is learned."""
+        return self.affinity.spatial_bandwidth
 
     def __init__(
         self,
@@ -138,9 +154,9 @@ class NonlocalFilter(nn.Module):
         **options: Any,
     ) -> None:
         super().__init__()
-        names = check_learn(learn, sliders.LEARNABLE + affinity.LEARNABLE)
-        self.affinity = NonlocalAffinity(learn=names.intersection(affinity.LEARNABLE), **options)
-        self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(sliders.LEARNABLE))
+        names = check_learn(learn, (*LEARNABLE, *NonlocalAffinity.learnable))
+        self.affinity = NonlocalAffinity(learn=names.intersection(NonlocalAffinity.learnable), **options)
+        self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(LEARNABLE))
 
     def forward(
         self, image: Tensor, guide: Tensor | None = None, mask: Tensor | None = None, alpha: Tensor | None = None

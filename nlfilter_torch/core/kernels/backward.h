@@ -1,7 +1,7 @@
-/* Derivatives of the columns of the Nystrom factor; nystrom.py says which. */
+/* Gradients through the columns of the Nystrom factor; the formulas are in operator/nystrom.py. */
 
-/* The gradient of a tile of columns, from that of what they are after they were shortened. */
-INLINE void NAME(receive)(const struct backward *task, long start, long width, float *gradient, float *spare)
+/* Gradient of a tile of columns before they were scaled to norm at most 1, from the gradient after scaling. */
+INLINE void NAME(column_gradients)(const struct backward *task, long start, long width, float *gradient, float *spare)
 {
     const struct columns *columns = &task->columns;
     float *edge = spare, *right = spare + PIXELS;
@@ -41,9 +41,9 @@ INLINE void NAME(receive)(const struct backward *task, long start, long width, f
     }
 }
 
-/* The gradient of a tile of features, of which these are the derivatives by the exponents. */
-INLINE void NAME(move)(const struct backward *task, long start, long width, const float *slopes, const float *features,
-                       float *moved)
+/* Gradient of a tile of features, from the gradient of the exponents (`slopes`). */
+INLINE void NAME(feature_gradients)(const struct backward *task, long start, long width, const float *slopes,
+                                    const float *features, float *moved)
 {
     const long size = task->columns.size;
     NAME(apply)(task->points, size + 1, slopes, task->columns.marks, moved);
@@ -55,9 +55,9 @@ INLINE void NAME(move)(const struct backward *task, long start, long width, cons
     }
 }
 
-/* totals (count, most) += left times the transpose of right over the tiles; of a triangle, its lower half. */
-INLINE void NAME(amount)(const float *left, long left_step, const float *right, long right_step, long tiles, long count,
-                         long most, int lower, double *totals)
+/* totals (count, most) += left right^T, summed over the tiles. With `lower`, only the lower triangle. */
+INLINE void NAME(add_products)(const float *left, long left_step, const float *right, long right_step, long tiles,
+                               long count, long most, int lower, double *totals)
 {
     for (long m = 0; m < count; m += ROWS)
         for (long n = 0; n < most && !(lower && n >= m + ROWS); n += VECTORS) {
@@ -70,8 +70,9 @@ INLINE void NAME(amount)(const float *left, long left_step, const float *right, 
         }
 }
 
-/* Gradients of the features of the pixels from first to last; totals += those of the whitening (M, M), and below it the
- * products of slopes and features (M, D + 1) that make those of the landmarks. So many tiles at a time as stay near. */
+/* Gradients of the features of pixels first to last. totals += the gradient of the inverse Cholesky factor (M, M),
+ * followed by the products of slopes and features (M, D + 1) from which the gradient of the landmarks is made. Works on
+ * as many tiles at a time as fit the cache. */
 static TARGET void NAME(backward)(const struct backward *task, long first, long last, float *scratch, double *totals)
 {
     const long size = task->columns.size, marks = task->columns.marks;
@@ -83,15 +84,15 @@ static TARGET void NAME(backward)(const struct backward *task, long first, long 
         const long tiles = (end - start + PIXELS - 1) / PIXELS;
         for (long t = 0; t < tiles; t++) {
             const long at = start + t * PIXELS, width = end - at < PIXELS ? end - at : PIXELS;
-            NAME(approach)(&task->columns, at, width, features + t * features_step, spare);
-            NAME(relate)(&task->columns, features + t * features_step, affinities + t * step);
-            NAME(receive)(task, at, width, gradients + t * step, spare);
+            NAME(load_features)(&task->columns, at, width, features + t * features_step, spare);
+            NAME(affinities)(&task->columns, features + t * features_step, affinities + t * step);
+            NAME(column_gradients)(task, at, width, gradients + t * step, spare);
         }
-        NAME(amount)(gradients, step, affinities, step, tiles, marks, marks, task->lower, totals);
+        NAME(add_products)(gradients, step, affinities, step, tiles, marks, marks, task->lower, totals);
         for (long t = 0; t < tiles; t++) {
             const long at = start + t * PIXELS, width = end - at < PIXELS ? end - at : PIXELS;
             const float *rows = task->columns.whitening, *gradient = gradients + t * step;
-            float *slopes = affinities + t * step; /* by the exponents, in place of the affinities */
+            float *slopes = affinities + t * step; /* gradient of the exponents, overwriting the affinities */
             for (long m = 0; m < marks; m += ROWS) {
                 const long skipped = task->lower ? m : 0;
                 FLOATS sums[ROWS][VECTORS];
@@ -101,8 +102,9 @@ static TARGET void NAME(backward)(const struct backward *task, long first, long 
                     for (int v = 0; v < VECTORS; v++)
                         *(FLOATS *)(slopes + (m + r) * PIXELS + v * LANES) *= sums[r][v];
             }
-            NAME(move)(task, at, width, slopes, features + t * features_step, spare);
+            NAME(feature_gradients)(task, at, width, slopes, features + t * features_step, spare);
         }
-        NAME(amount)(affinities, step, features, features_step, tiles, marks, size + 1, 0, totals + marks * marks);
+        NAME(add_products)(affinities, step, features, features_step, tiles, marks, size + 1, 0,
+                           totals + marks * marks);
     }
 }

@@ -1,9 +1,9 @@
-/* Columns of the Nystrom factor, and their derivatives. */
+/* Columns of the Nystrom factor and their gradients. */
 
 #include "tasks.h"
 
-/* Rows of each of the matrices (B, count, depth) in blocks of `rows`, by columns; rows past the last are zero. With
- * `depths`, (B, blocks), a block ends with the last of its columns that is not zero. */
+/* Pack each matrix (count, depth) of a batch into blocks of `rows` rows, each block stored by columns and padded with
+ * zero rows. If `depths` (B, blocks) is given, trailing zero columns of a block are dropped and its depth recorded. */
 static float *pack(const float *matrix, long images, long count, long depth, long rows, long *depths)
 {
     const long whole = padded(count, rows);
@@ -26,8 +26,8 @@ static float *pack(const float *matrix, long images, long count, long depth, lon
     return packed;
 }
 
-/* The transposes of square matrices in the same blocks; of lower triangles each block begins with the first of its
- * columns that is not zero. */
+/* Pack the transposes of square matrices into the same blocks. If the matrices are lower triangles, leading zero
+ * columns of a block are dropped. */
 static float *pack_transposes(const float *matrix, long images, long size, long rows, int lower)
 {
     const long whole = padded(size, rows);
@@ -51,7 +51,7 @@ static int are_lower(const float *matrix, long images, long size)
     return 1;
 }
 
-/* What there is of a batch for one of its images. */
+/* The task of a single image of the batch. */
 static struct columns of_image(struct columns task, long image, long rows)
 {
     const long whole = padded(task.marks, rows);
@@ -109,7 +109,7 @@ static void run_backward(struct work *work, long image, long piece, long first, 
     SETS[work->level].backward(&task, first, last, scratch, work->totals + piece * marks * (marks + size + 1));
 }
 
-/* Without `left` it is `right` that is the derivative by the columns, and `rank` the number of landmarks. */
+/* The gradient of the columns is left right. If `left` is NULL, it is `right` and `rank` the number of landmarks. */
 int nlfilter_backward(int level, int threads, long pixels, long images, long size, long marks, const float *features,
                       long features_step, long features_stride, const float *centre, const float *landmarks,
                       const float *whitening, float floor, int limited, float *factor, long factor_step,

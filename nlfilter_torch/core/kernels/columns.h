@@ -1,7 +1,7 @@
-/* Features to columns of the Nystrom factor; nystrom.py says what they are. */
+/* Columns of the Nystrom factor from features; defined in operator/nystrom.py. */
 
-/* A tile of features relative to the centre, above rows of ones and of |x|^2; past the image it is the centre. */
-INLINE void NAME(approach)(const struct columns *task, long start, long width, float *features, float *edge)
+/* Load a tile of centred features x and append a row of ones and a row of |x|^2. Pixels past the image are 0. */
+INLINE void NAME(load_features)(const struct columns *task, long start, long width, float *features, float *edge)
 {
     FLOATS norm[VECTORS];
     for (int v = 0; v < VECTORS; v++)
@@ -21,8 +21,8 @@ INLINE void NAME(approach)(const struct columns *task, long start, long width, f
     }
 }
 
-/* A tile of affinities to the landmarks. */
-INLINE void NAME(relate)(const struct columns *task, const float *features, float *affinities)
+/* Affinities of a tile of pixels to the landmarks. */
+INLINE void NAME(affinities)(const struct columns *task, const float *features, float *affinities)
 {
     for (long m = 0; m < task->marks; m += ROWS) {
         FLOATS exponents[ROWS][VECTORS];
@@ -34,32 +34,33 @@ INLINE void NAME(relate)(const struct columns *task, const float *features, floa
     }
 }
 
-/* The columns of the factor for the pixels from first to last: affinities, whitened, of norm at most 1 if asked. */
+/* Columns of the factor for pixels first to last: affinities times the inverse Cholesky factor, with `limited` scaled
+ * to norm at most 1. */
 static TARGET void NAME(columns)(const struct columns *task, long first, long last, float *scratch)
 {
     const long marks = task->marks;
     float *features = scratch, *affinities = features + (task->size + 2) * PIXELS;
     float *whitened = affinities + padded(marks, ROWS) * PIXELS;
-    float *edge = whitened + padded(marks, ROWS) * PIXELS; /* a row of a tile that the image ends in */
+    float *edge = whitened + padded(marks, ROWS) * PIXELS; /* a row of the last, partial tile */
     for (long start = first; start < last; start += PIXELS) {
         const long width = last - start < PIXELS ? last - start : PIXELS;
         FLOATS norm[VECTORS];
         for (int v = 0; v < VECTORS; v++)
             norm[v] = (FLOATS){0};
-        NAME(approach)(task, start, width, features, edge);
-        NAME(relate)(task, features, affinities);
+        NAME(load_features)(task, start, width, features, edge);
+        NAME(affinities)(task, features, affinities);
         const float *rows = task->whitening;
         for (long m = 0, block = 0; m < marks; m += ROWS, block++) {
             FLOATS sums[ROWS][VECTORS];
             NAME(multiply)(rows, affinities, task->depths[block], sums);
             rows += task->depths[block] * ROWS;
-            for (int r = 0; r < ROWS; r++) /* rows past the last are zero */
+            for (int r = 0; r < ROWS; r++) /* padding rows are zero */
                 for (int v = 0; v < VECTORS; v++) {
                     *(FLOATS *)(whitened + (m + r) * PIXELS + v * LANES) = sums[r][v];
                     norm[v] += sums[r][v] * sums[r][v];
                 }
         }
-        /* Norms exceed 1 by rounding alone, but those of all pixels that are like a landmark do: a black sky, say. */
+        /* Only rounding makes a norm exceed 1, but it can do so for many pixels: all those equal to a landmark. */
         FLOATS scale[VECTORS];
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(edge + v * LANES) = norm[v];
@@ -84,5 +85,5 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
                 memcpy(target, edge, width * sizeof(float));
         }
     }
-    __builtin_ia32_sfence(); /* what was streamed is there before anyone is told so */
+    __builtin_ia32_sfence(); /* complete the streaming stores before other threads read them */
 }

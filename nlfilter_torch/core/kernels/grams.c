@@ -14,7 +14,7 @@ static void run_grams(struct work *work, long image, long piece, long first, lon
 int nlfilter_grams(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
                    long factor_stride, long count, const float *scaling, const float *remainder, double *out)
 {
-    const long rows = padded(marks, 12), fitting = NEAR / rows / 64 * 64; /* rows: whole blocks both ways */
+    const long rows = padded(marks, 12), fitting = NEAR / rows / 64 * 64; /* a multiple of all block sizes */
     const struct grams task = {
         .factor = factor, .factor_step = factor_step, .factor_stride = factor_stride, .scaling = scaling,
         .remainder = remainder, .marks = marks, .count = count, .rows = rows,

@@ -1,6 +1,6 @@
-/* Gram matrices of the scaled factor; see spectrum.py. */
+/* Gram matrices of the scaled factor; see operator/spectrum.py. */
 
-/* totals (J, M, M) += F diag(r^j) F^T over the pixels from first to last, F = factor diag(d); lower triangles only. */
+/* totals (J, M, M) += F diag(r^j) F^T over pixels first to last, with F = factor diag(d). Lower triangles only. */
 static TARGET void NAME(grams)(const struct grams *task, long first, long last, float *scratch, double *totals)
 {
     const long marks = task->marks, step = task->step;

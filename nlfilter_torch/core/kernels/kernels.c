@@ -1,14 +1,13 @@
-/* Columns of the Nystrom factor, their derivatives, its products, and landmarks, in single precision on processors of
- * the x86-64 kind.
+/* Float32 kernels for x86-64: columns of the Nystrom factor and their gradients, products with the factor, Gram
+ * matrices, and landmarks.
  *
- * The same mathematics as in the files of Python that each part names. What they do with several passes over blocks of
- * memory happens here in the registers: distances, exponentials, whitening by a matrix of which the empty triangle is
- * skipped, norms.
- * Products with a few rows read the factor once, as fast as memory allows.
+ * Each part names the Python file that defines the same computation in torch. Where torch makes several passes over
+ * memory, these kernels keep distances, exponentials and norms in registers, and skip the zero triangle of the inverse
+ * Cholesky factor. Tall-skinny products read the factor once, at memory bandwidth.
  *
- * Work is divided into pieces of the image. What is written for each pixel does not depend on the number of threads;
- * sums over pixels are added in float64, for each piece and then in the order of these. Functions return 0, or -1 where
- * memory is short. */
+ * The image is divided into pieces. Per-pixel results do not depend on the number of threads. Sums over pixels are
+ * accumulated in float64 within each piece, and the pieces are added in order. Functions return 0 on success and -1 if
+ * memory cannot be allocated. */
 
 #include <math.h>
 
@@ -43,7 +42,7 @@ const struct set SETS[] = {
      pivots_avx512},
 };
 
-/* The best instruction set that this processor has: 2 for AVX-512, 1 for AVX2 with FMA, 0 for neither. */
+/* The best supported instruction set: 2 for AVX-512, 1 for AVX2 with FMA, 0 for neither. */
 int nlfilter_level(void)
 {
     if (__builtin_cpu_supports("avx512f"))

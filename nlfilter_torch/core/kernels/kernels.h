@@ -1,13 +1,13 @@
-/* What every instruction set computes: included once for each of them, with
+/* The kernels, included once per instruction set with these macros defined:
  *
- *   NAME(x)   the name x has in this instance,
- *   TARGET    the attribute that allows the compiler its instructions,
- *   LANES     floats in a register,
- *   ROWS      rows of a product that are formed together,
- *   VECTORS   registers of pixels that are formed together; ROWS * VECTORS sums stay in registers,
- *   STREAM    how to store a register so that memory is not read before, at an address that is a multiple of its size.
+ *   NAME(x)   x with the suffix of the instruction set,
+ *   TARGET    the function attribute that enables the instruction set,
+ *   LANES     floats per register,
+ *   ROWS      rows of a product computed together,
+ *   VECTORS   registers of pixels processed together; ROWS * VECTORS sums stay in registers,
+ *   STREAM    non-temporal store of a register, to an address aligned to its size.
  *
- * Pixels lie along the lanes, so that a sum over landmarks or patch positions needs no shuffling. */
+ * Pixels lie along the lanes, so sums over landmarks or patch positions need no shuffles. */
 
 typedef float NAME(floats) __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 typedef int NAME(ints) __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
@@ -19,7 +19,7 @@ typedef int NAME(ints) __attribute__((vector_size(4 * LANES), aligned(4), may_al
 /* 2^x to 1e-7 for -126 < x <= 0, and NaN for NaN. The polynomial is the minimax one on [-1/2, 1/2]. */
 INLINE FLOATS NAME(exp2)(FLOATS x)
 {
-    const float shift = 12582912.0f; /* 1.5 * 2^23: added to x, it leaves the nearest integer in the lowest bits */
+    const float shift = 12582912.0f; /* 1.5 * 2^23: adding it leaves the nearest integer in the lowest bits */
     FLOATS shifted = x + shift, part = x - (shifted - shift);
     FLOATS value = part * 0.0001534581242594868f + 0.0013399930903688073f;
     value = value * part + 0.009618489071726799f;
@@ -30,7 +30,7 @@ INLINE FLOATS NAME(exp2)(FLOATS x)
     return value * (FLOATS)(((INTS)shifted << 23) + (127 << 23));
 }
 
-/* x between the two limits; NaN stays NaN. */
+/* x limited to [least, most]; NaN stays NaN. */
 INLINE FLOATS NAME(clamp)(FLOATS x, float least, float most)
 {
     INTS above = x > most, below = x < least;
@@ -59,7 +59,7 @@ INLINE void NAME(multiply)(const float *rows, const float *tile, long depth, FLO
     }
 }
 
-/* A tile (count, PIXELS) in whole blocks = a packed matrix (count, depth) times a tile (depth, PIXELS). */
+/* out (count, PIXELS), padded to whole blocks = a packed matrix (count, depth) times a tile (depth, PIXELS). */
 INLINE void NAME(apply)(const float *matrix, long count, const float *tile, long depth, float *out)
 {
     for (long m = 0; m < count; m += ROWS) {
@@ -71,8 +71,8 @@ INLINE void NAME(apply)(const float *matrix, long count, const float *tile, long
     }
 }
 
-/* sums = rows of left times rows of right, lane by lane: `tiles` tiles of `length` pixels each, in which rows are
- * `stride` apart. */
+/* Per-lane sums of products of ROWS rows of left and VECTORS rows of right, over `tiles` tiles of `length` pixels whose
+ * rows are `stride` apart. */
 INLINE void NAME(correlate)(const float *left, long left_step, const float *right, long right_step, long tiles,
                             long stride, long length, FLOATS sums[ROWS][VECTORS])
 {
@@ -108,7 +108,7 @@ INLINE float NAME(total)(FLOATS x)
     return x[0];
 }
 
-/* PIXELS numbers from source on; where the image ends after `width` of them, in `edge`, and the rest is `fill`. */
+/* PIXELS numbers from source. If only `width` of them are in the image, a copy in `edge` padded with `fill`. */
 INLINE const float *NAME(fetch)(const float *source, long width, float fill, float *edge)
 {
     if (width == PIXELS)

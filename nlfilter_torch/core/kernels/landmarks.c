@@ -4,7 +4,7 @@
 
 #include "tasks.h"
 
-/* Lloyd's iteration on one image; scratch holds packed centres, sums with sizes, and a tile. */
+/* Lloyd's iteration on one image. Scratch holds the packed centres, the sums and sizes of the clusters, and a tile. */
 static void cluster(const struct lloyd *task, int level, long image, float *scratch)
 {
     const long size = task->size, count = task->count, marks = task->marks, rows = SETS[level].rows;
@@ -16,7 +16,7 @@ static void cluster(const struct lloyd *task, int level, long image, float *scra
         for (long m = 0; m < padded(marks, rows); m++) {
             float *target = centres + m / rows * rows * (size + 1) + m % rows, length = 0.0f;
             const float *sum = sums + m * (size + 1);
-            for (long k = 0; k < size; k++) { /* a centre without points stays where it began */
+            for (long k = 0; k < size; k++) { /* an empty cluster keeps its initial centre */
                 const float value = m >= marks ? 0.0f : sum[size] ? sum[k] / sum[size] : start[k * marks + m];
                 target[k * rows] = value;
                 length += value * value;
@@ -46,7 +46,7 @@ int nlfilter_lloyd(int level, int threads, long images, long size, long count, l
 static void run_pivots(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct pivots *task = work->task;
-    float *points = scratch + (task->marks + 2) * task->count; /* with whole lines */
+    float *points = scratch + (task->marks + 2) * task->count; /* rows padded to a multiple of LINE */
     (void)piece, (void)first, (void)last;
     for (long k = 0; k < task->size; k++) {
         const float *row = task->points + (image * task->size + k) * task->used;

@@ -1,7 +1,8 @@
-/* The choice of landmarks; see landmarks.py. */
+/* Choice of landmarks; see operator/landmarks.py. */
 
-/* The nearest of the packed centres (c, -|c|^2 / 2) to each of the points (D, S): where x . c - |c|^2 / 2 is largest,
- * the first of those that differ by rounding; and the sums (M, D + 1) of the points of each centre, with their number. */
+/* Nearest of the packed centres (c, -|c|^2 / 2) to each point x of (D, S), the one with the largest score
+ * x . c - |c|^2 / 2. Scores within rounding of each other are ties, and the first one wins. sums (M, D + 1) += the
+ * points of each cluster and their number. */
 static TARGET void NAME(assign)(const struct lloyd *task, const float *points, const float *centres, float *tile,
                                 int *nearest, float *sums)
 {
@@ -14,7 +15,7 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
             memcpy(tile + k * PIXELS, points + k * count + start, width * sizeof(float));
             memset(tile + k * PIXELS + width, 0, (PIXELS - width) * sizeof(float));
         }
-        FLOATS bar[VECTORS], slack[VECTORS]; /* what a score must exceed to be better, and a part of by how much */
+        FLOATS bar[VECTORS], slack[VECTORS]; /* best score plus its margin of rounding, and the part of it due to x */
         INTS chosen[VECTORS];
         for (int v = 0; v < VECTORS; v++) {
             bar[v] = (FLOATS){0} - INFINITY;
@@ -45,14 +46,14 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
     }
 }
 
-/* What a residual counts for in the draw: its fourth power. */
-INLINE float NAME(chance)(float residual, float explained)
+/* Weight of a residual in the random draw: its fourth power. */
+INLINE float NAME(pivot_weight)(float residual, float explained)
 {
     const float rest = residual > explained ? residual : explained;
     return (rest * rest) * (rest * rest);
 }
 
-/* out (S) += sum over the rows of left[r * step] times row r of right (R, S); four at a time, for fewer passes. */
+/* out (S) += sign * sum over r of left[r * step] * row r of right (R, S), four rows per pass. */
 INLINE void NAME(accumulate)(const float *left, long step, const float *right, long rows, long count, float sign,
                              float *out)
 {
@@ -68,8 +69,8 @@ INLINE void NAME(accumulate)(const float *left, long step, const float *right, l
     }
 }
 
-/* Pivots (M) of a random Cholesky decomposition of the affinities of points (D, S), S a multiple of LINE; see
- * landmarks.py. Scratch holds norms, residuals, and the columns (M, S). */
+/* Pivots (M) of a randomly pivoted Cholesky decomposition of the affinities between points (D, S), with S a multiple of
+ * LINE; see operator/landmarks.py. Scratch holds norms, residuals and the columns (M, S). */
 static TARGET void NAME(pivots)(const struct pivots *task, const float *points, long *pivots, float *scratch)
 {
     const long size = task->size, count = task->count;
@@ -83,10 +84,10 @@ static TARGET void NAME(pivots)(const struct pivots *task, const float *points, 
     for (long m = 0; m < task->marks; m++) {
         double total = 0.0, reached = 0.0;
         for (long i = 0; i < task->used; i++)
-            total += NAME(chance)(residual[i], task->explained);
+            total += NAME(pivot_weight)(residual[i], task->explained);
         long pivot = 0;
         for (; pivot < task->used - 1; pivot++) {
-            reached += NAME(chance)(residual[pivot], task->explained);
+            reached += NAME(pivot_weight)(residual[pivot], task->explained);
             if (reached >= task->draws[m] * total)
                 break;
         }

@@ -1,8 +1,8 @@
-/* Products of the factor with a few rows. */
+/* Tall-skinny products: the factor times a few rows. */
 
 #include "tasks.h"
 
-/* What there is of a batch for one of its images. */
+/* The task of a single image of the batch. */
 static struct thin part(const struct work *work, long image)
 {
     struct thin task = *(const struct thin *)work->task;
@@ -56,8 +56,8 @@ static void run_sweep(struct work *work, long image, long piece, long first, lon
     SETS[work->level].sweep(&task, first, last, work->totals + piece * task.marks);
 }
 
-/* Given a diagonal, what out = d has for a moment where row is half of its guess; else factor diag(scaling) factor^T
- * row, and out is room for what lies between. */
+/* With `diagonal`: out = the scaling d and moment = factor d, where row is half of the guess of the moment.
+ * Without: moment = factor diag(scaling) factor^T row, with out as working memory. */
 int nlfilter_sweep(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
                    long factor_stride, const float *row, const float *scaling, const float *diagonal, float most,
                    float *out, double *moment)

@@ -1,15 +1,16 @@
-/* Products of the factor with a few rows, each reading it once; see thin.py, and newton.py for the sweep. */
+/* Tall-skinny products that read the factor once; see tall_skinny.py, and operator/newton.py for the sweep. */
 
 #define LEAST (FLT_EPSILON / 4)
 
-/* Where the next rows of the factor begin; past the last one it is that once more. Several keep memory busy. */
-INLINE void NAME(adjacent)(const struct thin *task, long row, long start, int count, const float **found)
+/* Pointers to the next `count` rows of the factor, with the last row repeated past the end. Reading several rows at
+ * once makes better use of the memory bandwidth. */
+INLINE void NAME(row_pointers)(const struct thin *task, long row, long start, int count, const float **found)
 {
     for (long k = 0; k < count; k++)
         found[k] = task->factor + (row + k < task->marks ? row + k : task->marks - 1) * task->factor_stride + start;
 }
 
-/* out = rows (R, M) times the columns of the factor from first to last, at most a chunk of them, times scaling. */
+/* out = rows (R, M) times the columns first to last of the factor, at most CHUNK of them, times scaling. */
 static TARGET void NAME(spread)(const struct thin *task, long first, long last)
 {
     const long marks = task->marks, width = last - first, whole = width / LANES * LANES;
@@ -17,7 +18,7 @@ static TARGET void NAME(spread)(const struct thin *task, long first, long last)
         memset(task->out + r * task->pixels + first, 0, width * sizeof(float));
     for (long m = 0; m < marks; m += 8) {
         const float *column[8];
-        NAME(adjacent)(task, m, first, 8, column);
+        NAME(row_pointers)(task, m, first, 8, column);
         for (long r = 0; r < task->count; r++) {
             float *sums = task->out + r * task->pixels + first, weight[8];
             for (long k = 0; k < 8; k++)
@@ -39,7 +40,7 @@ static TARGET void NAME(spread)(const struct thin *task, long first, long last)
             task->out[r * task->pixels + i] *= task->scaling[i];
 }
 
-/* totals (R, M) += images (R, N) times the factor's transpose, over the pixels from first to last. */
+/* totals (R, M) += images (R, N) times the transposed factor, over pixels first to last. */
 static TARGET void NAME(gather)(const struct thin *task, long first, long last, double *totals)
 {
     const long marks = task->marks;
@@ -48,7 +49,7 @@ static TARGET void NAME(gather)(const struct thin *task, long first, long last, 
         const long whole = width / (2 * LANES) * (2 * LANES);
         for (long m = 0; m < marks; m += 4) {
             const float *column[4];
-            NAME(adjacent)(task, m, start, 4, column);
+            NAME(row_pointers)(task, m, start, 4, column);
             for (long r = 0; r < task->count; r++) {
                 const float *image = task->images + r * task->images_stride + start;
                 FLOATS sums[4][2] = {{{0}}};
@@ -74,9 +75,8 @@ static TARGET void NAME(gather)(const struct thin *task, long first, long last, 
     }
 }
 
-/* out = the root d of d (u . 2 rows + c d) = 1 for the pixels from first to last, or without c a row spread and scaled
- * as above, and totals += its moment, factor out. So few pixels at a time that their columns are near when it is
- * formed. */
+/* For pixels first to last: out = the root d of d (u . 2 rows + c d) = 1, or without c the product of `spread`;
+ * totals += factor out. Works on few pixels at a time, so that their columns are still in the cache for the second product. */
 static TARGET void NAME(sweep)(const struct thin *task, long first, long last, double *totals)
 {
     const long most = NEAR / task->marks / 64 * 64, step = most < 256 ? 256 : most;
@@ -84,7 +84,7 @@ static TARGET void NAME(sweep)(const struct thin *task, long first, long last, d
         const long end = last - start < step ? last : start + step;
         NAME(spread)(task, start, end);
         for (long i = start; task->diagonal && i < end; i++) {
-            /* newton.py: the root without cancellation for either sign of u . t, and finite without a diagonal */
+            /* operator/newton.py: the root without cancellation for either sign of u . t; finite if c = 0 */
             const float half = task->out[i], c = task->diagonal[i], root = sqrtf(half * half + c);
             const float over = half < 0.0f ? root - half : 1.0f, under = half < 0.0f ? c : root + half;
             const float d = over / (under < LEAST ? LEAST : under);

@@ -1,7 +1,7 @@
-/* What the kernels work on, and how work is divided among threads.
+/* Arguments of the kernels, and the division of work among threads.
  *
- * Matrices are given as (rows, columns), B images of N pixels, D features and M landmarks. Rows are in one piece, and
- * as far apart as their stride says. */
+ * Shapes are (rows, columns), for B images of N pixels, D features and M landmarks. Rows are contiguous and a stride
+ * apart. */
 
 #pragma once
 
@@ -11,37 +11,38 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define CHUNK 33024  /* pixels that a thread takes at a time, at most: memory likes long pieces of each row */
-#define LINE 64      /* a piece is a multiple of so many: a tile, and more than a line of the cache */
-#define NEAR 196608  /* numbers of the factor that stay in the second cache */
+#define CHUNK 33024  /* most pixels that a thread takes at a time; long pieces of each row use memory better */
+#define LINE 64      /* pieces are multiples of this: the largest tile, and more than a cache line */
+#define NEAR 196608  /* floats of the factor that fit the second-level cache */
 #define MOST_ROWS 6
 #define MOST_PIXELS 64
 
 static inline long padded(long count, long step) { return (count + step - 1) / step * step; }
 
-/* U = whitening exp2(landmarks (x, 1, |x|^2)), x = features - centre. */
+/* U = whitening exp2(landmarks (x, 1, |x|^2)), x = features - centre; whitening is the inverse Cholesky factor of the
+ * landmark block. */
 struct columns {
     const float *features, *centre; /* (D, N), (D) */
-    float *factor, *norms;          /* (M, N), (N): |u|^2 before it is limited, if it is */
+    float *factor, *norms;          /* (M, N), (N): |u|^2 before scaling, written if `limited` */
     long size, marks, pixels;
     long features_stride, factor_stride;
-    long features_step, factor_step; /* from one image of a batch to the next; everything else is contiguous */
-    float floor;                     /* of the exponents */
-    int limited;                     /* columns longer than 1 are shortened */
-    /* Matrices in blocks of ROWS rows, each stored by columns up to the last that is not zero. */
+    long features_step, factor_step; /* from one image of a batch to the next; other arrays are contiguous */
+    float floor;                     /* lower limit of the exponents */
+    int limited;                     /* scale columns to norm at most 1 */
+    /* Packed in blocks of ROWS rows, each stored by columns without trailing zero columns. */
     const float *landmarks, *whitening;
-    const long *depths; /* columns of each block of the whitening */
+    const long *depths; /* number of columns of each block of the whitening */
 };
 
-/* Derivatives of these, given G, that of the loss by the columns: left right, or where left is none, right itself. */
+/* Gradients of the columns' inputs. The gradient of the columns is left right, or right itself if left is NULL. */
 struct backward {
-    struct columns columns;        /* with the whitening transposed; of a triangle, blocks begin at the diagonal */
+    struct columns columns;        /* with the whitening transposed; if triangular, blocks begin at the diagonal */
     const float *left, *right;     /* (M, R) in blocks, (R, N) */
-    const float *scale, *diagonal; /* (N), by which columns were shortened, and the derivative by 1 - |u|^2 */
-    const float *points;           /* (D + 1, M) in blocks: what slopes of exponents move the features by */
-    float *moved;                  /* (D, N), derivatives by the features */
+    const float *scale, *diagonal; /* (N): scale of the columns, and the gradient of 1 - |u|^2 */
+    const float *points;           /* (D + 1, M) in blocks: derivative of the exponents by the features */
+    float *moved;                  /* (D, N), gradient of the features */
     long rank, right_stride, right_step;
-    long tiles, rows, feature_rows; /* how many are worked on together, and their rows */
+    long tiles, rows, feature_rows; /* tiles processed together, and their rows */
     int lower;                      /* the whitening is a lower triangle */
 };
 
@@ -51,23 +52,23 @@ struct thin {
     const float *rows, *images; /* (R, M), (R, N) */
     float *out;                 /* (R, N) */
     long images_stride;
-    const float *scaling;  /* d, (N), or none */
-    const float *diagonal; /* c, (N), or none */
-    float most;            /* of d */
-    long factor_step, images_step; /* from one image of a batch to the next; everything else is contiguous */
+    const float *scaling;  /* d, (N), or NULL */
+    const float *diagonal; /* c, (N), or NULL */
+    float most;            /* upper limit of d */
+    long factor_step, images_step; /* from one image of a batch to the next; other arrays are contiguous */
     long pixels;                   /* N */
 };
 
 struct grams {
     const float *factor, *scaling, *remainder; /* (M, N), (N), (N) */
     long factor_stride, factor_step, marks, count;
-    long rows, step; /* of a tile of F: with rows of zeros below it, and so many pixels that it stays in the cache */
+    long rows, step; /* padded rows and pixels of a tile of F that fits the cache */
 };
 
 struct pivots {
     const float *points, *draws; /* (B, D, S), (M) */
     long *pivots;                /* (B, M) */
-    long size, used, count, marks; /* S, and S in whole lines */
+    long size, used, count, marks; /* used = S; count = S padded to a multiple of LINE */
     float explained;
 };
 
@@ -75,12 +76,12 @@ struct lloyd {
     const float *points, *start; /* (B, D, S), (B, D, M) */
     int *nearest;                /* (B, S) */
     long size, count, marks, iterations;
-    float margin; /* of scores that count as equal, relative to the terms of their sums */
+    float margin; /* scores closer than this, relative to their terms, are ties */
 };
 
-/* What each instruction set computes, on pixels from first to last; see the files of the same names. */
+/* The kernels of an instruction set, on pixels first to last; see the header of the same name. */
 struct set {
-    long rows; /* of a block of a packed matrix */
+    long rows; /* rows in a block of a packed matrix */
     void (*columns)(const struct columns *, long first, long last, float *scratch);
     void (*backward)(const struct backward *, long first, long last, float *scratch, double *totals);
     void (*spread)(const struct thin *, long first, long last);
@@ -92,30 +93,30 @@ struct set {
     void (*pivots)(const struct pivots *, const float *points, long *pivots, float *scratch);
 };
 
-#pragma GCC visibility push(hidden) /* other libraries may have such names */
+#pragma GCC visibility push(hidden) /* avoid clashes with other libraries */
 
 extern const struct set SETS[];
 
-/* Work on all pixels of a batch of images, piece by piece: whichever thread is free takes the next. */
+/* Work on all pixels of a batch of images, in pieces. A free thread takes the next piece. */
 struct work {
     void (*run)(struct work *, long image, long piece, long first, long last, float *scratch);
     const void *task;
-    size_t floats; /* of scratch, which every thread has for itself */
+    size_t floats; /* size of the scratch memory of each thread */
     int level;
-    long images, pixels; /* of each image */
-    long length, each;   /* of a piece, and how many pieces each image has */
-    double *totals;      /* of each piece, where there is something to add up */
+    long images, pixels; /* pixels of each image */
+    long length, each;   /* pixels of a piece, and pieces per image */
+    double *totals;      /* sums of each piece, or NULL */
     atomic_long next;
     atomic_int failed;
 };
 
-/* Run work piece by piece; 0, or -1 where memory is short. */
+/* Run all pieces. Returns 0, or -1 if memory cannot be allocated. */
 int run_pieces(struct work *work, int threads);
 
-/* The same in pieces of at most so many pixels. */
+/* Divide the work into pieces of at most `most` pixels and run them. */
 int divide(struct work *work, int threads, long most);
 
-/* The same for work that adds up `sums` numbers for each image. */
+/* Divide and run work that computes `sums` sums over the pixels of each image. */
 int add_up(struct work *work, int threads, long sums, double *out);
 
 #pragma GCC visibility pop

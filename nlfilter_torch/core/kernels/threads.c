@@ -6,7 +6,7 @@
 
 #define MOST_THREADS 256
 
-static void labour(void *argument)
+static void run_worker(void *argument)
 {
     struct work *work = argument;
     float *scratch = aligned_alloc(64, padded((work->floats + 1) * sizeof(float), 64));
@@ -22,15 +22,15 @@ static void labour(void *argument)
     free(scratch);
 }
 
-/* OpenMP's way to run a function on its threads, once it is known where: torch waits for work with the same threads,
- * awake for a while, so that others would find no free core. */
+/* GOMP_parallel, once its address is known. OpenMP's threads, which torch uses too, keep spinning for a while after a
+ * parallel region, so threads of our own would compete with them for the cores. */
 static void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
 
 void nlfilter_share_threads(void *gomp_parallel) { parallel = gomp_parallel; }
 
-static void *help(void *work)
+static void *start_helper(void *work)
 {
-    labour(work);
+    run_worker(work);
     return NULL;
 }
 
@@ -40,21 +40,21 @@ int run_pieces(struct work *work, int threads)
     const long pieces = work->images * work->each;
     int started = 0;
     if (parallel && threads > 1 && pieces > 1) {
-        parallel(labour, work, threads, 0);
+        parallel(run_worker, work, threads, 0);
         return work->failed ? -1 : 0;
     }
     while (started < threads - 1 && started < pieces - 1 && started < MOST_THREADS)
-        if (pthread_create(&helpers[started++], NULL, help, work)) {
-            started--; /* no more threads to be had: those that there are do it */
+        if (pthread_create(&helpers[started++], NULL, start_helper, work)) {
+            started--; /* no more threads available; continue with those already started */
             break;
         }
-    labour(work);
+    run_worker(work);
     for (int i = 0; i < started; i++)
         pthread_join(helpers[i], NULL);
     return work->failed ? -1 : 0;
 }
 
-/* Four pieces for each thread, since one may be slower than another, but no piece longer than `most`. */
+/* About four pieces per thread, to balance the load, but none longer than `most`. */
 static void cut(struct work *work, int threads, long most)
 {
     const long wanted = (4 * threads + work->images - 1) / work->images;
@@ -69,7 +69,7 @@ int divide(struct work *work, int threads, long most)
     return run_pieces(work, threads);
 }
 
-/* Numbers of the pieces are added in their order: runs agree. */
+/* The sums of the pieces are added in order, so that results are reproducible. */
 int add_up(struct work *work, int threads, long sums, double *out)
 {
     cut(work, threads, work->pixels);
