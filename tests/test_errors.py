@@ -235,7 +235,8 @@ def test_bad_arguments_of_masks(call: Callable[[], object], error: type[Exceptio
 @pytest.mark.parametrize(("landmarks", "alarm"), [(100, 1.0), (20, 0.0)], ids=["too many landmarks", "no balance"])
 def test_warnings_point_at_the_caller(landmarks: int, alarm: float, monkeypatch: pytest.MonkeyPatch) -> None:
     # No small image leaves the row sums off by what is worth a warning, so any deviation has to do.
-    monkeypatch.setattr("nlfilter_torch.operator.balancing.ALARM", alarm)
+    monkeypatch.setattr("nlfilter_torch.operator.balancing.ALARM", {GUIDE.dtype: alarm})
+    monkeypatch.setattr("nlfilter_torch.operator.balancing.TOLERANCE", {GUIDE.dtype: 1e-17})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         nonlocal_operator(GUIDE, num_landmarks=landmarks)

@@ -63,8 +63,8 @@ def test_gradient_checkpointing(reentrant: bool) -> None:
     layer.zero_grad()
     tracked = image().requires_grad_()  # the reentrant variant wants an input that needs a gradient
     checkpoint(layer, tracked, use_reentrant=reentrant).square().mean().backward()
-    for name, parameter in layer.named_parameters():
-        torch.testing.assert_close(parameter.grad, exact[name], atol=0, rtol=0)
+    for name, parameter in layer.named_parameters():  # to rounding: torch may add up contributions in another order
+        torch.testing.assert_close(parameter.grad, exact[name], atol=0, rtol=1e-6)
 
 
 @pytest.mark.parametrize("generator", [False, True])

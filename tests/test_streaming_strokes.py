@@ -205,7 +205,16 @@ def test_report_tells_every_stage() -> None:
     seen: list[str] = []
     picture, (strokes, mask, _) = cat(40, 60), paint(40, 60)
     recoloured(picture, strokes, mask, sample=1000, num_landmarks=20, report=lambda *step: seen.append(step[0]))
-    stages = ["Reading strokes", "Looking", "Sampling", "Balancing", "Summing up", "Comparing strokes", "Filtering"]
+    stages = [
+        "Reading strokes",
+        "Looking",
+        "Sampling",
+        "Balancing",
+        "Bounding",
+        "Summing up",
+        "Comparing strokes",
+        "Filtering",
+    ]
     assert list(dict.fromkeys(seen)) == stages
 
 

@@ -106,6 +106,10 @@ def _alpha(scene: Scene) -> Tensor:
     return 4 * torch.rand(shape, generator=scene.generator).to(scene.dtype)
 
 
+def _size(scene: Scene) -> tuple[int, int]:
+    return scene.size
+
+
 def _short_side(part: float) -> Kind:
     return lambda scene: scene.rng.uniform(0.1, part * min(scene.size))
 
@@ -186,6 +190,12 @@ class Function:
 NUMBERS = {name: _plain(0.1, 4.0) for name in ("time", "width")}
 FUNCTIONS = {
     "nonlocal_operator": Function(nlf.nonlocal_operator, {"guide": _image(1, 3, 2)}, FILTER | GUIDED),
+    "operator_from_features": Function(
+        nlf.operator_from_features,
+        {"features": lambda scene: 5 * scene.noise(scene.batch, 3, math.prod(scene.size)), "size": _size},
+        {name: kind for name, kind in AFFINITY.items() if name not in ("patch_size", "spatial_bandwidth")}
+        | {"weights": lambda scene: 0.5 + 9 * scene.noise(math.prod(scene.size))},
+    ),
     "NonlocalOperator.matmul": Function(lambda operator, image: operator @ image, OPERATOR | IMAGE, {}),
     "NonlocalOperator.spectrum": Function(
         lambda operator, **options: operator.spectrum(**options), OPERATOR, {"rank": _count(1, 20)}

@@ -169,6 +169,7 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
         TypeError, ValueError: if ``image`` does not fit the operator, or either is a batch.
 
     Example:
+        >>> from nlfilter_torch import nonlocal_operator
         >>> image = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0))
         >>> fitted = fit_filter(nonlocal_operator(image, num_landmarks=20), image)
         >>> fitted.layers(image.roll(3, -1)[..., :10]).shape

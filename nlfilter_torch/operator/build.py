@@ -28,7 +28,7 @@ from nlfilter_torch.core.compilation import uncompiled
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.balancing import Balancing, balance, warn_of_residual
-from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
@@ -288,8 +288,9 @@ def assemble(
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = shifted_gram(factor, root_mass(scaling, weights), remainder, shard)
-    if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, factor):
-        limit = limiter(gram, moment(factor, weighted(scaling, weights).unsqueeze(1), shard), factor)
+    allowed = slack(factor.dtype, float(residual.max())) if watched else 0.0
+    if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, balancing.moment, allowed):
+        limit = limiter(gram, moment(factor, weighted(scaling, weights).unsqueeze(1), shard), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
         residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard, weights)

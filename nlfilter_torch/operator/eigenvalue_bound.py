@@ -50,39 +50,39 @@ def shift(at: Tensor, remainder: Tensor) -> Tensor:
     return (at.unsqueeze(1) - remainder.double()).clamp(min=1e-9)
 
 
+def slack(dtype: torch.dtype, residual: float) -> float:
+    """By how much eigenvalues may exceed 1 where row sums are off by up to ``residual``."""
+    return max(SLACK[dtype], 2 * residual)
+
+
 @torch.no_grad()
-def exceeds(gram: ShiftedGram, like: Tensor) -> bool:
-    """Whether an eigenvalue of W exceeds 1 by more than rounding, for any image of the batch of ``like`` (B, M, N)."""
-    matrix = gram(_limit(like), 1)
+def exceeds(gram: ShiftedGram, moment: Tensor, slack: float) -> bool:
+    """Whether an eigenvalue of W exceeds 1 by more than ``slack``, for any image of a batch; see :func:`limiter`."""
+    matrix = gram(torch.full_like(moment[:, 0, 0], 1 + slack), 1)
     identity = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
     return bool((torch.linalg.cholesky_ex(identity - matrix).info != 0).any())
 
 
-def limiter(gram: ShiftedGram, moment: Tensor, like: Tensor) -> Tensor:
+def limiter(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:
     """The ``X^(1/2)`` (B, M, M) in float64 by which the factor is multiplied for no eigenvalue to exceed 1.
 
     Args:
         gram: of W.
         moment: t = F 1, (B, M, 1) in float64.
-        like: the factor, for its dtype.
+        slack: by how much eigenvalues may exceed 1.
 
     Returns:
         Differentiable in what ``gram`` and ``moment`` are.
     """
-    matrix = gram(_limit(like), 1)
+    matrix = gram(torch.full_like(moment[:, 0, 0], 1 + slack), 1)
     # t is an eigenvector up to the slack; made one exactly, it keeps the row sums exact.
     unit = moment / moment.norm(dim=1, keepdim=True).clamp(min=torch.finfo(moment.dtype).tiny)
     others = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device) - unit @ unit.mT
     matrix = others @ torch.where(matrix.isfinite(), matrix, torch.zeros_like(matrix)) @ others
-    largest = 1 - SLACK[like.dtype] / 10
+    largest = 1 - slack / 10
     every = torch.ones_like(moment[:, :, 0], dtype=torch.bool)
     symmetric = SymmetricMatrix.of((matrix + matrix.mT) / 2)
     return symmetric.apply(lambda values: (values / largest).clamp(min=1.0).rsqrt(), every)
-
-
-def _limit(like: Tensor) -> Tensor:
-    """The x of S, (B,): 1 but for rounding."""
-    return torch.full(like.shape[:1], 1 + SLACK[like.dtype], dtype=torch.float64, device=like.device)
 
 
 def largest_eigenvalue(gram: ShiftedGram, remainder: Tensor, dtype: torch.dtype) -> Tensor:

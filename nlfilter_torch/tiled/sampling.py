@@ -146,7 +146,7 @@ def take_pilot(
         if photometric_bandwidth == "auto":
             slope += float(gradients(guide, tile.halo).double().mean((0, 1)).sum())
     if isinstance(photometric_bandwidth, str):
-        photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels)))
+        photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels, dtype=torch.float64)))
     order = torch.empty_like(wanted)
     order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
     recipe = (window, photometric_bandwidth, spatial_bandwidth)

@@ -17,7 +17,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.operator.balancing import balance
-from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.newton import LARGEST, PixelScaling, scaling_from_moment
 from nlfilter_torch.operator.spectrum import sum_grams, whiten_gram
 
@@ -80,7 +80,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
 
 def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
     """The ``X^(1/2)`` (1, M, M) by which the factor is multiplied, or None where no eigenvalue exceeds 1."""
-    like = next(iter(blocks())).factor
+    dtype = next(iter(blocks())).factor.dtype
 
     def gram(at: Tensor, power: int) -> Tensor:
         matrix = torch.zeros((), dtype=torch.float64)
@@ -90,7 +90,8 @@ def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
             matrix = matrix + sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
         return matrix
 
-    return limiter(gram, balancing.moment, like) if exceeds(gram, like) else None
+    allowed = slack(dtype, CONVERGED[dtype])
+    return limiter(gram, balancing.moment, allowed) if exceeds(gram, balancing.moment, allowed) else None
 
 
 @dataclass(frozen=True)
