@@ -110,7 +110,7 @@ def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
             few = places[:: 1 + len(places) // LOOKED_AT]
             if len(few) > 0 and columns[:, few].square().sum(0).mean() < EXPLAINED:
                 warn(
-                    f"region {number} is like no landmark, so its mask may contain other pixels like none; "
+                    f"region {number} is like no landmark, so its mask may take in other pixels like none; "
                     "raise num_landmarks or photometric_bandwidth"
                 )
 

@@ -107,7 +107,8 @@ class NonlocalFilter(nn.Module):
             each mask.
         residual: weight of what the eigenvectors do not capture; None is alpha_1.
         learn: what is learned: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``,
-            ``"spatial_bandwidth"`` and ``"patch_weights"``; see the two layers. Gradients reach image and guide in any case.
+            ``"spatial_bandwidth"`` and ``"patch_weights"``; see the two layers. Gradients reach image and guide in
+            any case.
         **options: of :func:`nonlocal_operator`.
 
     Raises:
