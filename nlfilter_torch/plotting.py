@@ -24,11 +24,11 @@ DPI = 100
 SIDE = 512  # pixels along the longer side of a picture
 LABEL = 35  # pixels above a picture for its title
 GAP = 15  # pixels between pictures
-FAR = 0.995  # colour scales end at this quantile, so that one odd pixel does not grey out the rest
+FAR = 0.995  # colour scales end at this quantile, so that one outlier does not compress the others
 
 
 def show_images(images: Mapping[str, Tensor], *, columns: int | None = None, side: int = SIDE) -> Figure:
-    """Pictures side by side, each (1, C, H, W) or (C, H, W) in [0, 1], under their titles."""
+    """Titled pictures side by side, each (1, C, H, W) or (C, H, W) in [0, 1]."""
     pictures = {title: _picture(image) for title, image in images.items()}
     figure, axes = _panels(next(iter(pictures.values())).shape, len(pictures), columns, side)
     for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
@@ -53,7 +53,7 @@ def show_eigenvectors(
 ) -> Figure:
     """Eigenvectors by their number from 1, as in the paper's Fig. 1; numbers beyond the last are left out.
 
-    Of a flat picture, whose only eigenvector is the constant one, that is shown.
+    A flat picture has only the constant eigenvector, which is then shown.
     """
     vectors = spectrum.eigenvectors[0].numpy(force=True)
     shown = [number for number in numbers if number <= len(vectors)] or [1]
@@ -66,7 +66,7 @@ def show_eigenvectors(
 
 
 def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) -> Figure:
-    """A photograph with a region outlined, the mask that grew from it, and the photograph in colour where the mask is.
+    """A photograph with a region outlined, the region's mask, and the photograph in colour where the mask is.
 
     Args:
         image: (1, C, H, W) in [0, 1].
@@ -77,17 +77,17 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) 
     picture = _picture(image)
     weight = mask[0, 0].numpy(force=True)[..., None]
     figure, axes = _panels(picture.shape, 3, columns=3, side=side)
-    _draw(axes[0], "The region that was selected", picture)
+    _draw(axes[0], "The selected region", picture)
     axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["white"], linewidths=3)
     axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["black"], linewidths=1)
-    _draw(axes[1], "How alike the rest is (white: alike)", weight[..., 0])
+    _draw(axes[1], "Similarity to the region (white: similar)", weight[..., 0])
     faded = np.broadcast_to(0.6 + 0.25 * picture.mean(-1, keepdims=True), picture.shape)
-    _draw(axes[2], "What an edit would reach", weight * picture + (1 - weight) * faded)
+    _draw(axes[2], "Pixels that an edit would change", weight * picture + (1 - weight) * faded)
     return figure
 
 
 def plot_eigenvalues(spectrum: Spectrum) -> Figure:
-    """Eigenvalues against their number: how fast they fall tells how few patterns make up the image."""
+    """Eigenvalues against their number; the faster they fall, the fewer patterns the image consists of."""
     figure = Figure(figsize=(8, 5), dpi=DPI, layout="constrained")
     axis = figure.subplots()
     values = spectrum.eigenvalues[0].numpy(force=True)
@@ -111,7 +111,7 @@ def plot_response(alpha: Tensor, spectrum: Spectrum) -> Figure:
     axis.set(
         xlabel="eigenvalue λ (0: finest detail, 1: smooth shading)",
         ylabel="gain f(λ)",
-        title="What the sliders do to each scale",
+        title="Response of the sliders",
     )
     axis.grid(alpha=0.3)
     axis.legend()
@@ -131,7 +131,7 @@ def _picture(image: Tensor) -> NDArray[Any]:
 
 
 def _reach(values: NDArray[Any]) -> float:
-    """Symmetric end of a colour scale; a plane of zeros still needs one."""
+    """Limit of a symmetric colour scale; positive even for a plane of zeros."""
     return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
 
 
@@ -151,7 +151,7 @@ def _panels(shape: tuple[int, ...], count: int, columns: int | None, side: int) 
 
 
 def _draw(axis: Axes, title: str, picture: NDArray[Any], *, reach: float | None = None, colours: str = "gray") -> None:
-    """One picture under its title, values spread over ±reach where given, over [0, 1] otherwise."""
+    """One titled picture, with the colour scale ±reach if given and [0, 1] otherwise."""
     lowest, highest = (0.0, 1.0) if reach is None else (-reach, reach)
     axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
     axis.set_title(title, fontsize=min(11.0, max(6.0, axis.get_window_extent().width / 28)))  # fits 36 letters

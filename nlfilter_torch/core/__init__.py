@@ -1,1 +1,1 @@
-"""What has no images in it: checks, precision, autograd helpers, blocks of pixels, processes, kernels."""
+"""Code independent of images: checks, precision, autograd helpers, blocks of pixels, communicator, kernels."""

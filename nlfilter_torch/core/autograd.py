@@ -1,4 +1,4 @@
-"""What the hand-written derivatives share: gradients that nobody needs in full, and a refusal of second derivatives."""
+"""Helpers of the hand-written derivatives: low-rank gradients, and an error for second derivatives."""
 
 import functools
 from collections.abc import Callable
@@ -15,11 +15,11 @@ Gradients = tuple[Tensor | None, ...]
 
 
 class OuterProduct(Tensor):
-    """``left @ right`` as a gradient of the factor, not formed before somebody looks.
+    """A low-rank gradient ``left @ right`` of the factor, evaluated only when needed.
 
-    Products with W and the balancing change the loss by matrices (B, M, N) of a small rank. Autograd adds them up, here
-    by putting their parts side by side, and the backward pass of the factor forms the sum block by block: three copies
-    of the factor are never made. Any other operation sees an ordinary tensor.
+    The gradients of products with W and of the balancing are low-rank matrices (B, M, N). When autograd adds them,
+    their parts are concatenated, and the backward pass of the factor evaluates the sum block by block. This saves three
+    copies of the factor. Any other operation sees an ordinary tensor.
 
     Attributes:
         left: (B, M, r).
@@ -31,7 +31,7 @@ class OuterProduct(Tensor):
 
     @staticmethod
     def __new__(cls, left: Tensor, right: Tensor) -> "OuterProduct":
-        """A tensor with the shape of the product and no memory of its own."""
+        """A tensor with the shape of the product that owns no memory."""
         shape = (left.shape[0], left.shape[1], right.shape[2])
         product: OuterProduct = Tensor._make_wrapper_subclass(cls, shape, dtype=left.dtype, device=left.device)
         product.left, product.right = left, right
@@ -53,37 +53,37 @@ class OuterProduct(Tensor):
 
 
 def outer_product(left: Tensor, right: Tensor) -> Tensor:
-    """``left @ right``, left unformed where its parts are smaller than it is."""
+    """``left @ right``, kept as its parts if these are smaller than the product."""
     if left.shape[2] >= left.shape[1] or torch.compiler.is_compiling():
         return torch.bmm(left, right)
     return OuterProduct(left, right)
 
 
 def strips_of_gradient(gradient: Tensor, count: int) -> Tensor:
-    """:func:`strips` of a gradient (1, M, N), formed or not."""
+    """:func:`strips` of a gradient (1, M, N), low-rank or ordinary."""
     if isinstance(gradient, OuterProduct) and count > 1:
         return OuterProduct(gradient.left.expand(count, -1, -1), strips(gradient.right, count))
     return strips(gradient, count)
 
 
 def factors_of(gradient: Tensor) -> tuple[Tensor, ...]:
-    """What a gradient is the product of: (B, M, r) and (B, r, N) of one that is not formed, otherwise itself alone."""
+    """The parts (B, M, r) and (B, r, N) of a low-rank gradient, or an ordinary gradient alone."""
     return (gradient.left, gradient.right) if isinstance(gradient, OuterProduct) else (gradient,)
 
 
 def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:
-    """The columns ``block`` of a gradient (B, M, N), formed or not, in ``out`` (B, M, n)."""
+    """The columns ``block`` of a gradient (B, M, N), low-rank or ordinary, in ``out`` (B, M, n)."""
     if isinstance(gradient, OuterProduct):
         return torch.bmm(gradient.left, gradient.right[:, :, block], out=out)
     return out.copy_(gradient[:, :, block])
 
 
 def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
-    """Let a ``backward`` of an autograd Function refuse to be differentiated itself, and run in full precision.
+    """Make a ``backward`` of an autograd Function raise on second derivatives, and run it in full precision.
 
-    A backward pass that is started under autocast would otherwise round its products. As to second derivatives, the
-    decorator of this name in torch refuses them only where the incoming gradient depends on something. Elsewhere it
-    passes what it returns for a constant, and a second derivative would be wrong without a word.
+    A backward pass started under autocast would otherwise round its products. torch's decorator of this name raises
+    only if the incoming gradient requires a gradient. Otherwise it treats the result as a constant, and second
+    derivatives would be silently wrong.
     """
     exact = full_precision(backward)
 
@@ -94,7 +94,7 @@ def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gra
         if not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return found
         formed = [g.formed() if isinstance(g, OuterProduct) else g for g in found if g is not None]
-        # Hung on what the gradients depend on: autograd visits only what lies on the way to the tensors in question.
+        # Connected to all that the gradients depend on: autograd visits only nodes on the way to the requested tensors.
         causes = [t for t in (*ctx.saved_tensors, *gradients) if t is not None and t.requires_grad]
         refused = iter(_Refusal.apply(len(formed), *formed, *causes))  # type: ignore[no-untyped-call]
         return tuple(None if g is None else next(refused) for g in found)

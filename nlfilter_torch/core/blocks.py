@@ -7,22 +7,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Pixels in a block, for each core. One of affinities is M x CACHED floats, at M = 100 0.8 MB, which the cache of a core
-# still holds when its whitened copy is made. Rows of 2048 floats would start in the same few sets of that cache
-# and drive each other out; 2032 are an odd number of its lines. A sweep writes only vectors, so that its blocks may be
-# longer, and cost fewer calls; torch divides vectors among cores from 32768 numbers on, those of two blocks.
+# Pixels in a block, per core. A block of affinities is M x CACHED floats, 0.8 MB for M = 100, and stays in the cache of
+# its core until it is multiplied by the inverse Cholesky factor. Rows of 2048 floats would map to the same few cache
+# sets and evict each other; 2032 floats are an odd number of cache lines. A sweep writes only vectors, so its blocks
+# may be longer, which saves calls; torch splits vectors among cores from 32768 numbers on, two of these blocks.
 CACHED = 2032
 SWEPT = 16400
-# An accelerator wants long blocks; this one bounds the memory of intermediate results at about 1 GB for M = 100.
+# Accelerators need long blocks; this length limits intermediate results to about 1 GB for M = 100.
 ACCELERATED = 1 << 21
-LINE = 16  # numbers: one line of the cache in float32, two in float64
+LINE = 16  # numbers: one cache line in float32, two in float64
 
 
 def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
-    """Uninitialised tensor in the dtype and on the device of ``like``, from memory that is quick to touch first.
+    """Uninitialised tensor in the dtype and on the device of ``like``, in memory that is fast to write first.
 
-    On Linux numpy asks for huge pages where torch does not: a fresh 400 MB costs 50 ms instead of 200. It begins on a
-    line of the cache, so that whole lines can be written without having been read.
+    On Linux numpy requests huge pages and torch does not: the first write of 400 MB takes 50 ms instead of 200. The
+    tensor is aligned to a cache line, so that whole lines can be written without being read first.
     """
     if like.device.type != "cpu" or like.dtype not in (torch.float32, torch.float64):
         return like.new_empty(shape)
@@ -32,42 +32,42 @@ def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
 
 
 def cores() -> int:
-    """How many threads torch has for one operation; 1 for a compiler, which cannot trace the question."""
+    """Number of threads torch uses for one operation; 1 while compiling, where it cannot be queried."""
     return 1 if torch.compiler.is_compiling() else torch.get_num_threads()
 
 
 def strip_count(batch: int, pixels: int, device: torch.device) -> int:
-    """How many strips an image is worked on in: one for each core, unless it is one of a batch or does not divide."""
+    """Number of strips of an image: one per core, but one for a batch or a number of pixels that does not divide."""
     count = cores()
     return count if batch == 1 and device.type == "cpu" and pixels % count == 0 else 1
 
 
 def strips(planes: Tensor, count: int) -> Tensor:
-    """A view of (1, C, N) as a batch (P, C, N / P) of strips; of a batch (B, C, N), which counts as one, itself.
+    """A view of (1, C, N) as a batch (P, C, N / P) of strips; a batch (B, C, N) is returned as it is.
 
-    Each core then works on a strip of its own: what it has just computed is in its cache, not in that of another.
+    Each core then works on its own strip, and finds what it has just computed in its own cache.
     """
     return planes if count == 1 else planes[0].unflatten(1, (count, -1)).transpose(0, 1)
 
 
 def block_length(batch: int, device: torch.device, length: int) -> int:
-    """Pixels of each image in a block that has about ``length`` for every core."""
+    """Pixels of each image in a block of about ``length`` pixels per core."""
     return max(256, (length * cores() if device.type == "cpu" else ACCELERATED) // batch)
 
 
 def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = CACHED) -> Iterator[slice]:
-    """Slices that cover ``range(count)``, each with about ``length`` pixels of the whole batch for every core."""
+    """Slices that cover ``range(count)``, each with about ``length`` pixels per core over the whole batch."""
     step = block_length(batch, device, length)
     for start in range(0, count, step):
         yield slice(start, min(start + step, count))
 
 
 def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Tensor]]]:
-    """The blocks of :func:`pixel_blocks`, each with ``count`` uninitialised (B, M, n) buffers that are used again.
+    """The blocks of :func:`pixel_blocks`, each with ``count`` uninitialised (B, M, n) buffers that are reused.
 
     Args:
-        factor: (B, M, N), whose shape, dtype and device the buffers take.
-        count: how many buffers.
+        factor: (B, M, N), from which the buffers take shape, dtype and device.
+        count: number of buffers.
     """
     batch, marks, pixels = factor.shape
     storage: list[Tensor] = []
@@ -81,7 +81,7 @@ def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Te
 def fold_batch(image: Tensor, batch: int) -> Tensor:
     """Images (b, C, H, W) as (batch, C', N) for an operator of ``batch`` images; either batch may be 1.
 
-    Several images under one operator become its channels, so that the factor is read once for all.
+    Several images under one operator become channels, so that the factor is read once.
 
     Raises:
         ValueError: if the batches differ and neither is 1.

@@ -1,6 +1,6 @@
-"""Validation at the public boundary: one sentence, naming argument, requirement, value received and remedy.
+"""Validation of public arguments: one sentence with the argument, the requirement, the value and the remedy.
 
-Functions inside the package trust what they are given; only public functions call these.
+Only public functions call these; internal functions trust their arguments.
 """
 
 import math
@@ -16,10 +16,10 @@ from torch import Tensor
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Response = Callable[[Tensor], Tensor]
 
-LARGEST_PATCH = 101  # features take its square times the memory of the guide
-LARGEST_ORDER = 1000  # each has a copy of the image
+LARGEST_PATCH = 101  # features take patch_size^2 times the memory of the guide
+LARGEST_ORDER = 1000  # each order takes a copy of the image
 LARGEST_EIGENVALUE = 1e6
-FAR_OUTSIDE = 16.0  # of [0, 1]; brighter than what HDR pictures scaled to a white of 1 hold, darker than 8-bit ones
+FAR_OUTSIDE = 16.0  # above the values of HDR pictures with white at 1, below those of 8-bit pictures
 
 
 def check_tensor(value: object, name: str, remedy: str = "convert it with torch.tensor") -> None:
@@ -68,7 +68,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
     if is_hidden(tensor):
         return
     values = tensor.detach()
-    # Their sum tells in a tenth of the time that looking at each would take, unless finite ones overflow it.
+    # The sum takes a tenth of the time of checking each value, but overflows for large finite values.
     if bool(values.sum().isfinite()):
         return
     bad = int((~torch.isfinite(values)).sum())
@@ -107,12 +107,12 @@ def warn_of_scale(image: Tensor, name: str) -> None:
 
 
 def is_hidden(tensor: Tensor) -> bool:
-    """Whether the values of a tensor are out of sight: on an accelerator, while compiling, or under a transform."""
+    """Whether the values of a tensor cannot be checked: on an accelerator, while compiling, or under a transform."""
     return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor)
 
 
 def is_transformed(tensor: Tensor) -> bool:
-    """True under ``torch.func`` transforms, where the values of a tensor cannot be looked at."""
+    """True under ``torch.func`` transforms, where the values of a tensor cannot be read."""
     return bool(torch._C._functorch.is_functorch_wrapped_tensor(tensor))
 
 
@@ -126,7 +126,7 @@ def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str
 
 
 def check_patch_size(patch_size: int) -> None:
-    """Raise unless ``patch_size`` is an odd positive integer, and not so large that the features take all memory."""
+    """Raise unless ``patch_size`` is an odd positive integer, and not above :data:`LARGEST_PATCH`."""
     if isinstance(patch_size, bool) or not isinstance(patch_size, int):
         raise TypeError(f"patch_size must be an int, got {type(patch_size).__name__}; pass 1, 3, 5, ...")
     if patch_size < 1 or patch_size % 2 == 0:
@@ -145,7 +145,7 @@ def check_choice(value: str, name: str, choices: Sequence[str], remedy: str = "c
 
 
 def described(value: object) -> str:
-    """A value of any type on one line of an error."""
+    """A value of any type, as one line of an error message."""
     if isinstance(value, int) and value.bit_length() > 64:
         return f"an integer of {value.bit_length()} bits"
     return repr(value) if value is None or isinstance(value, str | int | float) else type(value).__name__
@@ -183,7 +183,7 @@ def _check_values(
 ) -> None:
     """Raise unless ``value`` is a finite number ``inside`` a range, or a tensor of such with shape () or (batch,).
 
-    The values of a tensor are looked at where :func:`check_finite` would.
+    The values of a tensor are checked where :func:`check_finite` checks them.
     """
     if not isinstance(value, Tensor):
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -204,7 +204,7 @@ def _check_values(
 
 
 def _is_finite(value: float) -> bool:
-    return abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)  # torch takes no longer integers
+    return abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)  # torch's integers have 64 bits
 
 
 def check_pair(value: object, name: str) -> None:
@@ -217,8 +217,8 @@ def check_pair(value: object, name: str) -> None:
 
 
 def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
-    """Raise unless a blur by ``value`` pixels, at least 0, stays within an image of ``size``: time and memory grow."""
-    most = max(min(size) / 2, 2.0)  # a default for large images is none too large for tiny ones
+    """Raise if a blur radius of ``value`` pixels exceeds half the short side: time and memory grow with it."""
+    most = max(min(size) / 2, 2.0)  # defaults must be valid for tiny images too
     if not value <= most:
         raise ValueError(
             f"{name} must be at most half the short side of the image, {most:g} pixels, got {described(value)}; "
@@ -227,7 +227,7 @@ def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
 
 
 def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str) -> None:
-    """Raise if a bandwidth is so small beside the ``largest`` magnitudes (B,) of what it divides that squares overflow.
+    """Raise if squares of features overflow: magnitudes up to ``largest`` (B,) divided by the bandwidth.
 
     Skipped where :func:`check_finite` is.
     """
@@ -235,12 +235,12 @@ def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str
     if is_hidden(largest) or is_hidden(given):
         return
     limits = torch.finfo(largest.dtype)
-    # Features are subtracted from each other, squared and added up, with a margin for the gradients.
+    # Squared differences of features are summed; the margin is for the gradients.
     smallest = (largest.double() / (limits.max**0.5 / 64)).clamp(min=4 * limits.tiny)
     given = given.double().reshape(-1).expand_as(smallest)
     if bool((given < smallest).any()):
         worst = int((given / smallest).argmin())
-        least = 1.06 * float(smallest[worst])  # two digits of it are enough
+        least = 1.06 * float(smallest[worst])  # the message shows two digits, rounded up
         raise ValueError(
             f"{name} must be at least {least:.2g} for {what} up to {float(largest[worst]):.2g}, "
             f"got {float(given[worst]):.2g}; raise it"
@@ -248,7 +248,7 @@ def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str
 
 
 def check_count(value: int, name: str, *, least: int = 1, most: int | None = None) -> None:
-    """Raise unless ``value`` is an integer from ``least``, 1 if left out, to ``most``."""
+    """Raise unless ``value`` is an integer from ``least`` (default 1) to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"{name} must be an int, got {type(value).__name__}; pass a positive integer")
     if value < least:
@@ -258,7 +258,7 @@ def check_count(value: int, name: str, *, least: int = 1, most: int | None = Non
 
 
 def check_order(order: int) -> None:
-    """Raise unless ``order`` is a number of products with W that memory holds."""
+    """Raise unless ``order`` is a valid number of products with W."""
     check_count(order, "order", most=LARGEST_ORDER)
 
 
@@ -288,7 +288,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
 
     Args:
         response: from eigenvalues (B, R) to as many gains.
-        support: (B, M) bool, which eigenvalues count.
+        support: (B, M) bool, the eigenvalues in use.
     """
     if not callable(response):
         raise TypeError(
@@ -335,7 +335,7 @@ def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None
 
 
 def check_eigenvalues(values: Tensor) -> None:
-    """Raise unless eigenvalues are floating-point and so near to [0, 1] that their powers stay finite."""
+    """Raise unless eigenvalues are floating-point and so close to [0, 1] that their powers stay finite."""
     check_tensor(values, "eigenvalues")
     check_dtype(values, "eigenvalues", "convert them")
     check_finite(values, "eigenvalues")
@@ -398,7 +398,7 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
 
 
 def warn(message: str) -> None:
-    """Warn at the line that called this package, however many wrappers and modules lie between."""
+    """Warn at the line that called this package, through any number of wrappers and modules."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
         level, frame = level + 1, frame.f_back
@@ -406,7 +406,7 @@ def warn(message: str) -> None:
 
 
 def called_by_edit() -> bool:
-    """Whether an edit of photographs called, which has looked at its image itself."""
+    """Whether the caller is an edit of photographs, which has checked the image already."""
     frame: FrameType | None = sys._getframe()
     while frame is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
         if _module(frame).startswith(("nlfilter_torch.edits", "nlfilter_torch.filtering.fitted")):

@@ -1,4 +1,4 @@
-"""What ``torch.compile`` is to leave alone: code whose course depends on values, and loops over blocks of pixels."""
+"""Exclude code from ``torch.compile``: data-dependent control flow, and loops over blocks of pixels."""
 
 import functools
 from collections.abc import Callable
@@ -11,9 +11,9 @@ R = TypeVar("R")
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Run ``function`` as it is inside compiled code, at the price of one break of the graph.
+    """Run ``function`` uncompiled inside compiled code, at the cost of one graph break.
 
-    :func:`torch.compiler.disable` as a decorator would do the same, and import the compiler with this package.
+    Unlike :func:`torch.compiler.disable` as a decorator, this does not import the compiler with the package.
     """
 
     @functools.wraps(function)

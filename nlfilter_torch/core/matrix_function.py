@@ -1,10 +1,9 @@
-"""Functions of small symmetric matrices, with a gradient that stands repeated eigenvalues.
+"""Functions of small symmetric matrices, with a gradient that is finite for repeated eigenvalues.
 
-``torch.linalg.eigh`` differentiates its eigenvectors, which divides by ``lambda_i - lambda_j`` and gives NaN where they
-meet: on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of Q, and
-    its
-derivative is finite: ``Q (D * (Q^T dA Q)) Q^T`` with the divided differences ``D_ij = (f_i - f_j) / (lambda_i -
-lambda_j)``, or f' where the two meet (Daleckii and Krein, 1965).
+``torch.linalg.eigh`` differentiates its eigenvectors, which divides by ``lambda_i - lambda_j`` and gives NaN where two
+are equal, as on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of
+Q, and its derivative is finite: ``Q (D * (Q^T dA Q)) Q^T`` with the divided differences ``D_ij = (f_i - f_j) /
+(lambda_i - lambda_j)``, or f' where eigenvalues are equal (Daleckii and Krein, 1965).
 """
 
 from collections.abc import Callable
@@ -17,8 +16,8 @@ from torch import Tensor
 from nlfilter_torch.core.autograd import once_differentiable
 from nlfilter_torch.core.compilation import uncompiled
 
-# Eigenvalues closer than MEETING, relative to themselves, use f' at their midpoint: the errors of f''' and of
-# cancellation are both near 1e-10 then. Below FLOOR the comparison is absolute, since zero eigenvalues are only zero to
+# Eigenvalues with a relative distance below MEETING use f' at their midpoint: the errors of f''' and of
+# cancellation are then both near 1e-10. Below FLOOR the distance is absolute, since zero eigenvalues are zero only to
 # rounding.
 MEETING = 1e-5
 FLOOR = 1e-5
@@ -49,13 +48,13 @@ class SymmetricMatrix:
         """f(A) restricted to the eigenvalues in ``support``.
 
         Args:
-            function: elementwise and differentiable, (B, M) to (B, M); may hold parameters that need a gradient.
-            support: (B, M) bool; where False, f is taken as 0 and the eigenvalue does not reach ``function``.
+            function: elementwise and differentiable, (B, M) to (B, M); may have parameters that need a gradient.
+            support: (B, M) bool; where False, f is 0 and ``function`` is not evaluated.
 
         Returns:
             (B, M, M), differentiable once in the matrix and in the parameters of ``function``.
         """
-        # A point where any sensible response and its derivative are finite stands in for what is outside the support.
+        # Outside the support f is evaluated at a point where responses and their derivatives are finite.
         points = torch.where(support, self.eigenvalues, torch.ones_like(self.eigenvalues))
         values = torch.where(support, function(points), torch.zeros_like(points))
         if not self.matrix.requires_grad:
@@ -78,14 +77,14 @@ class SymmetricMatrix:
 
     @staticmethod
     def _slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-        """F' at ``points`` (B, M, M), one column at a time because f may be different for every image of the batch."""
+        """F' at ``points`` (B, M, M), one column at a time because f may differ between the images of a batch."""
         with torch.enable_grad():
             points = points.detach().requires_grad_()
             flat = points.flatten(1)
             total = function(flat).sum()
             if not total.requires_grad:
                 return torch.zeros_like(points)
-            # A function that is constant may still hold parameters.
+            # A constant function may still have parameters.
             return torch.autograd.grad(total, points, allow_unused=True, materialize_grads=True)[0]
 
 

@@ -1,4 +1,4 @@
-"""How much memory an edit takes."""
+"""Memory that an edit needs."""
 
 
 def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
@@ -6,7 +6,7 @@ def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
 
     Args:
         landmarks: m; the factor has as many floats for each pixel.
-        patch_size: p; the patches of a pixel are there twice while they are weighted.
-        factors: arrays of the factor's size that are held at once: 1 to filter, 5 for the diagnostics.
+        patch_size: p; patches exist twice while they are weighted.
+        factors: number of arrays of the factor's size at once: 1 to filter, 5 for the diagnostics.
     """
     return 4 * (factors * landmarks + 2 * patch_size**2 + 40)

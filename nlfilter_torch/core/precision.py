@@ -1,6 +1,6 @@
-"""Numerical precision: the filter runs in float32 or float64 whatever surrounds it.
+"""Numerical precision: the filter always runs in float32 or float64.
 
-Cholesky and eigen-decompositions reject half precision, and TF32 products lose the distances between patches. Every
+Cholesky and eigen-decompositions reject half precision, and TF32 is too coarse for distances between patches. Every
 public function therefore leaves autocast, computes in :func:`working_dtype` and casts its result back.
 """
 

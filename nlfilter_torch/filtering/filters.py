@@ -1,4 +1,4 @@
-"""Operator, response and image to filtered image. Paper: Sec. III, eq. (10) to (14); Appendix A, eq. (19)."""
+"""Polynomial and spectral filters. Paper: Sec. III, eq. (10) to (14); Appendix A, eq. (19)."""
 
 from collections.abc import Callable
 
@@ -28,9 +28,9 @@ from nlfilter_torch.operator.spectrum import Response, Spectrum
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:
     """Split an image into detail layers, fine to coarse, and the smooth layer that remains.
 
-    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Whoever keeps the layers moves
-    sliders without another look at the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, which is
-    :class:`PolynomialSliders`.
+    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. With the
+    layers, other sliders need no further products with the operator: ``(alpha[:, None, None, None] * layers).sum(1)``,
+    which is :meth:`PolynomialSliders.combine`.
 
     Args:
         operator: W.
@@ -63,7 +63,7 @@ def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
 
 
 def layers_between(smoothed: Tensor) -> Tensor:
-    """What lies between neighbours in ``y, W y, ..., W^k y`` (B, k+1, ...), and the last of them."""
+    """Differences of neighbours in ``y, W y, ..., W^k y`` (B, k+1, ...), followed by the last of them."""
     return torch.cat([smoothed[:, :-1] - smoothed[:, 1:], smoothed[:, -1:]], dim=1)
 
 
@@ -141,10 +141,10 @@ def polynomial_filter(
 
 
 def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor, remainder: Tensor) -> Tensor:
-    """What is added to a filtered image for ``missed``, the part that no eigenvector captures, to have its own weight.
+    """Correction of a filtered image that gives ``missed``, the part no eigenvector captures, its own weight.
 
-    W multiplies that part by r, as F annihilates it, so that the sliders have given it the weight f(r). The share r of
-    it stays as it is: W keeps a pixel like no other, though no eigenvector captures it.
+    F annihilates that part, so W multiplies it by r and the sliders have given it the weight f(r). The share r of it
+    keeps that weight: W preserves a pixel unlike all others, though no eigenvector captures it.
 
     Args:
         alpha: the sliders, of any shape that :func:`weigh_layers` takes.
@@ -167,7 +167,7 @@ def spectral_filter(
     residual: float | Tensor = 0.0,
     coefficients: Tensor | None = None,
 ) -> Tensor:
-    """Filter an image with any response: ``V f(S) V^T y``, plus ``residual`` times what V does not explain.
+    """Filter an image with any response: ``V f(S) V^T y``, plus ``residual`` times what V does not capture.
 
     Paper: eq. (10), (13), and Sec. V-D, where f is a fractional power.
 
@@ -176,8 +176,8 @@ def spectral_filter(
         image: y, (B, C, H, W).
         response: f, an elementwise function of the eigenvalues (B, R), differentiable in torch; it may hold parameters.
         residual: weight of ``y - V V^T y``, a number or a tensor of shape () or the spectrum's (B,).
-        coefficients: of the image, kept from ``spectrum.coefficients(image)``; with them another response reads the
-            factor once, not twice. None works them out.
+        coefficients: ``spectrum.coefficients(image)``, computed before; with them a further response reads the factor
+            once instead of twice. None computes them.
 
     Returns:
         (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
@@ -192,9 +192,9 @@ def spectral_filter(
         >>> from nlfilter_torch import nonlocal_operator
         >>> image = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0))
         >>> spectrum = nonlocal_operator(image, num_landmarks=20).spectrum()
-        >>> held = spectrum.coefficients(image)
+        >>> cached = spectrum.coefficients(image)
         >>> for power in (0.1, 0.5, 2.0):
-        ...     filtered = spectral_filter(spectrum, image, lambda s: s**power, residual=1.0, coefficients=held)
+        ...     filtered = spectral_filter(spectrum, image, lambda s: s**power, residual=1.0, coefficients=cached)
         >>> filtered.shape
         torch.Size([1, 1, 24, 24])
     """
@@ -212,7 +212,7 @@ def spectral_filter(
     if isinstance(residual, int | float) and residual == 0:
         return spectrum.synthesize(response, coefficients).to(image.dtype)
     rho = torch.as_tensor(replicate(residual, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
-    # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still one pass down and one up.
+    # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
     return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered)).to(image.dtype)
 
@@ -221,7 +221,7 @@ def spectral_filter(
 def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     """Share of the image's energy in the span of the eigenvectors: ``|V^T y|^2 / |y|^2``.
 
-    Paper: eq. (19); near 1 when bandwidth and landmarks suit the image.
+    Paper: eq. (19); near 1 if bandwidth and landmarks suit the image.
 
     Args:
         spectrum: of the operator.
@@ -242,21 +242,20 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
 
 
 def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
-    """Sliders for every pixel from sliders for every region: inside a mask its own, outside of all the image as it is.
+    """Per-pixel sliders from per-region sliders: those of the mask inside it, ones outside all masks.
 
     Paper: Figs. 12, 13, where eq. (12) acts inside a propagated mask. The result is an ``alpha`` of
     :func:`polynomial_filter`; with one region it is the edit blended by its mask.
 
     Args:
-        masks: (B, K, H, W) in [0, 1] of K regions, soft or hard. Where they add up to more than 1 they share the pixel
-            in proportion.
+        masks: (B, K, H, W) in [0, 1] of K regions, soft or hard; normalised where their sum exceeds 1.
         alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
 
     Returns:
         (B, k+1, H, W), ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in both.
 
     Raises:
-        TypeError, ValueError: if ``masks`` is no such tensor or leaves [0, 1], or ``alpha`` has another number of
+        TypeError, ValueError: if ``masks`` is no such tensor or exceeds [0, 1], or ``alpha`` has another number of
             regions.
 
     Example:
@@ -296,7 +295,7 @@ def filter_regions(
     Args:
         operator: W.
         image: (B, C, H, W).
-        masks: (B, K, H, W) in [0, 1], soft or hard; where they add up to more than 1 they share the pixel.
+        masks: (B, K, H, W) in [0, 1], soft or hard; normalised where their sum exceeds 1.
         alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
         residual: of :func:`polynomial_filter`, for all regions.
 
@@ -333,13 +332,13 @@ def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[T
 
 
 def blend_sliders(masks: Tensor, alpha: Tensor, outside: Tensor) -> Tensor:
-    """Sliders (B, k+1, H, W) of all pixels: those of :func:`blend_regions`, and ``outside`` (k+1,) where no mask is."""
+    """Sliders (B, k+1, H, W) of all pixels: those of :func:`blend_regions`, and ``outside`` (k+1,) elsewhere."""
     inside, share = _within(masks, alpha)
     return torch.lerp(outside.to(inside).view(1, -1, 1, 1).expand_as(inside), inside, share)
 
 
 def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Sliders (B, k+1, H, W), of all regions in proportion to their masks, and how much they count, (B, 1, H, W)."""
+    """Sliders (B, k+1, H, W), averaged over the regions with their masks as weights, and the sum of masks."""
     total = masks.sum(1, keepdim=True)
     return compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha), total.clamp(max=1.0)
 

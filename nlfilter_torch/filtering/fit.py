@@ -1,8 +1,8 @@
-"""Image and target to the sliders that turn one into the other. Paper: eq. (12), read backwards.
+"""The sliders that turn an image into a target. Paper: inverts eq. (12).
 
-The filter is linear in alpha, so least squares finds it at once from the (k+1) x (k+1) products of the layers. Layers
-that are nearly alike, or nearly nothing, leave some mixtures of sliders undecided: those stay as close to 1, which
-changes nothing, as the target allows.
+The filter is linear in alpha, so alpha is the solution of a least-squares problem with the (k+1) x (k+1) Gram matrix of
+the layers. If layers are nearly equal or nearly zero, some combinations of sliders are undetermined; those stay as
+close to 1, the identity, as the target allows.
 """
 
 import math
@@ -30,15 +30,15 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
-# Mixtures of layers of unit norm whose squared norm is below this are rounding of the operator's dtype.
+# Combinations of unit-norm layers with a squared norm below this are rounding of the operator's dtype.
 CUT = {torch.float32: 1e-10, torch.float64: 1e-14}
-ROUNDING = {torch.float32: 1e-13, torch.float64: 1e-30}  # power of a layer's rounding, as a share of the image's
-IDLE = 1e-20  # squared length of a move of the sliders that is the rounding of none, as a share of the longest
-# A layer whose power is this small beside that of the image is what balancing left of a constant one.
+ROUNDING = {torch.float32: 1e-13, torch.float64: 1e-30}  # power of a layer's rounding error, relative to the image's
+IDLE = 1e-20  # squared length of a slider direction that is rounding error, relative to the longest
+# A layer of less power than this, relative to the image, is the balancing error on a constant image.
 VANISHED = {torch.float32: 1e-9, torch.float64: 1e-22}
 DESCENT_STEPS = 200
 HALF_LEVEL = 0.5 / 255
-OFF_LEVEL = 1e-3  # of a level: values of 8 bits as floats are this close to one
+OFF_LEVEL = 1e-3  # of a level: tolerance for 8-bit values stored as floats
 NEWTON_STEPS, HALVINGS = 50, 8
 SETTLED = 1e-9
 
@@ -58,27 +58,26 @@ def fit_alpha(
 ) -> Tensor:
     """Find the sliders that bring ``polynomial_filter(operator, image, alpha)`` closest to ``target``.
 
-    Paper: eq. (12), read backwards. Solved in float64 whatever the images are in.
+    Paper: inverts eq. (12). Solved in float64 for images of any dtype.
 
     Args:
         operator: W.
         image: y, (B, C, H, W), before the edit.
-        target: (B, C, H, W), after it; all channels count alike.
-        order: k, at least 1: one slider fewer than are found.
-        mask: (B, 1, H, W) or (1, 1, H, W), non-negative weights of the pixels; None counts all of them.
-        ridge: weight of ``|alpha - 1|^2`` beside the mean squared error, at least 0: holds the sliders back.
+        target: (B, C, H, W), after it; channels have equal weight.
+        order: k, at least 1; k+1 sliders are found.
+        mask: (B, 1, H, W) or (1, 1, H, W), non-negative weights of the pixels; None weighs all equally.
+        ridge: weight of the penalty ``|alpha - 1|^2`` relative to the mean squared error, at least 0.
         shared: one alpha for the whole batch, rather than one for each image.
-        rounding: half the step between the values that ``target`` can hold, such as 0.5 / 255 for 8 bits. Errors up to
-            it count for nothing, nor does what goes beyond a target of 0 or 1, where a file clips. None is 0.5 / 255
-            where ``target`` holds only multiples of 1 / 255, and 0.0, plain least squares, where it does not.
-        loss: ``loss(filtered, target)``, a number to be made small by gradient descent from the least squares solution;
-            None is the least squares solution itself. Where ``mask`` is 0 both arguments hold the target, in between
-            they are blended.
+        rounding: half the step between the values of ``target``, such as 0.5 / 255 for 8 bits. Errors up to it are
+            ignored, and so are values beyond a target of 0 or 1, which a file clips. None is 0.5 / 255 if ``target``
+            holds only multiples of 1 / 255, and 0.0, ordinary least squares, otherwise.
+        loss: ``loss(filtered, target)``, a number to be minimised by L-BFGS from the least-squares solution; None
+            returns that solution. Where ``mask`` is 0 both arguments are the target, and in between they are blended.
 
     Returns:
-        alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype; every other alpha has a mean squared error (or
-        a ``loss``) at least as large. Ones where the image decides nothing, as a constant one. Differentiable in image,
-        target, mask and operator; with a ``loss``, not.
+        alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype, with the smallest mean squared error or
+        ``loss``. Ones if the image determines nothing, such as a constant one. Differentiable in image, target, mask
+        and operator, unless ``loss`` is given.
 
     Raises:
         TypeError, ValueError: if ``image``, ``target`` or ``mask`` do not fit together, ``mask`` is negative or all
@@ -131,13 +130,13 @@ def _check_not_negative(value: float, name: str) -> None:
 
 
 def _is_rounded(target: Tensor, shard: Shard | None) -> bool:
-    """Does ``target`` hold nothing but multiples of 1/255?"""
+    """Whether all values of ``target`` are multiples of 1/255."""
     levels = target.detach().double() * 255
     return bool(reduce_max((levels - levels.round()).abs().max(), shard) < OFF_LEVEL)
 
 
 def _dead_zone(target: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
-    """Errors (target less filtered) between which a pixel is explained: from a clipped one, any beyond the clipping."""
+    """Range of errors (target minus filtered) that count as zero; unbounded on one side for a clipped pixel."""
     low = torch.where(target >= 1.0, -math.inf, -rounding)
     high = torch.where(target <= 0.0, math.inf, rounding)
     return low, high
@@ -145,17 +144,17 @@ def _dead_zone(target: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Explain ``edit`` by a change of the sliders from 1, under which the filter leaves the image alone.
+    """Fit ``edit`` by a change of the sliders from 1, the identity.
 
     Attributes:
-        layers: (B, k+1, P), all values of an image in a row.
+        layers: (B, k+1, P), all values of an image in one row.
         edit: (B, P).
-        dead_zone: limits (B, P) between which errors count for nothing; None where all count.
+        dead_zone: limits (B, P) between which errors count as zero; None if there are none.
         weights: (B, P) or (1, P), of unit sum.
         ridge: see :func:`fit_alpha`.
         shared: one change for all images.
-        precision: dtype in which the layers were worked out.
-        shard: of the images, where other ranks have the rest of them.
+        precision: dtype in which the layers were computed.
+        shard: of the images, if other ranks have the remaining rows.
     """
 
     layers: Tensor
@@ -168,11 +167,11 @@ class _Problem:
     shard: Shard | None
 
     def fit(self) -> Tensor:
-        """Change (B, k+1) of least squares, with the dead zone.
+        """Least-squares change (B, k+1) with the dead zone.
 
-        Rounding is no noise: where the edit is smaller than half a level, it takes it away, always, and plain least
-        squares finds sliders that do too little. With the dead zone the true sliders are free of error. The objective
-        is convex, piecewise quadratic, and differentiable; Newton's method ends after a few steps.
+        Rounding errors are systematic: an edit of less than half a level always disappears, so ordinary least squares
+        underestimates the sliders. With the dead zone the true sliders have no error. The objective is convex,
+        piecewise quadratic and differentiable; Newton's method converges in a few steps.
         """
         batch = 1 if self.shared else self.layers.shape[0]
         start = self.layers.new_zeros(batch, self.layers.shape[1])
@@ -191,12 +190,12 @@ class _Problem:
         return self._least(change + self._step(change))  # a last step for the gradient
 
     def _least(self, change: Tensor) -> Tensor:
-        """The smallest change (B, k+1) that does the same: a layer that is a small multiple of another one rests."""
+        """The smallest change (B, k+1) with the same effect, which favours the stronger of two proportional layers."""
         scale, matrix, counted = self._scaled(self._products)
         idle = matrix.apply(torch.ones_like, ~counted)  # a projector, (B, k+1, k+1)
-        moves = scale.unsqueeze(2) * idle  # mixtures of sliders that change nothing
+        moves = scale.unsqueeze(2) * idle  # combinations of sliders without effect
         inner = SymmetricMatrix.of(moves.mT @ moves)
-        # Less is rounding, beside the longest of the moves or where there is none.
+        # Shorter directions are rounding error.
         least = torch.maximum(CUT[torch.float64] * inner.eigenvalues[:, :1], IDLE * scale.amax(1, True).square())
         real = inner.eigenvalues > least
         inverse = inner.apply(torch.reciprocal, real)
@@ -204,15 +203,15 @@ class _Problem:
 
     @cached_property
     def _products(self) -> Tensor:
-        """Of all layers with each other, (B, k+1, k+1), where all errors count."""
+        """Gram matrix of the layers, (B, k+1, k+1), without a dead zone."""
         return self._weighed(self.weights)
 
     def _weighed(self, weights: Tensor) -> Tensor:
-        """Products of all layers with each other, (B, k+1, k+1), under weights (B, P)."""
+        """Gram matrix of the layers, (B, k+1, k+1), under weights (B, P)."""
         return self._pool(reduce_sum((self.layers * weights.unsqueeze(1)) @ self.layers.mT, self.shard))
 
     def _errors(self, change: Tensor) -> Tensor:
-        """What of the edit (B, P) is left unexplained."""
+        """Remaining error of the edit, (B, P)."""
         errors = self.edit - (change.unsqueeze(1) @ self.layers).squeeze(1)
         return errors if self.dead_zone is None else errors - errors.clamp(*self.dead_zone)
 
@@ -224,7 +223,7 @@ class _Problem:
         return self._pool(squares) + self.ridge * change.square().sum(1)
 
     def _step(self, change: Tensor) -> Tensor:
-        """Newton's step (B, k+1): from anywhere to the solution where all errors count."""
+        """Newton's step (B, k+1); without a dead zone it leads to the solution from any point."""
         errors = self._errors(change)
         products = self._products if self.dead_zone is None else self._weighed(self.weights * (errors != 0.0))
         slope = reduce_sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2), self.shard)
@@ -233,30 +232,30 @@ class _Problem:
         return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)
 
     def _inverse(self, products: Tensor) -> tuple[Tensor, Tensor]:
-        """Scales (B, k+1) of the layers, and the pseudo-inverse (B, k+1, k+1) of their products so scaled."""
+        """Scales (B, k+1) of the layers, and the pseudo-inverse (B, k+1, k+1) of the scaled Gram matrix."""
         scale, matrix, counted = self._scaled(products)
         return scale, matrix.apply(torch.reciprocal, counted)
 
     def _scaled(self, products: Tensor) -> tuple[Tensor, SymmetricMatrix, Tensor]:
-        """Scales (B, k+1) of the layers, their products so scaled, and which eigenvalues of these are no rounding.
+        """Scales (B, k+1) of the layers, their scaled Gram matrix, and which of its eigenvalues exceed rounding.
 
-        The scales give unit norm, or 0 to a layer that is rounding itself.
+        The scales normalise the layers; a layer that is rounding error has scale 0.
         """
         products = products + self.ridge * torch.eye(products.shape[1]).to(products)
         power = products.diagonal(dim1=1, dim2=2)
-        # The layers sum to the image, so the largest of them is of its size.
+        # The layers sum to the image, so the largest of them is of its magnitude.
         share = power / power.amax(1, keepdim=True).clamp(min=torch.finfo(power.dtype).tiny)
         present = share > VANISHED[self.precision]
         scale = torch.where(present, power, torch.ones_like(power)).rsqrt() * present
         matrix = SymmetricMatrix.of(scale.unsqueeze(2) * products * scale.unsqueeze(1))
-        # Scaling raises the rounding of small layers as well.
+        # Scaling amplifies the rounding errors of small layers.
         rounding = ROUNDING[self.precision] / torch.where(present, share, torch.ones_like(share)).detach()
         floor = (matrix.vectors.square() * rounding.unsqueeze(2)).sum(1).clamp(min=CUT[self.precision])
         return scale, matrix, matrix.eigenvalues > floor
 
     @torch.no_grad()
     def descend(self, start: Tensor, loss: Loss, target: Tensor, mask: Tensor | None) -> Tensor:
-        """Change (B, k+1) that minimises ``loss``, by L-BFGS in a basis in which the squared error is round."""
+        """Change (B, k+1) that minimises ``loss``, by L-BFGS in a basis that makes the squared error isotropic."""
         scale, inverse = self._inverse(self._products)
         basis = scale.unsqueeze(2) * SymmetricMatrix.of(inverse).apply(torch.sqrt, torch.ones_like(scale).bool())
         filtered_shape = (self.layers.shape[0], *target.shape[1:])

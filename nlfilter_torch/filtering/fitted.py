@@ -1,8 +1,8 @@
 """A filter fitted to one image and applied to others: frames of a film, a set of photographs, tiles of a large one.
 
-Whatever W does to a pixel is a function of the pixel's own patch and of a few m-vectors, sums over all pixels of the
-image that W was made from. With those vectors held, equal patches are edited equally in every frame, so that an edit
-does not flicker; on the image that it was fitted to, the fitted filter is the filter itself.
+What W does to a pixel depends on the pixel's own patch and on a few m-vectors, which are sums over all pixels of the
+image that W was made from. With these vectors fixed, equal patches are edited equally in every frame, so an edit does
+not flicker. On the image it was fitted to, the fitted filter equals the filter.
 """
 
 from dataclasses import dataclass, replace
@@ -30,15 +30,15 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 
 @dataclass(frozen=True, eq=False)
 class FittedFilter:
-    """Detail layers of any image, by the landmarks, balancing and coefficients of the one that it was fitted to.
+    """Detail layers of any image, with the landmarks, balancing and coefficients of the image it was fitted to.
 
     Made by :func:`fit_filter`.
 
     Attributes:
         kernel: landmarks, bandwidths and window.
-        balancing: what the scaling of a pixel is a function of.
+        balancing: determines the scaling of a pixel.
         moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
-        explained: coefficients of the part of an image that the eigenvectors explain, (1, M, C).
+        explained: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
     """
 
     kernel: Kernel
@@ -61,8 +61,8 @@ class FittedFilter:
             image: (B, C, H, W), with the channels of the fitted image.
             guide: (B, C', H, W), with the channels of the fitted guide; None is the image.
             origin: row and column of the first pixel, for tiles of the fitted image.
-            halo: rows at the top and at the bottom of a tile that are there for the patches of the others, half a patch
-                or as many as there are before the border; the result is without them.
+            halo: rows at the top and at the bottom of a tile that only complete the patches of the others: half a
+                patch, or fewer at the border of the picture. The result does not contain them.
 
         Raises:
             TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
@@ -83,7 +83,7 @@ class FittedFilter:
     ) -> Tensor:
         """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`.
 
-        ``by_rows`` works out one row after the other: the rounding of a product depends on its shape, which is then the
+        ``by_rows`` computes one row after the other, so that rounding, which depends on the shape of a product, is the
         same for tiles of any height.
         """
         check_instance(by_rows, bool, "by_rows", "pass True or False")
@@ -108,7 +108,7 @@ class FittedFilter:
         by_rows: bool = False,
         missed: bool = False,
     ) -> Tensor:
-        """Layers (B, k+1, C, H, W) and, if asked for, what they miss and r as two more, in the kernel's dtype."""
+        """Layers (B, k+1, C, H, W) and, on request, the residual and r as two more, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
@@ -148,13 +148,13 @@ class FittedFilter:
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:
-    """The rows of an image that lie between those of its halo."""
+    """The rows of an image without its halo."""
     return image[..., halo[0] : image.shape[-2] - halo[1], :]
 
 
 @full_precision
 def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> FittedFilter:
-    """Keep what it takes to filter other images as an operator filters this one.
+    """Fit a filter to an image, to be applied to other images.
 
     Args:
         operator: W, of one image or a batch of one.

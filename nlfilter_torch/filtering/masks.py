@@ -1,4 +1,4 @@
-"""Spectrum and regions to masks that reach every similar pixel. Paper: Sec. IV, eq. (15) to (17), Fig. 11; Sec. V-A."""
+"""Masks of all pixels similar to a region. Paper: Sec. IV, eq. (15) to (17), Fig. 11; Sec. V-A."""
 
 import torch
 from torch import Tensor
@@ -11,11 +11,11 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import Spectrum
 
-FARTHEST = 60.0  # far pixels would underflow to 0, where a product of masks loses what it stands for
-STEEPEST = 1e30  # pixels over width: no distance of 0 becomes NaN
-EXPLAINED = 0.005  # share of a region's kernel below which its place in the diffusion map is nearly the origin
-LOOKED_AT = 4096  # of a region's pixels
-ITERATIONS = 20  # of k-means, which starts close to its end
+FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined
+STEEPEST = 1e30  # limit of pixels / width: a distance of 0 never becomes NaN
+EXPLAINED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
+LOOKED_AT = 4096  # pixels of a region that are checked
+ITERATIONS = 20  # of k-means, which starts close to the solution
 
 
 @full_precision
@@ -53,15 +53,15 @@ def diffusion_mask(
     """How similar every pixel is to a region: ``exp(-D_t^2 / width)``.
 
     Paper: eq. (16), (17), whose width is 1, with D_t the distance to the region's mean in :func:`diffusion_map`. Two
-    kinds of pixels that W keeps apart are at a squared distance of at least 4, whatever the size of the image.
+    groups of pixels that W does not connect have a squared distance of at least 4, for images of any size.
 
     Args:
         spectrum: of the operator.
         region: (B, K, H, W), non-negative weights of the pixels of K regions.
         time: diffusion time t > 0, a number or a tensor of shape () or (B,); larger reaches further.
         width: squared distance at which the mask has fallen to 1/e, likewise.
-        negative: (B, 1 or K, H, W), weights of pixels that the mask has to stay away from: it is halved where a pixel
-            is as close to them as to the region, and falls further where it is closer to them. None is no such region.
+        negative: (B, 1 or K, H, W), weights of pixels that the mask avoids: it is halved where a pixel is as close to
+            them as to the region, and smaller where it is closer to them. None is no such region.
 
     Returns:
         (B, K, H, W) in (0, 1], in the region's dtype (float16 rounds the least to 0); without ``negative`` it grows
@@ -91,7 +91,7 @@ def diffusion_mask(
         check_negative(others.shape[1], weights.shape[1])
         images = max(len(weights), len(others))
         weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
-    # The constant eigenvector has no differences, so it may stay: distances need no choice of eigenvectors.
+    # The constant eigenvector adds nothing to distances, so it may stay, and no eigenvectors need to be chosen.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
     exponents = scale.clamp(max=STEEPEST) * distances
@@ -102,7 +102,7 @@ def diffusion_mask(
 
 @torch.no_grad()
 def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
-    """Warn of a region (B, K, N) like no landmark: all pixels that the landmarks miss have the coordinates 0."""
+    """Warn of a region (B, K, N) unlike all landmarks: all pixels the landmarks do not capture have coordinates 0."""
     if is_hidden(weights):
         return
     for columns, regions in zip(spectrum.factor, weights.expand(len(spectrum.factor), -1, -1), strict=True):
@@ -111,7 +111,7 @@ def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
             few = places[:: 1 + len(places) // LOOKED_AT]
             if len(few) > 0 and columns[:, few].square().sum(0).mean() < EXPLAINED:
                 warn(
-                    f"region {number} is like no landmark, so its mask may take in whatever else is like none; "
+                    f"region {number} is like no landmark, so its mask may take in other pixels like none; "
                     "raise num_landmarks or photometric_bandwidth"
                 )
 
@@ -126,7 +126,7 @@ def check_negative(count: int, regions: int) -> None:
 
 
 def mask_of_exponents(exponents: Tensor, others: Tensor | None) -> Tensor:
-    """Positive masks (B, K, N) from squared distances over their width: to the regions, and to what is left out."""
+    """Positive masks (B, K, N) from squared distances divided by the width, to the regions and to the negative ones."""
     mask = torch.exp(-exponents.clamp(max=FARTHEST))
     return mask if others is None else mask * torch.sigmoid((others - exponents).clamp(min=-20.0))
 
@@ -135,7 +135,7 @@ def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> T
     """Squared distances (B, K, N) of all pixels to the means of K regions in the coordinates ``basis @ F``.
 
     Args:
-        spectrum: whose F, the scaled factor, it is.
+        spectrum: with F, the scaled factor.
         basis: (B, M, M), float64.
         weights: of the regions, (B, K, N), each of unit sum.
     """
@@ -143,7 +143,7 @@ def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> T
     centres = _sums(spectrum, basis, weights).mT.to(factor)  # (B, K, M)
     core, step = basis.to(factor), block_length(len(factor), factor.device, CACHED)
     blocks = zip(factor.split(step, dim=2), scaling.split(step, dim=2), strict=True)
-    # All coordinates would take as much memory as the factor.
+    # In blocks, since all coordinates take as much memory as the factor.
     return torch.cat([squared_distances((core @ columns) * scales, centres) for columns, scales in blocks], dim=2)
 
 
@@ -179,8 +179,8 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         time: diffusion time t > 0; larger values weigh coarse structure more.
 
     Returns:
-        (B, K, H, W) of zeros and ones, in the regions' dtype, with a single one for every pixel. A cluster that loses
-        all its pixels keeps its centre. Not differentiable, as any assignment.
+        (B, K, H, W) of zeros and ones, in the regions' dtype, with a single one for each pixel. A cluster that loses
+        all its pixels keeps its centre. Not differentiable.
 
     Raises:
         TypeError, ValueError: if ``regions`` does not fit, is negative or holds an empty one, or ``time`` is not
@@ -200,7 +200,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
             sizes = reduce_sum(counts, spectrum.shard).unsqueeze(1)  # (B, 1, K)
             centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
-            if members.device.type != "cpu":  # a look would be a wait
+            if members.device.type != "cpu":  # comparing would synchronise with the device
                 continue
             if not reduce_max((previous != assignment).any().to(members), spectrum.shard):
                 break
@@ -216,4 +216,4 @@ def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:
     """Number (B, N) of the centre (B, M, K) nearest to every pixel in the coordinates ``basis @ F``."""
     inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor, spectrum.scaling)
-    return (inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)).max(1).indices  # ten times as quick as argmax
+    return (inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)).max(1).indices  # ten times as fast as argmax

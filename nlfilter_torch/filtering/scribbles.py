@@ -1,11 +1,11 @@
-"""Spectrum and strokes to values for every pixel, by regression in the eigenbasis. Goes past the paper's Sec. V-A.
+"""Values for every pixel from scribbles, by regression in the eigenbasis. Goes beyond the paper's Sec. V-A.
 
-Values on strokes are taken for noisy samples of a random image that varies like a walk over similar pixels: with ``g =
-W + s W^2 + s^2 W^3 + ... = W (I - s W)^-1``, s the reach, its covariance is ``diag(1/d) g diag(1/d)``. At s = 0 that is
-the kernel K itself; larger s adds longer walks, so that values carry further where nothing nearer was painted. The
-weights of W alone would not do: they let rare pixels vary much and common ones hardly. As ``W = diag(d) U^T U diag(d)``
+The values on scribbles are treated as noisy samples of a Gaussian process whose covariance is a random walk over
+similar pixels: ``diag(1/d) g diag(1/d)`` with ``g = W + s W^2 + s^2 W^3 + ... = W (I - s W)^-1`` and s the reach. At
+s = 0 it is the kernel K; larger s adds longer walks, so values extend further where no scribble is closer. The
+covariance g alone would give rare pixels a large variance and common ones a small one. As ``W = diag(d) U^T U diag(d)``
 on the span of the factor, the covariance of two pixels is ``u_i^T X u_j`` with the core X of :meth:`Spectrum.gain`, and
-the best estimate is one m x m solve, with no choice of eigenvectors in it.
+the best estimate takes one m x m solve and no choice of eigenvectors.
 """
 
 from collections.abc import Callable, Iterable
@@ -29,9 +29,9 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
-SPOT = 25 / 38400  # share of the image that a dab of a brush covers: 5x5 pixels of 160x240
-NOISE = 0.08  # variance of the values of one dab, as a share of the variance of the image
-FLOOR = 1e-12  # of eigenvalues, which keeps the derivative of a root finite
+SPOT = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240
+NOISE = 0.08  # variance of the values of one dab, relative to that of the image
+FLOOR = 1e-12  # of eigenvalues; keeps the derivative of their square root finite
 
 Painted = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
 
@@ -46,24 +46,25 @@ def propagate_strokes(
     reach: float | Tensor = 0.9,
     smoothness: float | Tensor = 1.0,
 ) -> Tensor:
-    """Extend values that are known on strokes to the whole image, alike where the image is alike.
+    """Extend values given on scribbles to the whole image, with similar values for similar pixels.
 
     Args:
         spectrum: of the operator. Coordinates in its features (``spatial_bandwidth``) make values local as well.
-        strokes: c, (B, C, H, W), any values, such as chroma, selection or depth; read where painted only.
-        stroke_mask: (B, 1, H, W) in [0, 1], how much a pixel counts.
-        strength: in [0, 1], a number or a tensor of shape () or (B,): how much of the strokes' mean goes to pixels that
-            resemble none of them. At 1 every pixel gets a value, at 0 values fade to 0 away from their likes.
-        reach: in [0, 1), likewise: how likely a walk over similar pixels goes on after each step.
-        smoothness: positive, likewise. Smaller follows the strokes more closely, larger evens them out.
+        strokes: c, (B, C, H, W), any values, such as chroma, selection or depth; read under the mask only.
+        stroke_mask: (B, 1, H, W) in [0, 1], the weight of a pixel.
+        strength: in [0, 1], a number or a tensor of shape () or (B,): the share of the scribbles' mean that pixels
+            similar to none of them get. At 1 every pixel gets a value, at 0 values fade to 0 with decreasing
+            similarity.
+        reach: in [0, 1), likewise: probability that a walk over similar pixels continues after a step.
+        smoothness: positive, likewise. Smaller follows the scribbles more closely, larger averages them more.
 
     Returns:
         (B, C, H, W) in the dtype of ``strokes``. Linear in ``strokes``; at strength 1 a constant comes back as itself.
         Differentiable in operator, strokes, mask and parameters, also where eigenvalues meet.
 
     Raises:
-        TypeError, ValueError: if sizes or batches differ, ``stroke_mask`` leaves [0, 1] or is empty, or a parameter
-            leaves its range.
+        TypeError, ValueError: if sizes or batches differ, ``stroke_mask`` exceeds [0, 1] or is empty, or a parameter
+            is out of range.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -93,7 +94,7 @@ def propagate_strokes(
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
-    if not weights.requires_grad:  # the weight of an unpainted pixel has a derivative, but no effect
+    if not weights.requires_grad:  # pixels of weight 0 matter only to the derivative by the weights
         painted = (weights > 0).any(0).squeeze(0).nonzero().squeeze(1)
         factor, weights, values = factor[:, :, painted], weights[:, :, painted], values[:, :, painted]
     fitted = fit_strokes(
@@ -110,11 +111,11 @@ def propagate_strokes(
 
 @dataclass(frozen=True, eq=False)
 class FittedStrokes:
-    """What strokes say about any pixel, from its column of the factor alone.
+    """Values of any pixel by the fitted regression, from its column of the factor alone.
 
     Attributes:
         coefficients: (B, C, M), float64.
-        share: (B, C, 1), the part of the strokes' mean that goes to pixels that resemble none of them.
+        share: (B, C, 1), the share of the scribbles' mean that pixels similar to none of them get.
     """
 
     coefficients: Tensor
@@ -135,17 +136,17 @@ def fit_strokes(
     smoothness: float | Tensor,
     shard: Shard | None = None,
 ) -> FittedStrokes:
-    """The regression of :func:`propagate_strokes`, from sums over the painted pixels.
+    """The regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
     Args:
-        painted: gives, as often as it is called, all painted pixels in blocks of columns of the factor (B, M, n),
+        painted: iterates at each call over all scribbled pixels, in blocks of columns of the factor (B, M, n),
             weights (B, 1, n) and values (B, C, n).
         pairs: of the operator.
         pixels: N, of the whole image.
         strength: as of :func:`propagate_strokes`, and so are ``reach`` and ``smoothness``.
         reach: s of the walks.
         smoothness: scales the noise.
-        shard: of the image, where other ranks have the rest of it.
+        shard: of the image, if other ranks have the remaining rows.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T
     heed = Heed.of(painted, half, SPOT * pixels, shard)
@@ -162,13 +163,13 @@ def fit_strokes(
 
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
     inner = half.mT @ gram @ half
-    noise = _per_image(smoothness, gram) * heed.spot * heed.noise  # of a pixel, many of which make a dab
+    noise = _per_image(smoothness, gram) * heed.spot * heed.noise  # of a single pixel of a dab
     identity = torch.eye(inner.shape[1]).to(inner)
     lower = torch.linalg.cholesky_ex(inner + noise * identity).L
     solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
 
-    # The last column extends a stroke of ones: how far each pixel is reached at all. Generalised least squares tells
-    # the mean from what both leave unexplained on the strokes, and unreached pixels get their part of it.
+    # The last column extends scribbles of ones: how much each pixel is determined by them. Generalised least squares
+    # gets the mean from the residuals of both, and pixels that are not determined get their share of it.
     unexplained = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
     mean = unexplained[:, :-1] / unexplained[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
@@ -176,7 +177,7 @@ def fit_strokes(
 
 
 def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
-    """B (B, M, M) with the core ``X = B^T B``: columns u and v of the factor covary by ``(B u)^T (B v)``.
+    """B (B, M, M) with the core ``X = B^T B``: columns u and v of the factor have the covariance ``(B u)^T (B v)``.
 
     Args:
         pairs: of the operator.
@@ -188,16 +189,16 @@ def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Heed:
-    """How much a painted pixel counts.
+    """Effective weights of scribbled pixels.
 
-    A dot that someone sets with care must not drown among broad strokes, nor in a large photograph: pixels that
-    resemble few others that are painted count for up to a whole dab. And what a pixel has of its own, which the
-    landmarks miss, tells nothing about others: values of pixels like no other are left to themselves.
+    A single dot must not be outweighed by broad scribbles or by the size of the photograph: pixels similar to few other
+    scribbled ones count for up to a whole dab. The part of a pixel that the landmarks do not capture says nothing about
+    other pixels, so pixels unlike all others have little weight.
 
     Attributes:
         core: X, (B, M, M).
-        gram: ``X G X / v`` with G the sum over the painted pixels and v their mean explained variance, (B, M, M).
-        spot: pixels that a dab of a brush covers.
+        gram: ``X G X / v`` with G the sum over the scribbled pixels and v their mean captured variance, (B, M, M).
+        spot: pixels in a dab of the brush.
         noise: variance of the values of a dab, (B, 1, 1).
     """
 
@@ -208,7 +209,7 @@ class Heed:
 
     @staticmethod
     def of(painted: Painted, half: Tensor, spot: float, shard: Shard | None) -> "Heed":
-        """From a pass over the painted pixels."""
+        """From a pass over the scribbled pixels."""
         gram, missed, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
@@ -227,18 +228,18 @@ class Heed:
         if self.spot <= 1:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
-        # The sum of squared correlations with what is painted.
+        # The sum of squared correlations with the scribbled pixels.
         likes = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
         return weights * (self.spot / likes.clamp(min=1.0)).clamp(min=1.0)
 
 
 def unexplained(factor: Tensor) -> Tensor:
-    """What columns (B, M, n) lack of the kernel's unit diagonal, (B, 1, n): 1 for a pixel like no landmark."""
+    """Residual of columns (B, M, n) on the kernel's unit diagonal, (B, 1, n): 1 for a pixel like no landmark."""
     return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 
 
 def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shard | None = None) -> None:
-    """Raise unless every image of ``stroke_mask`` (B, 1, H, W) holds a painted pixel and all values are in [0, 1]."""
+    """Raise unless every image of ``stroke_mask`` (B, 1, H, W) has a scribbled pixel and all values are in [0, 1]."""
     check_unit_range(stroke_mask, name)
     empty = reduce_max(stroke_mask.detach().amax((1, 2, 3)), shard) <= 0
     if bool(empty.any()):

@@ -1,4 +1,4 @@
-"""Image files: photographs in memory, TIFF, and pictures that are read and written by rows."""
+"""Image files: photographs in memory, TIFF, and pictures read and written a few rows at a time."""
 
 from nlfilter_torch.io.photographs import Photograph, TooLarge, check_output, read_photograph, write_photograph
 

@@ -1,4 +1,4 @@
-"""EXIF blocks: what they say of a picture's orientation, and the picture turned upright."""
+"""EXIF blocks: the orientation of a picture, and turning it upright."""
 
 import warnings
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
 PREFIX = b"Exif\0\0"
-FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point at a table of further ones
+FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point at a nested table
 # (transpose, turn upside down, mirror), in that order, for each orientation of the EXIF standard.
 _TURNS = {
     1: (False, False, False),
@@ -23,7 +23,7 @@ _TURNS = {
 
 
 def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """An array (H, W, S) stored with an EXIF orientation, as it is meant to be seen.
+    """Turn an array (H, W, S) stored with an EXIF orientation upright.
 
     >>> import numpy as np
     >>> upright(np.array([[[1], [2]]]), 6)[..., 0].tolist()
@@ -36,17 +36,17 @@ def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
-    """The orientation, and the rest as a block that says "upright"; None where there is nothing to say.
+    """The orientation, and the other fields as an EXIF block with orientation 1, or None if there are none.
 
-    The sizes that some cameras note are swapped if the picture is to be turned on its side. ``read`` gives the block.
-    Fields that make no sense are left out: they are no reason to refuse a picture.
+    ``read`` returns the block. Width and height fields are swapped if the orientation swaps them. Invalid fields are
+    dropped, since they do not affect the pixels.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Pillow, about damaged blocks
+        warnings.simplefilter("ignore")  # Pillow's, about damaged blocks
         try:
             exif = read()
             fields = dict(exif)
-        except Exception:  # Pillow has no common class for what can be wrong with a block
+        except Exception:  # Pillow has no common base class for these errors
             return 1, None
         orientation = orientation_of(fields.get(ExifTags.Base.Orientation))
         if set(fields) <= {ExifTags.Base.Orientation}:
@@ -61,12 +61,12 @@ def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
             details[width], details[height] = details[height], details[width]
         try:
             return orientation, exif.tobytes()
-        except Exception:  # which field it was, Pillow does not say
+        except Exception:  # Pillow does not say which field is invalid
             return orientation, _sound(fields, folders).tobytes()
 
 
 def orientation_of(value: Any) -> int:
-    """An orientation of the EXIF standard, 1 to 8; 1, upright, for what is none.
+    """The EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
 
     >>> orientation_of(6), orientation_of("upside down")
     (6, 1)
@@ -82,7 +82,7 @@ def _folder(exif: Image.Exif, code: int) -> dict[int, Any]:
 
 
 def _sound(fields: dict[int, Any], folders: dict[int, dict[int, Any]]) -> Image.Exif:
-    """A block of those fields that can be written."""
+    """An EXIF block of the fields that can be written."""
     block = Image.Exif()
     for code, value in fields.items():
         if code not in FOLDERS and is_writable(code, value):

@@ -34,9 +34,9 @@ if sys.platform != "win32":
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
 
-WHITE = {"uint8": 255, "uint16": 65535}  # what integer channels hold for 1.0
+WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
-# What each type of file can hold. JPEG and WebP know 8 bits only, JPEG no alpha, PNG no floats.
+# Depths that each file type supports. JPEG and WebP have 8 bits only, JPEG has no alpha, PNG no floats.
 DEPTHS: dict[str, tuple[str, ...]] = {
     "PNG": ("uint8", "uint16"),
     "JPEG": ("uint8",),
@@ -44,21 +44,21 @@ DEPTHS: dict[str, tuple[str, ...]] = {
     "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
 }
 ENCODING: dict[str, dict[str, object]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WebP": {"lossless": True}}
-PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # what name_beside gives
-unfinished: set[Path] = set()  # files that are being written; command lines look at it when they are interrupted
+PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
+unfinished: set[Path] = set()  # files being written; command lines read this when interrupted
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".tif": "TIFF", ".tiff": "TIFF"}
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image file in memory: pixels to compute with, and what has to go back into the file.
+    """An image file in memory: pixels to compute with, and the metadata to write back.
 
     Attributes:
         pixels: (1, C, H, W), C = 1 or 3, upright. Integer files are scaled to [0, 1]; float files keep their own
             values. float32, or float64 for a file of 64-bit floats.
         depth: How a channel is stored in the file, as the name of a numpy dtype.
-        alpha: (1, 1, H, W) likewise, or None. Never edited, carried along.
-        icc: The colour profile, or None. Pixels are neither converted from nor to it.
+        alpha: (1, 1, H, W) likewise, or None. Kept as it is.
+        icc: The colour profile, or None. Pixels are not converted.
         exif: The EXIF block, whose orientation is 1 since the pixels are upright, or None.
     """
 
@@ -74,26 +74,26 @@ class Photograph:
 
 
 class TooLarge(MemoryError):
-    """A picture that takes more memory than there is to edit it whole."""
+    """A picture that needs more memory to be edited whole than is available."""
 
 
 def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int | None = None) -> Photograph:
     """Read an image file.
 
     Args:
-        path: A PNG, JPEG, TIFF or WebP file, told by its content: grey or RGB, with or without alpha, of 8 or 16 bits
-            or (TIFF) floats. Of a TIFF with several pages, and of a JPEG with several pictures, the first.
-        bytes_per_pixel: Memory that is going to be needed for each pixel in float32, checked before anything is
-            decoded; twice as much for a file of 64-bit floats, which are not cut to 32.
-        memory: Bytes that may be used; None is what is free.
+        path: A PNG, JPEG, TIFF or WebP file, recognised by its content: grey or RGB, with or without alpha, 8 or 16
+            bits or (TIFF) floats. The first page of a TIFF or picture of a JPEG is read.
+        bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for a
+            file of 64-bit floats.
+        memory: Bytes that may be used; None is the free memory.
 
     Returns:
         The photograph, turned upright.
 
     Raises:
-        FileNotFoundError: No file is there.
-        ValueError: The file is empty, damaged, not an image, or an image of a kind that is not handled.
-        TooLarge: ``bytes_per_pixel`` for each pixel is more than the memory at hand, a MemoryError.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is empty, damaged, not an image, or of an unsupported kind.
+        TooLarge: ``bytes_per_pixel`` for all pixels exceeds the memory. It is a MemoryError.
     """
     path = Path(path)
     channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
@@ -115,7 +115,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
 
 
 def first_bytes(path: Path) -> bytes:
-    """What tells the kind of an image file.
+    """The first bytes of a file, which identify its type.
 
     Raises:
         FileNotFoundError, ValueError: see :func:`read_photograph`.
@@ -124,7 +124,7 @@ def first_bytes(path: Path) -> bytes:
         raise FileNotFoundError(f"{path} does not exist; check the name and the folder")
     if path.is_dir():
         raise ValueError(f"{path} is a folder, not an image file; name a file in it")
-    if not path.is_file():  # to open a pipe would be to wait for someone who writes to it
+    if not path.is_file():  # opening a pipe would block
         raise ValueError(f"{path} is a pipe, a socket or a device, not a file; save the picture in a file first")
     try:
         with path.open("rb") as stream:
@@ -145,14 +145,14 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tu
 
 
 def write_photograph(photograph: Photograph, path: str | Path) -> None:
-    """Write an image file of the type that the name ends on, at the photograph's depth.
+    """Write an image file at the photograph's depth; the extension of the name selects the type.
 
     Integer channels are clipped to what the file can hold and rounded. JPEG is written at quality 95 without colour
     subsampling, WebP and TIFF without loss. The file appears complete or not at all.
 
     Raises:
         ValueError: See :func:`check_output`.
-        OSError: The system does not let the file be written.
+        OSError: The file cannot be written.
     """
     path = Path(path)
     kind = check_output(path, photograph)
@@ -167,7 +167,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
 
 
 def encode(stream: BinaryIO, kind: str, channels: Pixels, alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
-    """Write channels (H, W, S), as they are to be stored, as an image file of a type of :data:`DEPTHS`."""
+    """Write channels (H, W, S) of the stored dtype as an image file of a type in :data:`DEPTHS`."""
     if channels.shape[2] == 1:
         channels = channels[..., 0]
     if kind == "TIFF":
@@ -181,9 +181,9 @@ def encode(stream: BinaryIO, kind: str, channels: Pixels, alpha: bool, icc: byte
 
 
 def check_output(path: str | Path, photograph: Photograph) -> str:
-    """Raise ValueError unless ``photograph`` can be written to ``path``; return the type of file it would be.
+    """Raise ValueError unless ``photograph`` can be written to ``path``; return the file type.
 
-    Call it before long work, so that the sentence comes at once.
+    Call it before long work, so that the error comes early.
     """
     return check_type(path, photograph.depth, photograph.alpha is not None)
 
@@ -207,7 +207,7 @@ def check_type(path: str | Path, depth: str, alpha: bool) -> str:
 
 
 def check_file(path: str | Path) -> None:
-    """Raise ValueError unless a file can be made at ``path``."""
+    """Raise ValueError unless a file can be created at ``path``."""
     path = link_target(path)
     if path.is_symlink():
         raise ValueError(f"{path} is a symbolic link that leads back to itself; choose another name")
@@ -219,7 +219,7 @@ def check_file(path: str | Path) -> None:
 
 
 def check_folder(folder: str | Path) -> None:
-    """Raise ValueError unless ``folder`` is one that can be written to, or could be made."""
+    """Raise ValueError unless ``folder`` is writable or can be created."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file, not a folder; name a folder for the output")
@@ -235,7 +235,7 @@ def _check_parent(path: Path) -> None:
 
 @contextmanager
 def open_beside(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file that takes the name ``path`` when the block ends well, and vanishes when it does not.
+    """A binary file that is renamed to ``path`` when the block succeeds, and removed when it fails.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -245,7 +245,7 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
     ['note.txt']
     """
     path = link_target(path)
-    # Opened by hand, not by tempfile: the file must get the usual permissions, and live on the same file system.
+    # Not tempfile: the file needs the usual permissions and must be on the same file system.
     beside = name_beside(path)
     unfinished.add(beside)
     try:
@@ -258,29 +258,29 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
     except OSError as error:
         if error.filename not in (None, str(beside)) or error.errno is None:
             raise
-        # A full disk, a quota, or no right to make files: the system says what, but not where.
+        # A full disk, a quota or missing permission: the system's message does not name the path.
         raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
-        with suppress(OSError):  # no file, or a name that is too long for one
+        with suppress(OSError):  # no such file, or the name is too long
             beside.unlink()
         unfinished.discard(beside)
 
 
 def link_target(path: str | Path) -> Path:
-    """Where what is written to ``path`` goes: the same path, or what a symbolic link there points at."""
+    """``path``, or the target of the symbolic link there."""
     path = Path(path)
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def name_beside(path: Path) -> Path:
-    """A name in the same folder that nothing else has, and that no one takes for a finished file."""
+    """A unique hidden name in the same folder for a file that is being written."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
 @contextmanager
 def claimed(part: Path) -> Iterator[None]:
-    """Keep :func:`remove_stale` of other processes away from a file or folder as long as the block lasts."""
-    if sys.platform == "win32":  # where no one can remove an open file
+    """Lock a file or folder, so that :func:`remove_stale` in other processes leaves it alone."""
+    if sys.platform == "win32":  # open files cannot be removed there
         yield
         return
     handle = os.open(part, os.O_RDONLY)
@@ -309,7 +309,7 @@ def _is_claimed(part: Path) -> bool:
 
 
 def remove_stale(folder: Path, names: Container[str]) -> None:
-    """Remove what processes that were killed had begun to write in a folder under some names."""
+    """Remove the unfinished files of killed processes for some names in a folder."""
     for part in folder.glob(".*.part"):
         if PART.fullmatch(part.name) and part.name[1:].rsplit(".", 2)[0] in names and not _is_claimed(part):
             if part.is_dir():
@@ -320,7 +320,7 @@ def remove_stale(folder: Path, names: Container[str]) -> None:
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:
-    """Raise TooLarge if ``width * height * bytes_per_pixel`` is more than ``memory``; None is what is free."""
+    """Raise TooLarge if ``width * height * bytes_per_pixel`` exceeds ``memory``; None is the free memory."""
     needed = width * height * bytes_per_pixel
     free = psutil.virtual_memory().available if memory is None else memory
     if needed > free:
@@ -332,7 +332,7 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
 
 
 def _size(count: int) -> str:
-    """So many bytes in words."""
+    """A number of bytes with its unit."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
@@ -342,7 +342,7 @@ def _read_by_pillow(
     """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG or WebP file."""
     try:
         with warnings.catch_warnings():
-            # Pillow's own guard against huge pictures knows nothing of this machine's memory; check_memory does.
+            # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
             image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP"])
@@ -359,7 +359,7 @@ def _read_by_pillow(
         check_memory(path, *image.size, bytes_per_pixel, memory)
         try:
             orientation, exif = exif_tags.split(image.getexif)
-            if image.format == "PNG" and head[24] == 16:  # the bit depth in its header; Pillow would keep 8 of them
+            if image.format == "PNG" and head[24] == 16:  # the bit depth in the header; Pillow would reduce it to 8
                 channels = imagecodecs.png_decode(path.read_bytes())
             else:
                 channels = np.asarray(_to_plain_mode(image, path))
@@ -393,7 +393,7 @@ def _read_tiff(
         raise ValueError(f"{path} {error}") from error
     except MemoryError:
         raise
-    except Exception as error:  # tifffile and the decoders behind it have no common class for damage
+    except Exception as error:  # tifffile and its decoders have no common base class for errors
         raise _damaged(path, error) from error
 
 
@@ -404,9 +404,9 @@ def _damaged(path: Path, error: Exception) -> ValueError:
 
 
 def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None) -> bytes:
-    """A 16-bit PNG file; profile and EXIF go in right after its header, before the pixels as the format demands."""
+    """A 16-bit PNG file, with profile and EXIF between header and pixels as the format requires."""
     encoded = imagecodecs.png_encode(channels)
-    start = 8 + 25  # signature, and the header chunk, whose length is fixed
+    start = 8 + 25  # signature and header chunk, of fixed length
     chunks = io.BytesIO()
     if icc is not None:
         PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(icc))

@@ -1,4 +1,4 @@
-"""Files that are read and written by rows: TIFF and BigTIFF, folders of zarr, and other pictures by their bytes alone.
+"""Picture files read and written a few rows at a time: TIFF, BigTIFF and zarr. Other formats are decoded whole.
 
 Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complete or not at all.
 """
@@ -36,18 +36,18 @@ from nlfilter_torch.io.tiff import TiffRows
 from nlfilter_torch.tiled.sources import Rows, RowSource
 
 ZARR = ".zarr"
-CHUNK = 256  # side of the chunks of a zarr array that is made here
-CODED = 8  # times its bytes that a picture other than TIFF and zarr takes while it is decoded or encoded
+CHUNK = 256  # side of the chunks of a new zarr array
+CODED = 8  # memory to decode or encode other formats, as a multiple of the picture's bytes
 
 
 @dataclass(frozen=True)
 class StoredPicture:
-    """A picture in a file, of which only what is asked for is read.
+    """A picture in a file, read on demand.
 
     Attributes:
         rows: upright, (H, W, S) or (H, W).
-        alpha: that the last channel is one.
-        held: bytes of it that are in memory meanwhile.
+        alpha: whether the last channel is transparency.
+        held: bytes of it that are cached in memory.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
         attributes: of a zarr array.
@@ -67,7 +67,7 @@ class StoredPicture:
         return height, width, samples[0] if samples else 1
 
     def in_colour(self) -> "StoredPicture":
-        """What it is to be written like once it has colours; no pixel of it. A profile for grey fits no colours."""
+        """Shape and metadata of its coloured version, without pixels; the profile of a grey picture is dropped."""
         height, width, samples = self.shape
         if samples > 2:
             return self
@@ -86,11 +86,11 @@ def _holds_zarr(path: Path) -> bool:
 
 @contextmanager
 def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
-    """A picture that is read by rows as long as the block lasts.
+    """Open a picture to read its rows within the block.
 
     Raises:
-        FileNotFoundError, ValueError: if no file is there, or it is none that can be read.
-        MemoryError: if it can only be read in pieces that take more than ``memory`` bytes.
+        FileNotFoundError, ValueError: if the file does not exist or cannot be read.
+        FileNotFoundError, ValueError: if the file does not exist or cannot be read.
     """
     with ExitStack() as stack:
         if is_zarr(path):
@@ -113,7 +113,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
 
     Raises:
         ValueError: as :func:`check_output`.
-        MemoryError: if a file of that type has to be put together in more than ``memory`` bytes.
+        MemoryError: if encoding a file of that type takes more than ``memory`` bytes.
     """
     if path.suffix.lower() == ZARR:
         _zarr()
@@ -134,10 +134,10 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
 
 
 def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> None:
-    """Write rows as they come, with the profile and the notes of another picture of that shape.
+    """Write rows as they arrive, with the profile and metadata of another picture of that shape.
 
     Raises:
-        OSError: if the system does not let the file be written.
+        OSError: if the file cannot be written.
     """
     shape, dtype = like.shape, np.dtype(depth)
     if path.suffix.lower() == ZARR:
@@ -161,7 +161,7 @@ def _bytes(picture: StoredPicture, depth: str) -> int:
 
 
 def free_memory() -> int:
-    """Bytes that may be used where no one says how many: four fifths of what is free."""
+    """Default memory budget in bytes: four fifths of the free memory."""
     return int(psutil.virtual_memory().available * 4 // 5)
 
 
@@ -172,7 +172,7 @@ def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
         raise ValueError(f"{path} {error}") from error
     except OSError:
         raise
-    except Exception as error:  # tifffile has no class of its own for every damage
+    except Exception as error:  # tifffile has no common base class for errors
         raise ValueError(
             f"{path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
         ) from error
@@ -183,7 +183,7 @@ def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
 
 
 def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
-    """The rows of a picture that lies on its side, from a copy on disk that has no name and so vanishes by itself."""
+    """The rows of a picture stored on its side, from a copy in a temporary file."""
     height, width, samples = rows.shape
     copy = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
     upright = np.memmap(copy, dtype=rows.dtype, mode="w+", shape=(width, height, samples))
@@ -208,7 +208,7 @@ def _zarr() -> Any:
 
 
 class _ZarrRows:
-    """An array of zarr that notices when it gets another shape meanwhile."""
+    """A zarr array that detects a change of its shape."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -245,7 +245,7 @@ def _open_zarr(path: Path) -> StoredPicture:
 
 
 def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:
-    """An array that takes its name when it is whole; one that had the name before goes then, and not earlier."""
+    """An array that is renamed when it is complete, and only then replaces an earlier one of that name."""
     shape = tuple(like.rows.shape)
     path = link_target(path)
     beside, former = name_beside(path), name_beside(path)
@@ -261,7 +261,7 @@ def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPictur
         start = 0
         for band in tiff.bands((part for _, part in rows), CHUNK):
             values = band.reshape(len(band), *shape[1:])
-            # One chunk a call: zarr writes several at once, and goes on with the others after one has failed.
+            # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
             for left in range(0, shape[1], CHUNK):
                 array[start : start + len(band), left : left + CHUNK] = values[:, left : left + CHUNK]
             start += len(band)
@@ -283,7 +283,7 @@ def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPictur
 
 
 def _remove(folder: Path) -> None:
-    """Remove an array that was given up; after an interrupt a thread of zarr may still be writing its last chunk."""
+    """Remove an abandoned array; after an interrupt a thread of zarr may still be writing its last chunk."""
     for pause in (0.0, 0.1, 0.4):
         time.sleep(pause)
         shutil.rmtree(folder, ignore_errors=True)

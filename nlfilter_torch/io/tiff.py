@@ -1,6 +1,6 @@
-"""TIFF files in and out, by tifffile: any depth, profile and EXIF carried.
+"""TIFF files by tifffile, of any depth, with profile and EXIF; whole, or a few rows at a time.
 
-TIFF files read by rows: strips or tiles are decoded as they are needed, and forgotten.
+Reading rows decodes strips or tiles as they are needed.
 """
 
 import logging
@@ -19,22 +19,22 @@ from PIL import ExifTags, Image, TiffImagePlugin
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
 
-# Tags that describe the photograph; the others describe how the file stores it, and are written anew.
+# Tags that describe the photograph. The others describe how the file stores it and are not copied.
 _DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)
 _ORIENTATION = int(ExifTags.Base.Orientation)
-# tifffile logs what it finds wrong with a file. Without a handler Python would print it before the error says the same.
+# tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
-TILE = 256  # side of the tiles of a picture that is written by rows
-CLASSIC = 4_000_000_000  # bytes of pixels, compressed or not, that a TIFF file of the usual kind is trusted with
+TILE = 256  # side of the tiles that are written
+CLASSIC = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
 
 
 class UnhandledTiff(Exception):
-    """A sound TIFF file of a kind that is not handled; the text goes on from the file's name."""
+    """A valid TIFF file of an unsupported kind; the message continues a sentence that starts with the file's name."""
 
 
 def is_tiff(head: bytes) -> bool:
-    """Do these first bytes open a TIFF (or BigTIFF) file?"""
+    """Whether a file with these first bytes is a TIFF or BigTIFF."""
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -43,7 +43,7 @@ def read(
 ) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
     """(H, W, S) channels as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
 
-    ``check_size(width, height, double)`` is called before the pixels are decoded; ``double``: they have 64 bits.
+    ``check_size(width, height, double)`` is called before the pixels are decoded; ``double`` means 64-bit pixels.
     """
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
@@ -75,7 +75,7 @@ def check_page(page: Any) -> None:
 
 
 def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
-    """Channels (H, W, S) of a page, or of some of its rows, as they are meant: black is 0, colours without alpha."""
+    """Channels (H, W, S) of a page or some of its rows, with black as 0 and colours not premultiplied by alpha."""
     channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
         channels[..., :1] = np.iinfo(channels.dtype).max - channels[..., :1]
@@ -94,7 +94,7 @@ def notes(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes
 
 
 def write(stream: BinaryIO, channels: NDArray[Any], alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
-    """Write channels, (H, W) or (H, W, S), compressed without loss; ``alpha``: the last of them is one."""
+    """Write channels, (H, W) or (H, W, S), compressed without loss; ``alpha``: whether the last is transparency."""
     _write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, bigtiff=False)
 
 
@@ -107,7 +107,7 @@ def write_rows(
     icc: bytes | None,
     exif: bytes | None,
 ) -> None:
-    """Write rows (h, W, S) of a picture of ``shape`` as they come, into tiles; a large file becomes a BigTIFF."""
+    """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF."""
     height, width, samples = shape
     plain_shape = (height, width) if samples == 1 else shape
 
@@ -120,13 +120,13 @@ def write_rows(
                 yield whole[..., 0] if samples == 1 else whole
 
     big = height * width * samples * dtype.itemsize > CLASSIC
-    # Compressing ahead in threads would gather hundreds of megabytes.
+    # Compressing ahead in threads would queue hundreds of megabytes.
     options = {"tile": (TILE, TILE), "maxworkers": 1, "buffersize": TILE * TILE * samples * dtype.itemsize}
     _write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, bigtiff=big, **options)
 
 
 def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
-    """Rows (h, W, S) in pieces of any height, as pieces of one ``height`` and a last one that may be lower.
+    """Regroup rows (h, W, S) into pieces of the same ``height``, the last one possibly shorter.
 
     >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
     [2, 2, 2, 1]
@@ -161,7 +161,7 @@ def _write(
         if code in tags and code not in exif_tags.FOLDERS
     ]
     folders = {code: folder for code in exif_tags.FOLDERS if (folder := tags.get_ifd(code))}
-    # tifffile does not write tables of its own, so a tag of the number below keeps each one's place in the order.
+    # tifffile does not write nested tables, so a placeholder tag of the next lower number keeps each one's place.
     places = [(code - 1, "I", 1, 0, True) for code in folders]
     start = stream.tell()
     tifffile.imwrite(
@@ -189,7 +189,7 @@ def _write(
 
 
 def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder: dict[int, Any]) -> None:
-    """Append a table of tags and make the tag at ``position`` the one that points at it."""
+    """Append a table of tags and make the tag at ``position`` point at it."""
     table = TiffImagePlugin.ImageFileDirectory_v2(ifh=(b"II*\0" if order == "<" else b"MM\0*") + bytes(4))
     for key, value in folder.items():
         if exif_tags.is_writable(key, value):
@@ -217,7 +217,7 @@ def _read_exif(path: Path) -> bytes | None:
 
 
 def _unmultiplied(channels: NDArray[Any]) -> NDArray[Any]:
-    """Colours that were stored multiplied by their alpha, as themselves; black where alpha is 0."""
+    """Divide premultiplied colours by their alpha; black where alpha is 0."""
     colour, alpha = channels[..., :-1].astype(np.float64), channels[..., -1:].astype(np.float64)
     integer = np.issubdtype(channels.dtype, np.integer)
     limit = np.iinfo(channels.dtype).max if integer else 1.0
@@ -226,7 +226,7 @@ def _unmultiplied(channels: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([plain.astype(channels.dtype), channels[..., -1:]], axis=-1)
 
 
-KEPT = 2  # bands of strips or tiles: rows that two tiles of a picture share lie in two at most
+KEPT = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
 
 
 class TiffRows:
@@ -234,17 +234,17 @@ class TiffRows:
 
     Attributes:
         shape: (H, W, S).
-        dtype: in the machine's order of bytes.
+        dtype: in native byte order.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
-        alpha: that the last channel is one.
+        alpha: whether the last channel is transparency.
     """
 
     def __init__(self, path: Path) -> None:
         """Read the header.
 
         Raises:
-            UnhandledTiff: if it is a picture of a kind that is not handled.
+            UnhandledTiff: if the picture is of an unsupported kind.
         """
         self.path = path
         self.stream: BinaryIO = path.open("rb")
@@ -261,7 +261,7 @@ class TiffRows:
         self.shape = (page.imagelength, page.imagewidth, page.samplesperpixel)
         self.dtype = page.dtype.newbyteorder("=")
         self.alpha = bool(page.extrasamples)
-        # (height, width) of a strip or tile; strips may say that they are higher than the picture.
+        # (height, width) of a strip or tile; the declared height of a strip may exceed the picture's.
         self.segment = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
         self.segment = (min(self.segment[0], self.shape[0]), self.segment[1])
         self.bands: dict[int, NDArray[Any]] = {}
@@ -276,12 +276,12 @@ class TiffRows:
 
     @property
     def turned(self) -> bool:
-        """That the rows of the upright picture are stored as columns."""
+        """Whether the rows of the upright picture are stored as columns."""
         return self.orientation >= 5
 
     @property
     def held(self) -> int:
-        """Bytes of decoded strips or tiles that are held while rows are read."""
+        """Bytes of decoded strips or tiles that are cached while rows are read."""
         return 0 if self._raw else (KEPT + 1) * self.segment[0] * self.shape[1] * self.shape[2] * self.dtype.itemsize
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
@@ -296,7 +296,7 @@ class TiffRows:
         read: Callable[[int, int], NDArray[Any]] = self._read_raw if self._raw else self._decode
         try:
             stored = read(first, last)
-        except Exception as error:  # decoders have no common class for damage
+        except Exception as error:  # decoders have no common base class for errors
             self._check_unchanged()
             raise ValueError(
                 f"{self.path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
@@ -307,7 +307,7 @@ class TiffRows:
 
     @property
     def _raw(self) -> bool:
-        """That rows lie in the file one after the other, as they are."""
+        """Whether the file stores the rows uncompressed, one after the other."""
         contiguous: bool = self.page.is_contiguous and self.page.planarconfig == tifffile.PLANARCONFIG.CONTIG
         return contiguous and self.page.compression == tifffile.COMPRESSION.NONE and not self.page.is_tiled
 
@@ -346,7 +346,7 @@ class TiffRows:
                     raise EOFError("it ends too early")
                 segment, _, _ = self.page.decode(data, index, jpegtables=self.page.jpegtables)
                 if segment is None:
-                    continue  # left out, as sparse files do
+                    continue  # absent, as in sparse files
                 left = column * self.segment[1]
                 part = segment[0, : result.shape[0], : width - left]
                 channels = slice(plane, plane + 1) if apart else slice(None)

@@ -1,4 +1,4 @@
-"""The functions of this package as ``torch.nn`` layers: parameters here, mathematics there."""
+"""The functions of this package as ``torch.nn`` layers, which hold parameters and no mathematics."""
 
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.masks import DiffusionMask, SegmentMask

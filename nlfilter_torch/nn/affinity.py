@@ -1,4 +1,4 @@
-"""Guide to operator, as a layer."""
+"""The layer from a guide to an operator."""
 
 from collections.abc import Collection
 from types import MappingProxyType
@@ -18,14 +18,14 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 
 
 class NonlocalAffinity(Learnable):
-    """Guide to operator, a layer around :func:`nonlocal_operator`, whose options it takes.
+    """From a guide to an operator: a layer around :func:`nonlocal_operator`, with its options.
 
     Args:
-        learn: what trains besides the network that makes the guide: any of ``"photometric_bandwidth"`` and
+        learn: what is learned besides the network that makes the guide: any of ``"photometric_bandwidth"`` and
             ``"spatial_bandwidth"`` (which must have numbers to start from) and ``"patch_weights"``. All stay positive.
-        **options: of :func:`nonlocal_operator`. A ``generator`` gives every call other landmarks; do not combine it
-            with gradient checkpointing, which runs the layer twice and expects the same. A layer with a ``group`` is
-            neither pickled nor copied.
+        **options: of :func:`nonlocal_operator`. With a ``generator`` every call has other landmarks; do not combine it
+            with gradient checkpointing, which expects two runs of the layer to agree. A layer with a ``group`` cannot
+            be pickled or copied.
 
     Raises:
         TypeError, ValueError: if ``learn`` has another name, or an option is not one of :func:`nonlocal_operator`.
@@ -96,7 +96,7 @@ class NonlocalAffinity(Learnable):
             )
         self.start_positive("photometric_bandwidth", photometric_bandwidth, names, other=str)
         self.start_positive("spatial_bandwidth", spatial_bandwidth, names, other=type(None))
-        # Non-persistent: like the other options, it belongs to the constructor, not to what was learned.
+        # Non-persistent: a fixed window is an option of the constructor, like the others.
         self.patch_weights: Tensor | UnitWindow | None
         if "patch_weights" in names:
             self.patch_weights = UnitWindow(window)
@@ -122,7 +122,7 @@ class NonlocalAffinity(Learnable):
         )
 
     def extra_repr(self) -> str:
-        """The options that decide what the operator does."""
+        """The options of the operator."""
         return (
             f"patch_size={self.patch_size}, photometric_bandwidth={self.shown('photometric_bandwidth')}, "
             f"spatial_bandwidth={self.shown('spatial_bandwidth')}, num_landmarks={self.num_landmarks}, "

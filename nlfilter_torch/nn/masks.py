@@ -1,4 +1,4 @@
-"""Spectrum and regions to masks, as layers."""
+"""Layers from a spectrum and regions to masks."""
 
 from collections.abc import Collection
 from types import MappingProxyType
@@ -12,12 +12,12 @@ from nlfilter_torch.operator.spectrum import Spectrum
 
 
 class DiffusionMask(Learnable):
-    """Spectrum and region to mask, a layer around :func:`diffusion_mask`.
+    """From a spectrum and regions to masks: a layer around :func:`diffusion_mask`.
 
     Args:
         time: diffusion time t > 0.
         width: squared diffusion distance at which the mask has fallen to 1/e.
-        learn: what trains, any of ``"time"`` and ``"width"``; both stay positive.
+        learn: what is learned, any of ``"time"`` and ``"width"``; both stay positive.
 
     Raises:
         TypeError, ValueError: if ``time`` or ``width`` is not positive, or ``learn`` has another name.
@@ -34,7 +34,7 @@ class DiffusionMask(Learnable):
         self.start_positive("width", width, names)
 
     def forward(self, spectrum: Spectrum, region: Tensor, negative: Tensor | None = None) -> Tensor:
-        """Mask (B, K, H, W) in (0, 1] of regions (B, K, H, W), away from the regions ``negative``."""
+        """Masks (B, K, H, W) in (0, 1] of regions (B, K, H, W), avoiding the regions ``negative``."""
         return diffusion_mask(spectrum, region, time=self.time, width=self.width, negative=negative)
 
     def extra_repr(self) -> str:
@@ -43,7 +43,7 @@ class DiffusionMask(Learnable):
 
 
 class SegmentMask(nn.Module):
-    """Spectrum and regions to a partition, a layer around :func:`segment_mask`.
+    """From a spectrum and regions to a partition: a layer around :func:`segment_mask`.
 
     Args:
         time: diffusion time t > 0.

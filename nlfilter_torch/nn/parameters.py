@@ -11,10 +11,10 @@ from nlfilter_torch.core.checks import check_number, check_positive, described
 
 
 class Learnable(nn.Module):
-    """A layer with options that train if ``learn`` names them, as :func:`positive_option` and :class:`UnitWindow`.
+    """A layer with options that are learned if ``learn`` names them: :func:`positive_option` and :class:`UnitWindow`.
 
     Attributes:
-        learnable: each of these options, and the parameter that it has if it trains.
+        learnable: each of these options, with the name of its parameter.
     """
 
     learnable: ClassVar[Mapping[str, str]]
@@ -48,7 +48,7 @@ class Learnable(nn.Module):
         unexpected_keys: list[str],
         error_msgs: list[str],
     ) -> None:
-        """Take the names of earlier versions too, and say what to pass where the constructor lacked an option."""
+        """Accept the names of earlier versions, and say which option of the constructor is missing."""
         own = dict(self.named_parameters())
         for option, parameter in self.learnable.items():
             earlier = f"{prefix}{option}.logarithm"
@@ -90,13 +90,13 @@ def positive_option(name: str, meaning: str) -> Any:
 
 
 class UnitWindow(nn.Module):
-    """Positive weights of unit sum that train: the softmax of a parameter.
+    """Learned positive weights of unit sum: the softmax of a parameter.
 
     Attributes:
         logits: parameter (p, p).
     """
 
-    SMALLEST = 1e-6  # where a weight of zero starts from; it could not leave zero
+    SMALLEST = 1e-6  # start of a weight of zero, which could not change otherwise
 
     def __init__(self, start: Tensor) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Operator and image to filtered image, and image to edited image, as layers."""
+"""Layers from an operator and an image, or an image alone, to the filtered image."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Literal
@@ -16,15 +16,15 @@ LEARNABLE = ("alpha", "residual")
 
 
 class PolynomialSliders(nn.Module):
-    """Operator and image to filtered image, a layer around :func:`polynomial_filter`.
+    """From an operator and an image to the filtered image: a layer around :func:`polynomial_filter`.
 
     Args:
-        alpha: start of the sliders, fine to coarse; ones leave the image as it is. Paper: eq. (12). Rows of them, one
-            for each region, are for :class:`NonlocalFilter` with masks.
-        residual: weight of what the eigenvectors do not explain; None is alpha_1, and where it is to be learned the
-            start is the start of alpha_1.
-        learn: what trains, any of ``"alpha"`` and ``"residual"``; the others are buffers. Give none of them where a
-            network finds ``alpha`` for every call.
+        alpha: initial sliders, fine to coarse; ones leave the image as it is. Paper: eq. (12). Rows of sliders, one per
+            region, are for :class:`NonlocalFilter` with masks.
+        residual: weight of what the eigenvectors do not capture; None is alpha_1. If it is learned, None starts from
+            alpha_1.
+        learn: what is learned, any of ``"alpha"`` and ``"residual"``; the others are buffers. Pass none of them if a
+            network computes ``alpha`` for every call.
 
     Attributes:
         alpha: (k+1,) or (K, k+1), parameter or buffer.
@@ -65,13 +65,13 @@ class PolynomialSliders(nn.Module):
         Args:
             operator: W.
             image: (B, C, H, W).
-            alpha: sliders of this call in place of the layer's own: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
+            alpha: sliders for this call instead of the layer's own: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
                 pixel, of any order k.
         """
         return polynomial_filter(operator, image, self.alpha if alpha is None else alpha, residual=self.residual)
 
     def combine(self, layers: Tensor, alpha: Tensor | None = None) -> Tensor:
-        """The same, with ``residual`` alpha_1, from layers (B, k+1, C, H, W) of :func:`detail_layers` that are held."""
+        """The same, with ``residual`` alpha_1, from the layers (B, k+1, C, H, W) of :func:`detail_layers`."""
         check_tensor(layers, "layers")
         if layers.ndim != 5:
             raise ValueError(
@@ -80,9 +80,9 @@ class PolynomialSliders(nn.Module):
         return weigh_layers(layers, self.alpha if alpha is None else alpha)
 
     def extra_repr(self) -> str:
-        """The sliders as they are now."""
+        """The current sliders."""
         residual = None if self.residual is None else round(self.residual.item(), 4)
-        alpha = self.alpha.double().mul(1e4).round().div(1e4).tolist()  # in double: 1.05 has no tail of digits there
+        alpha = self.alpha.double().mul(1e4).round().div(1e4).tolist()  # in double, so that 1.05 prints as such
         return f"alpha={alpha}, residual={residual}"
 
 
@@ -99,15 +99,16 @@ def _sliders(alpha: Any) -> Tensor:
 class NonlocalFilter(nn.Module):
     """Image to edited image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` in one layer.
 
-    Paper: eq. (12), (13). The operator is built anew for every call, from the guide as it is; to move sliders over one
-    image, hold its operator or its layers and call the parts.
+    Paper: eq. (12), (13). Every call builds the operator from its guide. To try several sliders on one image, keep its
+    operator or its layers and call the two layers.
 
     Args:
-        alpha: start of the sliders, fine to coarse; ones leave the image as it is. For K regions K rows of them, each
-            for the mask of its number.
-        residual: weight of what the eigenvectors do not explain; None is alpha_1.
-        learn: what trains: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``, ``"spatial_bandwidth"`` and
-            ``"patch_weights"``; see the two layers. Gradients reach image and guide in any case.
+        alpha: initial sliders, fine to coarse; ones leave the image as it is. For K regions, K rows of them, one for
+            each mask.
+        residual: weight of what the eigenvectors do not capture; None is alpha_1.
+        learn: what is learned: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``,
+            ``"spatial_bandwidth"`` and ``"patch_weights"``; see the two layers. Gradients reach image and guide in
+            any case.
         **options: of :func:`nonlocal_operator`.
 
     Raises:
@@ -167,7 +168,7 @@ class NonlocalFilter(nn.Module):
             image: (B, C, H, W).
             guide: (B, C', H, W) from which the operator is built; None is the image itself.
             mask: (B, K, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
-            alpha: sliders of this call in place of the layer's own, such as another network finds them: (k+1,),
+            alpha: sliders for this call instead of the layer's own, such as those computed by a network: (k+1,),
                 (B, k+1) per image or (B, k+1, H, W) per pixel; for K > 1 masks (K, k+1) or (B, K, k+1).
 
         Returns:

@@ -1,4 +1,4 @@
-"""Pictures that fit no memory: the filter of the whole, worked out by rows."""
+"""Pictures larger than memory: the filter of the whole picture, applied in tiles of rows."""
 
 from nlfilter_torch.tiled.colorize import stream_colorize
 from nlfilter_torch.tiled.detail import stream_detail

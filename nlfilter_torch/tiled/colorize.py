@@ -1,4 +1,4 @@
-"""Colours from strokes for a grey picture that fits no memory."""
+"""Colourisation from scribbles of a grey picture larger than memory."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -50,18 +50,18 @@ def stream_colorize(
     memory: int = 1 << 30,
     report: Report | None = None,
 ) -> None:
-    """Colour a picture of any size, as :func:`~nlfilter_torch.colorize` does one in memory.
+    """Colourise a picture of any size, as :func:`~nlfilter_torch.colorize` does in memory.
 
-    What the strokes make of a pixel depends on the pixel's own patch and place only, once the sums over all pixels and
-    over the painted ones are known: tiles have no seams, and their size makes no difference.
+    Given the sums over all pixels and over the scribbled ones, the colour of a pixel depends only on its own patch and
+    position, so there are no seams, and the size of the tiles does not matter.
 
     Args:
         source: rows (H, W) or (H, W, S), as of :func:`stream_detail`; of colours the luminance is taken.
-        target: what takes the rows; (H, W, 3), or (H, W, 4) where the source has transparency.
-        strokes: rows (H, W, 3), RGB, read where painted only; or (H, W, 4), painted where not transparent. Integers
-            count from 0 to 1, whatever their range.
-        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 where painted; None where the strokes have
-            four channels.
+        target: receives the rows; (H, W, 3), or (H, W, 4) if the source has transparency.
+        strokes: scribbles as rows (H, W, 3), RGB, read under ``stroke_mask`` only; or (H, W, 4), whose last channel is
+            the mask. Integers are scaled to [0, 1].
+        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
+            channels.
         method: ``"regression"``; k-means takes all pixels at once.
         strength: as of :func:`~nlfilter_torch.colorize`, and so are bandwidths, ``patch_size``, ``num_landmarks`` and
             ``generator``.
@@ -72,12 +72,12 @@ def stream_colorize(
         generator: source of randomness for the landmarks.
         statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
         sample: number of pixels.
-        tile_rows: rows that are worked out at once.
-        memory: in bytes, beside those of the sources and the target.
-        report: called with a stage and how much of it is done.
+        tile_rows: rows that are computed at once.
+        memory: in bytes, besides that of the sources and the target.
+        report: called with the name of a stage and its progress.
 
     Raises:
-        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size meanwhile.
+        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size.
         MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
 
     Example:
@@ -123,9 +123,9 @@ def colorize_rows(
     generator: torch.Generator | None = None,
     names: tuple[str, str] = ("source", "strokes"),
 ) -> Rows:
-    """The rows (h, W, S) of :func:`stream_colorize`, as they are asked for.
+    """The rows (h, W, S) of :func:`stream_colorize`, computed as they are requested.
 
-    Errors call source and strokes by ``names``.
+    ``names`` are those of source and strokes in error messages.
     """
     check_choice(method, "method", ("regression", "kmeans"))
     if method == "kmeans":
@@ -177,7 +177,7 @@ def colorize_rows(
 
 @dataclass(frozen=True, eq=False)
 class FittedChroma:
-    """The chroma that strokes give to a picture's tiles.
+    """The chroma of a picture's tiles by regression on scribbles.
 
     Attributes:
         kernel: of the operator.
@@ -206,7 +206,7 @@ def fit_chroma(
     strength: float,
     report: Report,
 ) -> tuple[FittedChroma, Tensor]:
-    """A stage of :func:`colorize` for values (1, 3, n) of the painted pixels, and what it leaves of them."""
+    """A stage of :func:`colorize` for values (1, 3, n) of the scribbled pixels, and the residuals it leaves."""
     found = gather(picture, guide, kernel, painted.places, painted.weights, lambda colours: colours, report)
     found = Sample(found.features, values, found.weights)
 

@@ -1,4 +1,4 @@
-"""Detail sliders for pictures whose factor fits no memory: statistics from passes or a sample, then tile after tile."""
+"""Detail sliders for pictures whose factor exceeds memory: statistics from passes or a sample, then tile by tile."""
 
 import math
 from dataclasses import replace
@@ -36,40 +36,38 @@ def stream_detail(
     report: Report | None = None,
     **options: Any,
 ) -> None:
-    """Filter a picture of any size, of which no more than some rows are in memory at once.
+    """Filter a picture of any size, with only some of its rows in memory at once.
 
-    Landmarks, balancing and coefficients are shared by the whole picture; with them, what the filter makes of a pixel
-    depends on the pixel's own patch only. So the rows of a tile are exact: there are no seams, and the size of the
-    tiles makes no difference.
+    The whole picture shares landmarks, balancing and coefficients. Given these, the result at a pixel depends only on
+    its own patch, so tiles are exact: there are no seams, and the size of the tiles does not matter.
 
     Args:
         source: rows (H, W) or (H, W, S) of 8 or 16 bits or floats: a numpy array or memory map, an array of zarr,
-            anything that gives rows for a slice. One or three channels are colours, one more is transparency, which is
-            carried along. Integers count from 0 to 1, whatever their range.
-        target: what takes the rows, in their order, by assignment to a slice, with the source's shape and a dtype of
-            its own.
+            anything that returns rows for a slice. One or three channels are colours; one more is transparency, which
+            is copied. Integers are scaled to [0, 1].
+        target: receives the rows in order, by assignment to a slice; of the source's shape and any dtype.
         alpha: sliders (k+1,), as of :func:`~nlfilter_torch.polynomial_filter`; with regions (K, k+1), a row for each,
             or (k+1,) for all.
-        regions: rows (H, W, K), non-negative weights of the pixels of K regions: all that looks like them is edited,
-            as by :func:`~nlfilter_torch.enhance`. None edits the whole picture.
-        negative: rows (H, W, 1 or K), weights of pixels whose likes are left out, likewise.
-        residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since what the
-            eigenvectors explain depends on pixels that no sample holds enough of.
-        time: diffusion time of the masks that grow from the regions; larger reaches further.
+        regions: rows (H, W, K), non-negative weights of the pixels of K regions; similar pixels are edited, as by
+            :func:`~nlfilter_torch.enhance`. None edits the whole picture.
+        negative: rows (H, W, 1 or K), weights of pixels whose similar pixels are left out, likewise.
+        residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since the part that
+            the eigenvectors capture depends on rare pixels that a sample lacks.
+        time: diffusion time of the regions' masks; larger extends them further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
-        statistics: ``"sample"`` balances the filter and finds its coefficients on a sample of the pixels, in which
-            rare patches come before common ones, after two readings of the source; ``"full"`` goes on
-            from there to all pixels, in three or four passes that each cost more than the result.
-        sample: number of pixels of that sample, about; with as many as the picture has, statistics are full.
-        tile_rows: rows that are worked out at once; None is as many as ``memory`` has room for.
-        memory: bytes that may be used, beside those of source and target.
-        report: called with the name of a stage, how much of it is done, and how much there is to do.
+        statistics: ``"sample"`` balances the filter and computes its coefficients on a sample of the pixels that
+            favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
+            or four passes that each cost more than the output.
+        sample: approximate number of pixels of that sample; with as many as the picture has, statistics are full.
+        tile_rows: rows that are computed at once; None is as many as fit in ``memory``.
+        memory: bytes that may be used, besides those of source and target.
+        report: called with the name of a stage, the part done and the total.
         **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are
             numbers.
 
     Raises:
-        TypeError, ValueError: if an argument does not fit, or the source changes its size meanwhile.
+        TypeError, ValueError: if an argument does not fit, or the source changes its size during the work.
         MemoryError: if the samples or a single row take more than ``memory``.
 
     Example:
@@ -112,9 +110,9 @@ def detail_rows(
     name: str = "source",
     **options: Any,
 ) -> Rows:
-    """The rows (h, W, S) of :func:`stream_detail`, from the first to the last, as they are asked for.
+    """The rows (h, W, S) of :func:`stream_detail`, computed in order as they are requested.
 
-    With sliders ``outside`` (k+1,) what resembles no region is edited by them. Errors call the source ``name``.
+    The sliders ``outside`` (k+1,) apply to pixels similar to no region. ``name`` is the source's in error messages.
     """
     picture = Picture(source, name)
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
@@ -131,7 +129,7 @@ def detail_rows(
                 f"alpha must have a row for each of the {regions.shape[-1]} regions, got {len(alpha)}; add or drop some"
             )
         alpha = alpha.expand(regions.shape[-1], -1)
-        own = {} if generator is None else {"generator": generator.clone_state()}  # as if each were made alone
+        own = {} if generator is None else {"generator": generator.clone_state()}  # as if each were computed alone
         masks = fit_masks(picture, regions, negative, passes, time=time, width=width, **options | own)
     elif negative is not None:
         raise ValueError("negative must come with regions, got it alone; select what is to be edited, too")
@@ -180,7 +178,7 @@ def rows_in_memory(
     guide_channels: str = "luminance",
     **_: Any,
 ) -> int:
-    """Rows of a tile that can be worked out in the memory of the passes.
+    """Rows of a tile that fit in the memory of the passes.
 
     Raises:
         MemoryError: if there is not one, or no room for the samples.

@@ -1,4 +1,4 @@
-"""A whole edit, as the editor saves it, on a picture that fits no memory: its steps one after the other, by rows."""
+"""A whole edit, as the editor saves it, on a picture larger than memory: its steps in turn, in tiles of rows."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -21,12 +21,12 @@ from nlfilter_torch.tiled.sources import Picture, Rows, RowSource
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
 
 Floats = NDArray[np.float32]
-LOOKED_AT = 64  # rows at once
+LOOKED_AT = 64  # rows read at once
 
 
 @dataclass(frozen=True)
 class CoveredRows:
-    """What strokes cover of a picture: rows (h, W, 1) of zeros and ones.
+    """The mask of strokes over a picture: rows (h, W, 1) of zeros and ones.
 
     Attributes:
         strokes: of any paint.
@@ -55,7 +55,7 @@ class CoveredRows:
 
 @dataclass(frozen=True)
 class ColouredRows(CoveredRows):
-    """Strokes of colour over a picture: rows (h, W, 4) in RGB, the last channel above 0 where painted."""
+    """Coloured strokes over a picture: rows (h, W, 4) in RGB and their mask."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -69,17 +69,17 @@ class ColouredRows(CoveredRows):
 
 
 def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, folder: Path) -> Rows:
-    """The rows (h, W, S) that :meth:`Recipe.apply` makes of a picture, from the first to the last.
+    """The rows (h, W, S) of the picture under :meth:`Recipe.apply`, in order.
 
     Args:
         passes: over the rows, of every step.
         source: as of :func:`stream_detail`.
-        recipe: of steps that can do by rows.
-        name: what errors call the source.
-        folder: with room for the floats that one step leaves to the next.
+        recipe: of steps that support tiles.
+        name: of the source, for error messages.
+        folder: with room for the intermediate picture between two steps.
 
     Raises:
-        ValueError: if a step takes the whole picture at once, or cannot do its work on such a picture.
+        ValueError: if a step needs the whole picture at once, or does not suit the picture.
         OSError: if the folder has no room.
     """
     picture = Picture(source, name)
@@ -102,7 +102,7 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
 
 @contextmanager
 def _kept(rows: Rows, size: tuple[int, int], folder: Path) -> Iterator[RowSource]:
-    """Rows as a source of rows, in a file without a name in a folder."""
+    """Rows as a source of rows, in a temporary file in a folder."""
     with TemporaryFile(dir=folder) as file:
         samples = 0
         for _, values in rows:
@@ -117,7 +117,7 @@ def _kept(rows: Rows, size: tuple[int, int], folder: Path) -> Iterator[RowSource
 
 
 def rows_of(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
-    """The rows that a step makes of a picture."""
+    """The rows of a picture after a step."""
     return BY_ROWS[type(step)](step, passes, source, name)
 
 
@@ -156,5 +156,5 @@ def _recolor(step: Recolor, passes: Passes, source: RowSource, name: str) -> Row
     )
 
 
-# The other steps take the whole picture at once.
+# The other steps need the whole picture at once.
 BY_ROWS: dict[type, Callable[..., Rows]] = {Detail: _detail, Colorize: _colorize, Recolor: _recolor}

@@ -1,6 +1,6 @@
-"""New colours for what looks like the strokes on a picture that fits no memory.
+"""Recolouring from scribbles of a picture larger than memory.
 
-Strokes of colour on a picture that is read by rows to what they make of any of its pixels, a few M-vectors.
+A few M-vectors, computed from the scribbled pixels, determine the new colour of any pixel.
 """
 
 from dataclasses import dataclass
@@ -60,32 +60,32 @@ def stream_recolor(
     report: Report | None = None,
     **options: Any,
 ) -> None:
-    """Recolour a picture of any size, as :func:`~nlfilter_torch.recolor` does one in memory.
+    """Recolour a picture of any size, as :func:`~nlfilter_torch.recolor` does in memory.
 
-    What the strokes make of a pixel depends on the pixel's own patch only, once the sums over all pixels and over the
-    painted ones are known: tiles have no seams, and their size makes no difference.
+    Given the sums over all pixels and over the scribbled ones, the colour of a pixel depends only on its own patch, so
+    there are no seams, and the size of the tiles does not matter.
 
     Args:
         source: rows (H, W, 3) in RGB or (H, W, 4) with transparency, as of :func:`stream_detail`.
-        target: what takes the rows; of the source's shape.
-        strokes: rows (H, W, 3), RGB, read where painted only; or (H, W, 4), painted where not transparent. Integers
-            count from 0 to 1, whatever their range.
-        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 where painted; None where the strokes have
-            four channels.
-        keep: likewise, above 0 on spots whose likes are to stay as they are; None is none.
+        target: receives the rows; of the source's shape.
+        strokes: scribbles as rows (H, W, 3), RGB, read under ``stroke_mask`` only; or (H, W, 4), whose last channel is
+            the mask. Integers are scaled to [0, 1].
+        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
+            channels.
+        keep: likewise, above 0 on background scribbles, whose similar pixels keep their colours; None is none.
         reach: as of :func:`~nlfilter_torch.recolor`, and so are ``photometric_bandwidth`` and ``patch_size``.
         photometric_bandwidth: in hundredths of Lab.
         patch_size: of the patches that are compared.
         statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
         sample: number of pixels.
-        tile_rows: rows that are worked out at once.
-        memory: in bytes, beside those of the sources and the target.
-        report: called with a stage and how much of it is done.
+        tile_rows: rows that are computed at once.
+        memory: in bytes, besides that of the sources and the target.
+        report: called with the name of a stage and its progress.
         **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``guide_channels``, ``tolerance`` and
             ``patch_weights``.
 
     Raises:
-        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size meanwhile.
+        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size.
         MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
 
     Example:
@@ -128,9 +128,9 @@ def recolor_rows(
     names: tuple[str, str] = ("source", "strokes"),
     **options: Any,
 ) -> Rows:
-    """The rows (h, W, S) of :func:`stream_recolor`, as they are asked for.
+    """The rows (h, W, S) of :func:`stream_recolor`, computed as they are requested.
 
-    Errors call source and strokes by ``names``.
+    ``names`` are those of source and strokes in error messages.
     """
     picture, guide = Picture(source, names[0]), Guide(source, names[0], colour_guide)
     if picture.colours != 3:
@@ -169,10 +169,10 @@ def recolor_rows(
 
 @dataclass(frozen=True)
 class Marked:
-    """Painted pixels, and those that are kept as they are, divided among regions of one colour.
+    """Scribbled pixels, grouped into regions of one colour; background scribbles are a region of their own.
 
     Attributes:
-        places: numbers (n,) of the pixels, counted along the rows, ascending.
+        places: indices (n,) of the pixels in row-major order, ascending.
         weights: (n,) in (0, 1].
         regions: the region (n,) of each; those of the K colours come first.
         colours: their chroma, (K, 3).
@@ -187,7 +187,7 @@ class Marked:
 
     @staticmethod
     def of(painted: Painted, held: Painted | None) -> "Marked":
-        """Tell the colours apart; strokes paint over what is kept."""
+        """Group the pixels by colour; coloured scribbles take precedence over background scribbles."""
         wanted = split_luminance(painted.colours[None, :, None])[1]
         regions, colours, _ = group_colours(wanted, painted.weights[None, None, None])  # (1, K, 1, n)
         labels, count = regions[0, :, 0].argmax(0), len(colours[0])
@@ -215,12 +215,12 @@ class FittedDye:
     """A picture's tiles in new colours.
 
     Attributes:
-        guide: what is compared of the picture.
+        guide: by which pixels are compared.
         kernel: of the operator.
-        marked: what is painted.
+        marked: the scribbled pixels.
         basis: of the unit vectors that pixels are compared by, (M, M).
         division: (K', M), of :func:`divide`.
-        dye: what becomes of the colours.
+        dye: the change of the colours.
     """
 
     guide: Guide
@@ -237,7 +237,7 @@ class FittedDye:
         return self.dye(tile.inner, likeness, self.marked.planes(tile))
 
     def likeness(self, features: Tensor) -> Tensor:
-        """How much pixels with features (1, D, n) resemble each region, (1, K', n)."""
+        """Similarity (1, K', n) of pixels with features (1, D, n) to each region."""
         return Pixels.of(self.basis, self.kernel.factor(features)[0][0]).along(self.division)[None]
 
 
@@ -246,7 +246,7 @@ class FittedDye:
 def fit_dye(
     picture: Picture, guide: Guide, kernel: Kernel, pairs: RitzPairs, marked: Marked, reach: float, report: Report
 ) -> FittedDye:
-    """What :func:`recolor` makes of a picture, from the columns of the marked pixels."""
+    """Fit the recolouring of a picture to the columns of the scribbled pixels."""
     found = gather(
         picture, guide, kernel, marked.places, marked.weights, lambda colours: split_luminance(colours)[1], report
     )
@@ -258,7 +258,7 @@ def fit_dye(
 
 
 def _find_spots(found: Sample, marked: Marked, kernel: Kernel, basis: Tensor, size: tuple[int, int]) -> Spots:
-    """The spots of the marked pixels, compared with no pixel yet."""
+    """The scribbled regions, before any pixel is compared with them."""
     order = (marked.regions * (size[0] * size[1]) + marked.places).argsort()
     numbers, owners = label_spots(marked.places[order], marked.regions[order], size)
     numbers = torch.empty_like(numbers).scatter_(0, order, numbers)

@@ -1,4 +1,4 @@
-"""The painted pixels of a picture that is read by rows: what is painted there, and their features."""
+"""The scribbled pixels of a picture that is read by rows: their colours and features."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,28 +17,28 @@ Planes = Callable[[int, int], Tensor]  # of the rows from the first to before th
 
 
 class Guide(Picture):
-    """A picture as its pixels are compared with each other, in the colours that ``look`` makes of it."""
+    """The guide of a picture, which ``look`` computes from its colours."""
 
     def __init__(self, source: RowSource, name: str, look: Look) -> None:
-        """Check ``source``; ``look`` takes the colours of each pixel for themselves."""
+        """Check ``source``; ``look`` maps the colours of each pixel independently."""
         super().__init__(source, name)
         self.look = look
 
     def tile(self, start: int, stop: int, margin: int) -> Tile:
-        """As of any picture."""
+        """A tile of the guide, as :meth:`Picture.tile`."""
         return self.seen(super().tile(start, stop, margin))
 
     def seen(self, tile: Tile) -> Tile:
-        """The guide's tile in place of that of the picture itself."""
+        """The guide of a tile of the picture."""
         return Tile(tile.start, self.look(tile.pixels), tile.halo, tile.stored)
 
 
 @dataclass(frozen=True)
 class Painted:
-    """Painted pixels.
+    """Scribbled pixels.
 
     Attributes:
-        places: their numbers (n,), counted along the rows, ascending.
+        places: their indices (n,) in row-major order, ascending.
         weights: (n,) in (0, 1].
         colours: (3, n), or none of them (0, n).
     """
@@ -51,19 +51,19 @@ class Painted:
 def read_strokes(
     picture: Picture, strokes: RowSource, mask: RowSource | None, passes: Passes, *, name: str = "strokes"
 ) -> Painted:
-    """Find what is painted over a picture, and in which colours.
+    """Read the scribbles on a picture and their colours.
 
     Args:
-        picture: below the paint.
-        strokes: rows (H, W, 3), read where painted only; or (H, W, 4), whose last channel is the mask.
+        picture: below the scribbles.
+        strokes: rows (H, W, 3), read under the mask only; or (H, W, 4), whose last channel is the mask.
         mask: rows (H, W) or (H, W, 1), or None.
-        passes: whose memory painted pixels may take.
+        passes: with the memory that scribbled pixels may take.
         name: of the strokes, for messages.
 
     Raises:
-        ValueError: if one of them has another size or another number of channels, a weight leaves [0, 1], or all of
+        ValueError: if one of them has another size or another number of channels, a weight exceeds [0, 1], or all of
             them are 0.
-        MemoryError: if there are too many painted pixels.
+        MemoryError: if there are too many scribbled pixels.
     """
     over = _overlay(picture, strokes, name)
     if over.samples != (4 if mask is None else 3):
@@ -90,7 +90,7 @@ def read_strokes(
 
 
 def read_mask(picture: Picture, mask: RowSource, name: str, passes: Passes) -> Painted:
-    """Find the pixels that a mask, rows (H, W) or (H, W, 1), has above 0; errors as of :func:`read_strokes`."""
+    """Find the pixels where a mask, rows (H, W) or (H, W, 1), is above 0; raises as :func:`read_strokes`."""
     return _read(picture, _weights(picture, mask, name), None, name, passes)
 
 
@@ -102,7 +102,7 @@ def _weights(picture: Picture, mask: RowSource, name: str) -> Planes:
 
 
 def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
-    """A source of rows that lies over a picture."""
+    """A source of rows of the same size as a picture."""
     if tuple(rows.shape[:2]) != picture.size:
         raise ValueError(
             f"{name} must have the height and width of {picture.name}, {picture.size[0]}x{picture.size[1]}, got "
@@ -134,12 +134,12 @@ def _read(picture: Picture, weights: Planes, colours: Planes | None, name: str, 
 
 
 def floats_of_painted(planes: int) -> int:
-    """Floats that a painted pixel takes, with so many features of it: twice while they are put together."""
+    """Floats per scribbled pixel with that many features, which exist twice while they are concatenated."""
     return 2 * planes + 40
 
 
 def check_room(picture: Picture, count: int, planes: int, memory: int) -> None:
-    """Raise MemoryError where so many painted pixels take more than ``memory`` bytes."""
+    """Raise MemoryError if that many scribbled pixels take more than ``memory`` bytes."""
     needed = count * floats_of_painted(planes) * (8 if picture.dtype == torch.float64 else 4)
     if needed > memory:
         raise MemoryError(
@@ -157,7 +157,7 @@ def gather(
     image: Callable[[Tensor], Tensor],
     report: Report,
 ) -> Sample:
-    """Pixels (n,), ascending, with their features and with ``image`` of their colours, from the rows that hold some."""
+    """Scribbled pixels (n,), ascending, with their features and ``image`` of their colours, read from their rows."""
     size, (height, width), step = kernel.recipe.patch_weights.shape[0], picture.size, picture.statistics_rows
     patches, values = [], []
     for start in range(0, height, step):

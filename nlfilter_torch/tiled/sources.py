@@ -1,4 +1,4 @@
-"""Pictures that are read by rows: memory maps, arrays of zarr, files of tifffile, anything that can be sliced."""
+"""Pictures read a few rows at a time: memory maps, zarr arrays, tifffile files, anything that can be sliced."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-WHITE = {"uint8": 255, "uint16": 65535}  # what integer channels hold for 1.0
+WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
-Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their places in the picture
-STATISTICS_PIXELS = 1 << 17  # in a block of a pass; the same for every size of tile, so that sums are equal to the bit
+Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
+STATISTICS_PIXELS = 1 << 17  # in a block of a pass; independent of the tile size, so that sums agree bit by bit
 
 
 class RowSource(Protocol):
-    """Rows (H, W) or (H, W, S) to read; a slice of them is, or can be made, a numpy array."""
+    """Rows (H, W) or (H, W, S) to read; a slice of them can be converted to a numpy array."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -24,7 +24,7 @@ class RowSource(Protocol):
 
     @property
     def dtype(self) -> Any:
-        """One that numpy knows."""
+        """A numpy dtype."""
 
     def __getitem__(self, rows: slice, /) -> Any:
         """The rows from ``rows.start`` to ``rows.stop``."""
@@ -39,7 +39,7 @@ class RowTarget(Protocol):
 
     @property
     def dtype(self) -> Any:
-        """Decides how channels are stored: integers are clipped and rounded."""
+        """Type of the stored channels; integers are clipped and rounded."""
 
     def __setitem__(self, rows: slice, values: Any, /) -> None:
         """Take these rows."""
@@ -50,9 +50,9 @@ class Tile:
     """Some rows of a picture.
 
     Attributes:
-        start: number of the first of them.
+        start: index of the first of them.
         pixels: (1, C, h, W), C = 1 or 3, with the rows of the halo. Integers are scaled to [0, 1].
-        halo: how many rows more there are at the top and at the bottom.
+        halo: number of additional rows at the top and at the bottom.
         stored: (h, W, S), the rows themselves as they are stored.
     """
 
@@ -68,21 +68,21 @@ class Tile:
 
     @property
     def inner(self) -> Tensor:
-        """The pixels (1, C, h, W) of the rows themselves."""
+        """The pixels (1, C, h, W) without the halo."""
         return self.pixels[..., self.halo[0] : self.pixels.shape[-2] - self.halo[1], :]
 
 
 class Picture:
-    """A source of rows as the colours of an image, of which no more is in memory than a few rows.
+    """A source of rows as an image, with only a few rows in memory at once.
 
     Attributes:
         size: (H, W).
-        colours: 1 or 3; one channel more is transparency, which is not looked at.
+        colours: 1 or 3; a further channel is transparency, which is ignored.
         dtype: in which to compute.
     """
 
     def __init__(self, source: RowSource, name: str = "source") -> None:
-        """Check the shape and type of ``source``, which errors call ``name``."""
+        """Check the shape and type of ``source``, called ``name`` in error messages."""
         self.source, self.name = source, name
         shape, kind = tuple(source.shape), np.dtype(source.dtype).name
         if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] > 4):
@@ -107,7 +107,7 @@ class Picture:
         """The rows from ``start`` to ``stop`` and up to ``margin`` more on both sides.
 
         Raises:
-            ValueError: if the source gives other rows than it said it had, or floats that are not finite.
+            ValueError: if the source returns rows of another shape than declared, or floats that are not finite.
         """
         first, last = max(start - margin, 0), min(stop + margin, self.size[0])
         stored = np.asarray(self.source[first:last])
@@ -130,13 +130,13 @@ class Picture:
         return Tile(start, planes, halo, stored[halo[0] : last - first - halo[1]])
 
     def tiles(self, margin: int, rows: int) -> Iterator[Tile]:
-        """All rows, ``rows`` of them at once."""
+        """All rows, in tiles of ``rows``."""
         for start in range(0, self.size[0], rows):
             yield self.tile(start, min(start + rows, self.size[0]), margin)
 
     @property
     def statistics_rows(self) -> int:
-        """Rows in a block of a pass that gathers statistics."""
+        """Rows in a block of a pass that computes statistics."""
         return max(1, STATISTICS_PIXELS // self.size[1])
 
 
@@ -149,7 +149,7 @@ def stored_as(values: Tensor, kind: str) -> NDArray[Any]:
 
 
 def transparency(tile: Tile, kind: str) -> NDArray[Any]:
-    """The channels (h, W, 0 or 1) of a tile that are no colours, as dtype ``kind``."""
+    """The transparency (h, W, 0 or 1) of a tile, as dtype ``kind``."""
     extra = tile.stored[..., 3 if tile.stored.shape[2] >= 3 else 1 :]
     if extra.dtype.name == kind:
         return extra

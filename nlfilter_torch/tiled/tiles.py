@@ -1,4 +1,4 @@
-"""What every edit by rows shares: how many rows fit the memory, and tile after tile from a source to a target."""
+"""Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 
-SAMPLE = 1 << 20  # pixels; see docs/scale.md for what more or fewer of them are worth
+SAMPLE = 1 << 20  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
 Statistics = Literal["sample", "full"]
 Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
@@ -26,15 +26,15 @@ def in_silence(stage: str, done: int, rows: int) -> None:
 
 @dataclass(frozen=True)
 class Passes:
-    """How any edit goes over the rows of a picture.
+    """Tiling options of an edit.
 
     Attributes:
-        kind: dtype of what comes out.
+        kind: dtype of the output.
         statistics: from a sample of the pixels or from all of them.
-        sample: number of its pixels.
-        tile_rows: rows that are worked out at once; None is as many as the memory has room for.
+        sample: number of pixels of that sample.
+        tile_rows: rows that are computed at once; None is as many as fit in memory.
         memory: bytes that may be used.
-        report: told of the progress.
+        report: called with the progress.
     """
 
     kind: str
@@ -45,7 +45,7 @@ class Passes:
     report: Report = in_silence
 
     def __post_init__(self) -> None:
-        """Raise unless all of them fit."""
+        """Raise unless all options are valid."""
         check_choice(self.statistics, "statistics", ("sample", "full"))
         check_choice(self.kind, "dtype of the target", KINDS)
         check_count(self.sample, "sample")
@@ -53,7 +53,7 @@ class Passes:
             check_count(self.tile_rows, "tile_rows")
 
     def work_out(self, picture: Picture, edit: Edit, margin: int, rows: int) -> Rows:
-        """The edited rows, so many at a time unless ``tile_rows`` says it, with the transparency that they had."""
+        """The edited rows with their transparency, in tiles of ``rows`` unless ``tile_rows`` is given."""
         for tile in picture.tiles(margin, self.tile_rows or rows):
             self.report("Filtering", tile.start, picture.size[0])
             with torch.no_grad():
@@ -64,7 +64,7 @@ class Passes:
 
 
 def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False) -> None:
-    """Raise unless the source can be read, and the target takes its rows, or those that it becomes in colour."""
+    """Raise unless the source can be read, and the target has the shape of the output."""
     picture, shape, what = Picture(source), tuple(source.shape), "the shape of the source"
     if coloured:
         shape = (*picture.size, 3 if picture.samples in (1, 3) else 4)
@@ -74,15 +74,15 @@ def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False
 
 
 def fill(target: RowTarget, rows: Rows) -> None:
-    """Assign the rows (h, W, S) to their places."""
+    """Assign the rows (h, W, S) to their positions."""
     for part, values in rows:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
 
 
 def row_by_row(kernel: Kernel, tile: Tile, work: Callable[[Tensor], Tensor]) -> Tensor:
-    """What ``work`` makes of the features (1, D, W) of every row of a tile, (1, C, W) each, as (1, C, h, W).
+    """Apply ``work``, from features (1, D, W) to (1, C, W), to every row of a tile; (1, C, h, W).
 
-    The rounding of a product depends on its shape: a row's is the same in tiles of any height.
+    The rounding of a product depends on its shape. Row by row it is the same in tiles of any height.
     """
     features = kernel.recipe(tile.pixels, origin=tile.origin, halo=tile.halo)
     return torch.stack([work(row) for row in features.split(tile.inner.shape[-1], dim=2)], dim=2)
@@ -97,7 +97,7 @@ def rows_that_fit(
     num_landmarks: int,
     held: int = 0,
 ) -> int:
-    """Rows of a tile that can be worked out in the memory of the passes.
+    """Rows of a tile that fit in the memory of the passes.
 
     Args:
         picture: to be edited.
@@ -105,7 +105,7 @@ def rows_that_fit(
         floats: for each pixel of a tile.
         planes: features of a pixel.
         num_landmarks: M.
-        held: floats that are held beside it.
+        held: floats kept in memory besides.
 
     Raises:
         MemoryError: if there is not one, or no room for the samples.

@@ -76,7 +76,7 @@ static TARGET void NAME(gather)(const struct thin *task, long first, long last, 
 }
 
 /* For pixels first to last: out = the root d of d (u . 2 rows + c d) = 1, or without c the product of `spread`;
- * totals += factor out. Works on few pixels at a time, so that their columns are still in the cache for the second product. */
+ * totals += factor out. Works on few pixels at a time, so that their columns stay cached for the second product. */
 static TARGET void NAME(sweep)(const struct thin *task, long first, long last, double *totals)
 {
     const long most = NEAR / task->marks / 64 * 64, step = most < 256 ? 256 : most;
