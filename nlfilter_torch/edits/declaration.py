@@ -78,9 +78,11 @@ class Parameter:
         argument: name of the function's argument, if it is another one.
         share: of the short side that None stands for, for distances; 0 is no limit.
         least: pixels that a length in hundredths of the short side has at least.
-        former: other names, of options and in files, and what values under them are multiplied by.
+        former: other names in files, and what values under them are multiplied by; those of the same unit are names of
+            the option, too.
         metavar: stands for a value in the help, where it is not that of the unit.
         slider: of the editor.
+        is_option: whether the command takes it, beside files.
     """
 
     name: str
@@ -102,6 +104,7 @@ class Parameter:
     former: tuple[tuple[str, float], ...] = ()
     metavar: str | None = None
     slider: Slider | None = None
+    is_option: bool = True
 
     @property
     def keyword(self) -> str:
@@ -218,6 +221,7 @@ class Edit:
         brushes: what strokes may say, and how the editor calls it; ``colour`` is any colour.
         needs: that without strokes it changes nothing.
         coloured: that it gives colours to a grey photograph.
+        tiled: that it can be done to a photograph that fits no memory.
     """
 
     name: str
@@ -227,6 +231,7 @@ class Edit:
     brushes: tuple[tuple[str, str], ...] = ()
     needs: bool = False
     coloured: bool = False
+    tiled: bool = False
 
     def __iter__(self) -> Iterator[Parameter]:
         """Its parameters."""

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_photograph, check_positive, check_tensor
@@ -73,6 +74,9 @@ def enhance(
     if regions is not None:
         check_image(regions, "regions", batch=image.shape[0])
         shared = {name: value for name, value in options.items() if name in SHARED}
+        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
+            shared["generator"] = torch.Generator(options["generator"].device)
+            shared["generator"].set_state(options["generator"].get_state())
         masks = colour_masks(
             pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared
         )

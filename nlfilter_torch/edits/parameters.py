@@ -112,6 +112,16 @@ DETAIL = Edit(
             metavar="A,B,...,Z",
         ),
         Parameter(
+            "inside",
+            "sliders",
+            None,
+            "The sliders inside what looks like the strokes; as many. Left out: 1 for each.",
+            *GAINS,
+            "gain",
+            optional=True,
+            is_option=False,  # --region has them
+        ),
+        Parameter(
             "residual",
             "number",
             None,
@@ -147,6 +157,7 @@ DETAIL = Edit(
     ),
     hint="Paint on what is to have sliders of its own; all that looks like it follows.",
     brushes=(("in", "Edit this"), ("out", "Not this")),
+    tiled=True,
 )
 
 SHARPEN = Edit(
@@ -286,6 +297,7 @@ RECOLOR = Edit(
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
     needs=True,
+    tiled=True,
 )
 
 COLORIZE = Edit(
@@ -325,6 +337,7 @@ COLORIZE = Edit(
     brushes=(("colour", "Paint"),),
     needs=True,
     coloured=True,
+    tiled=True,
 )
 
 DEFOCUS = Edit(
