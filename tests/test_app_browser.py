@@ -16,6 +16,7 @@ from playwright.sync_api import Browser, expect
 
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from tests.browser import CHROMIUM, Editor, Tab, chromium
 
@@ -153,8 +154,8 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     opened.save("Save edit", "edit.json")
 
     recipe = Recipe.find(str(folder / "edit.json"))
-    assert recipe.detail.inside == (1.0, 3.0, 1.0, 1.0)
-    assert recipe.recolor.strokes[0].paint == "#8a46c8"
+    assert recipe.last("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
+    assert recipe.last("recolor").strokes[0].paint == "#8a46c8"
     saved = read_photograph(folder / "out.png").pixels
     assert (saved - recipe.apply(cat()).clamp(0, 1)).abs().max() <= 1 / 255
     assert main(["apply", str(folder / "cat.png"), str(folder / "cli.png"), "--preset", str(folder / "edit.json")]) == 0
@@ -287,7 +288,7 @@ def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Ed
     for name, alpha, image in (("a.png", 3.0, cat()), ("b.png", 4.5, coffee)):
         wanted = Recipe().apply(image)
         recipe = Recipe.find("crisp")
-        recipe = Recipe(type(recipe.detail)((alpha, 1.0, 1.0, 1.0)))
+        recipe = Recipe((Step("detail", alpha=(alpha, 1.0, 1.0, 1.0)),))
         assert (read_photograph(folder / name).pixels - recipe.apply(image).clamp(0, 1)).abs().max() <= 1 / 255
         assert difference(recipe.apply(image), wanted) > 5
 

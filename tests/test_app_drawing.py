@@ -8,9 +8,9 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.app import controls, drawing
-from nlfilter_torch.edits.recipe import STEPS, Recipe
+from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Detail
+from nlfilter_torch.edits.steps import Step
 from tests.problems import cat
 
 
@@ -48,15 +48,13 @@ def test_response_has_a_line_for_each_region_and_a_dot_for_each_eigenvalue() -> 
 
 
 @pytest.mark.parametrize(
-    "control", [c for step in controls.OF_STEP.values() for c in step] + list(controls.detail_sliders("inside", 3))
+    "control", [c for step in controls.OF_EDIT.values() for c in step] + list(controls.detail_sliders("inside", 3))
 )
 def test_controls_stay_within_what_a_step_takes(control: controls.Control) -> None:
-    recipe = Recipe(Detail((1.0,) * 3, (1.0,) * 3))
-    wanted, is_valid = STEPS[control.step].VALID[control.entry]
-    assert control.low <= control.read(recipe) <= control.high
-    for value in (control.low, control.high):
-        entries = control.entries(recipe, value)
-        changed = entries[control.entry]
-        assert is_valid(list(changed) if isinstance(changed, tuple) else changed), wanted
-        step = type(getattr(recipe, control.step))(**entries) if control.index is None else Detail((1.0,) * 3, changed)
-        assert control.read(Recipe(**{control.step: step})) == value
+    recipe = Recipe((Step("detail", alpha=(1.0,) * 3, inside=(1.0,) * 3), Step("denoise", noise_level=1.0)))
+    low, high = control.slider.low, control.slider.high
+    assert low <= control.read(recipe) <= high
+    for value in (low, high):
+        changed = control.entries(recipe, value)
+        assert control.parameter.is_valid(changed[control.parameter.name])
+        assert control.read(recipe.with_last(recipe.last(control.edit).changed(**changed))) == value

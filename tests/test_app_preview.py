@@ -1,7 +1,6 @@
 """The editor's preview: what it shows is what is saved, and what does not change is not worked out again."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
@@ -10,9 +9,11 @@ import torch.nn.functional as F
 from nlfilter_torch import diffusion_mask, estimate_bandwidth, nonlocal_operator, polynomial_filter
 from nlfilter_torch.app.preview import MaskMaker, Preview, reduce, sampled_operator, stride_for
 from nlfilter_torch.app.session import Session
+from nlfilter_torch.edits.applying import apply_step, prepare
+from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Abstract, Colorize, Defocus, Detail, FilterStep, Recolor
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import cat, difference
 
@@ -30,30 +31,30 @@ def test_what_is_shown_is_what_is_saved(colour: bool) -> None:
     preview = Preview(image)
     for recipe in (
         Recipe(),
-        Recipe(Detail((3.0, 2.0, 1.0))),
-        Recipe(Detail((3.0, 3.0, 4.0, 1.05), bandwidth=15.0, spatial_bandwidth=20.0, patch_size=3, landmarks=40)),
-        Recipe(Detail((0.2, 1.0, 1.0, 1.0), (3.0, 3.0, 4.0, 1.0), 0.5, (region, outside))),
-        Recipe(Detail((2.0, 1.0, 1.0, 1.0)), defocus=Defocus((region,))),
+        Recipe((Step("detail", alpha=(3.0, 2.0, 1.0)),)),
+        Recipe((Step("detail", bandwidth=15.0, spatial_bandwidth=20.0, patch_size=3, landmarks=40),)),
+        Recipe((Step("detail", (region, outside), alpha=(0.2, 1.0, 1.0, 1.0), inside=(3.0, 3.0, 4.0, 1.0), time=0.5),)),
+        Recipe((Step("detail", alpha=(2.0, 1.0, 1.0, 1.0)), Step("defocus", (region,)))),
+        Recipe((Step("denoise"), Step("detail", residual=1.0), Step("tone"), Step("sharpen"))),
     ):
         assert difference(preview.render(recipe), recipe.apply(image)) < 1
 
 
-def counted(monkeypatch: pytest.MonkeyPatch, kind: type) -> list[str]:
-    """What happens to a step from now on: ``filter`` for each one made, ``edit`` for each picture drawn."""
-    events = []
-    hold = kind.hold  # type: ignore[attr-defined]
+def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """What happens to steps from now on: ``filter`` for each one made, ``edit`` for each picture drawn."""
+    events: dict[str, list[str]] = {edit: [] for edit in EDITS}
 
-    def spied(step: FilterStep, image: torch.Tensor) -> Callable[[FilterStep], torch.Tensor]:
-        events.append("filter")
-        edit = hold(step, image)
-        return lambda other: events.append("edit") or edit(other)  # type: ignore[func-returns-value,no-any-return]
+    def spied(step: Step, image: torch.Tensor, *, stride: int) -> Callable[[Step], torch.Tensor]:
+        events[step.edit].append("filter")
+        edit = prepare(step, image, stride=stride)
+        return lambda other: events[step.edit].append("edit") or edit(other)  # type: ignore[func-returns-value]
 
-    monkeypatch.setattr(kind, "hold", spied)
+    monkeypatch.setattr("nlfilter_torch.app.preview.prepare", spied)
     return events
 
 
 def test_pictures_are_held_until_a_step_before_them_changes(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    events = counted(monkeypatch, Abstract)
+    events = counted(monkeypatch)["abstract"]
     session.set("abstract", power=0.1)
     first = session.render()
     assert torch.equal(session.render(), first)
@@ -61,55 +62,59 @@ def test_pictures_are_held_until_a_step_before_them_changes(session: Session, mo
     session.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))
     assert not torch.equal(session.render(), first)
     assert events == ["filter", "edit"] * 2
-    assert torch.equal(session.render("detail"), Preview(cat()).render(Recipe(session.recipe.detail)))
+    assert torch.equal(session.render("detail"), Preview(cat()).render(Recipe((session.recipe.last("detail"),))))
     assert events == ["filter", "edit"] * 2
 
 
 HERE, THERE = ((0.2, 0.2), (0.3, 0.2)), ((0.7, 0.6), (0.8, 0.7))
-EDITS = {
+PAIRS = {
     "recolor": (
-        Recolor((Stroke(HERE, 0.04, "#2040e0"),)),
-        Recolor((Stroke(HERE, 0.04, "#20e040"), Stroke(THERE, 0.04, "keep")), reach=0.5),
+        Step("recolor", (Stroke(HERE, 0.04, "#2040e0"),)),
+        Step("recolor", (Stroke(HERE, 0.04, "#20e040"), Stroke(THERE, 0.04, "keep")), reach=0.5),
     ),
     "colorize": (
-        Colorize((Stroke(HERE, 0.04, "#2040e0"),)),
-        Colorize((Stroke(HERE, 0.04, "#2040e0"), Stroke(THERE, 0.04, "#c02010")), strength=0.3),
+        Step("colorize", (Stroke(HERE, 0.04, "#2040e0"),)),
+        Step("colorize", (Stroke(HERE, 0.04, "#2040e0"), Stroke(THERE, 0.04, "#c02010")), strength=0.3),
     ),
-    "defocus": (Defocus((Stroke(HERE, 0.04, "in"),)), Defocus((Stroke(THERE, 0.04, "in"),), radius=4.0)),
-    "abstract": (Abstract(power=0.1), Abstract(power=0.05, edges=1.0, width=4.0, tones=5)),
+    "defocus": (
+        Step("defocus", (Stroke(HERE, 0.04, "in"),)),
+        Step("defocus", (Stroke(THERE, 0.04, "in"),), radius=4.0),
+    ),
+    "abstract": (Step("abstract"), Step("abstract", power=0.05, edges=1.0, edge_width=0.4, tones=5)),
 }
 
 
-@pytest.mark.parametrize("name", EDITS)
+@pytest.mark.parametrize("name", PAIRS)
 def test_more_strokes_need_no_other_filter(name: str, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = EDITS[name]
-    wanted = second.apply(session.preview.pixels).clamp(0, 1)
-    session.set(name, **vars(first))
+    first, second = PAIRS[name]
+    wanted = apply_step(second, session.preview.pixels).clamp(0, 1)
+    session.load(Recipe((first,)))
     session.render()
     monkeypatch.setattr(f"nlfilter_torch.edits.{name}.nonlocal_operator", None)
-    session.set(name, **vars(second))
+    session.load(Recipe((second,)))
     assert torch.equal(session.render(), wanted)
 
 
 def test_another_tolerance_or_picture_needs_another_filter(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    events = counted(monkeypatch, Recolor)
-    session.set("recolor", **vars(EDITS["recolor"][0]))
+    events = counted(monkeypatch)["recolor"]
+    session.load(Recipe((PAIRS["recolor"][0],)))
     session.render()
     for step, change in (
         ("recolor", {"tolerance": 20.0}),
         ("detail", {"alpha": (3.0, 1.0, 1.0, 1.0)}),
-        ("colorize", vars(EDITS["colorize"][0])),
+        ("colorize", {"strokes": PAIRS["colorize"][0].strokes}),
     ):
         session.set(step, **change)
         assert difference(session.render(), session.recipe.apply(cat())) < 1
-    assert events == ["filter", "edit"] * 7  # the preview's and those of the whole edits
+    assert events == ["filter", "edit"] * 4
 
 
 def test_the_filter_held_is_that_of_the_step_at_work(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    early, late = counted(monkeypatch, Recolor), counted(monkeypatch, Abstract)
+    events = counted(monkeypatch)
+    early, late = events["recolor"], events["abstract"]
     session.set("abstract", power=0.1)
     for reach in (0.3, 0.5, 0.8):
-        session.set("recolor", **vars(replace(EDITS["recolor"][0], reach=reach)))
+        session.set("recolor", strokes=PAIRS["recolor"][0].strokes, reach=reach)
         session.render()
     assert early == ["filter", "edit", "edit", "edit"]
     assert late == ["filter", "edit"] * 3  # of another picture each time
@@ -151,7 +156,9 @@ def test_sampled_operator_is_a_sample_of_the_whole() -> None:
     whole = polynomial_filter(nonlocal_operator(image, photometric_bandwidth=bandwidth), image, alpha)
     for stride in (1, 2, 3):
         first = (stride - 1) // 2
-        operator = sampled_operator(image, stride, Detail(), bandwidth=bandwidth, channels="luminance", patch_size=5)
+        operator = sampled_operator(
+            image, stride, Step("detail"), bandwidth=bandwidth, channels="luminance", patch_size=5
+        )
         height, width = operator.size
         assert operator.size == (300 // stride, 450 // stride)
         points = image[..., first::stride, first::stride][..., :height, :width]
@@ -166,7 +173,7 @@ def test_sampled_operator_in_colour_and_nearby() -> None:
     image = cat(1)
     options = {"patch_size": 3, "photometric_bandwidth": 0.1, "spatial_bandwidth": 60.0, "num_landmarks": 200}
     whole = nonlocal_operator(image, guide_channels="all", **options) @ image  # type: ignore[arg-type]
-    detail = Detail(landmarks=200, spatial_bandwidth=60.0, patch_size=3)
+    detail = Step("detail", landmarks=200, spatial_bandwidth=60.0, patch_size=3)
     operator = sampled_operator(image, 2, detail, bandwidth=0.1, channels="all", patch_size=3)
     found, wanted = operator @ image[..., ::2, ::2], whole[..., ::2, ::2]
     assert (found - wanted).square().mean().sqrt() * 255 < 0.8
@@ -175,7 +182,7 @@ def test_sampled_operator_in_colour_and_nearby() -> None:
 def test_preview_of_a_large_photograph_shows_what_saving_gives() -> None:
     """A preview that filtered the reduced picture would be twice as far off."""
     image = cat(1)
-    recipe = Recipe(Detail((3.0, 3.0, 4.0, 1.05)))
+    recipe = Recipe((Step("detail"),))
     preview = Preview(image, pixels=40_000)
     assert preview.stride == 2
     wanted = reduce(recipe.apply(image).clamp(0, 1), 2)

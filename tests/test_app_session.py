@@ -10,7 +10,7 @@ from PIL import Image
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Detail, Recolor
+from nlfilter_torch.edits.steps import Step
 from tests.problems import LINE
 
 
@@ -24,7 +24,7 @@ def test_undo_and_redo(session: Session) -> None:
     session.commit()  # nothing new
     edited = session.recipe
     assert session.undo()
-    assert session.recipe == Recipe(Detail((3.0, 1.0, 1.0, 1.0)))
+    assert session.recipe == Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),))
     assert session.undo()
     assert session.recipe == Recipe()
     assert not session.undo()
@@ -48,14 +48,14 @@ def test_undo_in_the_midst_of_a_drag_takes_it_back_whole(session: Session) -> No
 
 def test_strokes(session: Session) -> None:
     session.add_stroke("detail", LINE, 0.03, "in")
-    (stroke,) = session.recipe.detail.strokes
+    (stroke,) = session.recipe.last("detail").strokes
     assert stroke.points[0] == (round(20 / 150, 4), 0.2)
     assert stroke.paint == "in"
-    mask = session.preview.mask(session.recipe.detail)
+    mask = session.preview.mask(session.recipe.last("detail"))
     assert mask is not None
     assert mask[0, 0, 20, 30] > 0.9
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
-    assert session.recipe.recolor == Recolor((Stroke(stroke.points, 0.03, "#2040e0"),))
+    assert session.recipe.last("recolor") == Step("recolor", (Stroke(stroke.points, 0.03, "#2040e0"),))
     with pytest.raises(ValueError, match="abstract takes no strokes"):
         session.add_stroke("abstract", LINE, 0.03, "in")
     with pytest.raises(ValueError, match="must be one of in, got 'red'"):
@@ -65,11 +65,21 @@ def test_strokes(session: Session) -> None:
 def test_what_was_set_for_all_goes_to_the_first_region(session: Session) -> None:
     session.set("detail", alpha=(3.0, 3.0, 4.0, 1.05))
     session.add_stroke("detail", LINE, 0.03, "in")
-    assert session.recipe.detail.inside == (3.0, 3.0, 4.0, 1.05)
-    assert session.recipe.detail.alpha == (1.0, 1.0, 1.0, 1.0)
+    assert session.recipe.last("detail")["inside"] == (3.0, 3.0, 4.0, 1.05)
+    assert session.recipe.last("detail")["alpha"] == (1.0, 1.0, 1.0, 1.0)
     session.set("detail", alpha=(0.0, 1.0, 1.0, 1.0))
     session.add_stroke("detail", LINE, 0.03, "in")
-    assert session.recipe.detail.alpha == (0.0, 1.0, 1.0, 1.0)
+    assert session.recipe.last("detail")["alpha"] == (0.0, 1.0, 1.0, 1.0)
+
+
+def test_the_last_step_of_an_edit_is_the_one_at_work(session: Session) -> None:
+    """A first one is put where it usually comes."""
+    session.load(Recipe((Step("abstract"), Step("tone"), Step("detail"), Step("tone", clarity=3.0))))
+    session.set("tone", contrast=0.9)
+    assert [step["contrast"] for step in session.recipe.steps if step.edit == "tone"] == [1.2, 0.9]
+    session.set("denoise", noise_level=5.0)
+    session.set("recolor", reach=0.5)
+    assert [step.edit for step in session.recipe.steps] == ["denoise", "abstract", "tone", "detail", "tone", "recolor"]
 
 
 def test_a_stroke_before_a_photograph(tmp_path: Path) -> None:

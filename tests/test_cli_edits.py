@@ -71,6 +71,9 @@ def test_recolor(photo: Path, strokes: Path, pixels: torch.Tensor) -> None:
     assert is_written(run("recolor", photo, "--region", "10,8,8,6:red", "--region", "10,8,8,6:#14a028"), wanted)
     keep = box(30, 40, 8, 8)
     held = recolor(pixels, GREEN * mask, mask, keep=keep, reach=0.5, num_landmarks=40, generator=seeded())
+    wide = recolor(pixels, GREEN * mask, mask, photometric_bandwidth=0.3, num_landmarks=40, generator=seeded())
+    for option in ("--tolerance", "--bandwidth"):
+        assert is_written(run("recolor", photo, "--strokes", strokes, option, 30), wide)
     assert is_written(run("recolor", photo, "--strokes", strokes, "--keep", "40,30,8,8", "--reach", 0.5), held)
 
 
@@ -94,7 +97,7 @@ def test_defocus(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
     for aperture in ("disc", "gaussian"):
         wanted = defocus(pixels, region, radius=3.0, aperture=aperture, num_landmarks=40, generator=seeded())
         assert is_written(
-            run("defocus", photo, "--region", "20,10,16,12", "--radius", 3, "--aperture", aperture), wanted
+            run("defocus", photo, "--region", "20,10,16,12", "--radius", 6.25, "--aperture", aperture), wanted
         )
     write_photograph(Photograph(region), tmp_path / "mask.png")
     assert is_written(
@@ -105,9 +108,9 @@ def test_defocus(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
 
 def test_abstract(photo: Path, pixels: torch.Tensor) -> None:
     wanted = abstract(
-        pixels, power=0.2, edges=0.5, edge_width=1.5, tones=6, photometric_bandwidth=40 / 255, num_landmarks=40
+        pixels, power=0.2, edges=0.5, edge_width=0.96, tones=6, photometric_bandwidth=40 / 255, num_landmarks=40
     )
-    arguments = ("--power", 0.2, "--edges", 0.5, "--edge-width", 1.5, "--tones", 6, "--bandwidth", 40)
+    arguments = ("--power", 0.2, "--edges", 0.5, "--edge-width", 2, "--tones", 6, "--bandwidth", 40)
     assert is_written(run("abstract", photo, *arguments), wanted)
     assert is_written(run("abstract", photo, "--power", 0), pixels)
 
@@ -197,14 +200,15 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H alone here, got"),
         ("recolor", ["--region", "1,2,5,4:red", "--reach", "1"], "Invalid value for '--reach'"),
         ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H alone here"),
-        ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "radius must be positive and finite, got 0"),
+        ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "Invalid value for '--radius': "),
         ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
         ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers with commas between"),
-        ("detail", ["--region", "1,2,5,4", "--spread", "0"], "Invalid value for '--spread': "),
+        ("detail", ["--region", "1,2,5,4", "--spread", "0"], "Invalid value for '--time' / '--spread': "),
         ("abstract", ["--tones", "1"], "Invalid value for '--tones'"),
         ("abstract", ["--edge-width", "0"], "Invalid value for '--edge-width': "),
         ("denoise", ["--noise-level", "-1"], "Invalid value for '--noise-level'"),
-        ("tone", ["--bandwidth", "0"], "Invalid value for '--bandwidth': "),
+        ("tone", ["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels"),
+        ("denoise", ["--bandwidth", "0"], "Invalid value for '--bandwidth': "),
     ],
 )
 def test_wrong_options(

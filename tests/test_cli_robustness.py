@@ -16,7 +16,7 @@ import torch
 
 import nlfilter_torch
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import shown
+from nlfilter_torch.edits.declaration import shown
 from nlfilter_torch.io import photographs as files
 from nlfilter_torch.io.photographs import Photograph, open_beside, read_photograph, write_photograph
 
@@ -45,7 +45,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     ("command", "sentence"),
     [
         ("detail --bandwidth 1e-40", "--bandwidth must be from 0.01 to 1000000 grey levels, or auto, got '1e-40'"),
-        ("tone --bandwidth 1e-40", "'--bandwidth': "),
+        ("recolor --tolerance 1e-40", "'--tolerance' / '--bandwidth': "),
+        ("tone --bandwidth 1e-40", "--bandwidth must be from 0.01 to 1000000 grey levels, or auto, got '1e-40'"),
         ("detail --spatial-bandwidth 1e-40", "'--spatial-bandwidth': "),
         ("detail --spatial-bandwidth nan", "--spatial-bandwidth"),
         (f"detail --patch-size {LONG}", "'--patch-size': "),
@@ -55,7 +56,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("detail --alpha 1e30,1", "--alpha must be numbers from -1000000 to 1000000"),
         (f"detail --alpha {','.join('1' * 101)}", "--alpha must have at most 100 numbers, got 101"),
         ("detail --residual 1e300", "'--residual': "),
-        ("detail --spread nan --region 1,1,3,3", "--spread"),
+        ("detail --time nan --region 1,1,3,3", "--time"),
         ("detail --memory 1e300", "--memory must be a positive number of gigabytes"),
         ("sharpen --amount nan", "--amount"),
         ("sharpen --guide-blur nan", "--guide-blur"),
@@ -89,9 +90,12 @@ def test_numbers_without_sense(
         ('{"alpha": [1, 1], "spatial_bandwidth": 1e-40}', "must be a positive number of pixels, from 0.01 to"),
         ('{"alpha": [1, 1], "patch_size": 1000001}', "must be an odd number from 1 to 99, got 1000001"),
         (f'{{"alpha": [1, 1], "landmarks": {LONG}}}', "must be a whole number from 1 to 10000"),
-        (f'{{"defocus": {{"radius": {LONG}}}}}', "must be a number from 0.1 to 20"),
-        (f'{{"abstract": {{"tones": {LONG}}}}}', "must be a whole number from 2 to 64"),
-        ('{"abstract": {"tones": 4.0}}', "must be a whole number from 2 to 64"),
+        (
+            f'{{"defocus": {{"radius": {LONG}}}}}',
+            "must be a positive number of hundredths of the short side, from 0.1 to 20",
+        ),
+        (f'{{"abstract": {{"tones": {LONG}}}}}', "must be a whole number from 2 to 65536, or null"),
+        ('{"abstract": {"tones": 4.0}}', "must be a whole number from 2 to 65536, or null"),
         (
             f'{{"recolor": {{"strokes": [{{"points": [[{LONG}, 0]], "radius": 0.1, "paint": "keep"}}]}}}}',
             "must be pairs of numbers",

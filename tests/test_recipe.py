@@ -8,14 +8,15 @@ import pytest
 import skimage.data
 import torch
 
-from nlfilter_torch import abstract, colorize, defocus, enhance, recolor
+from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import colour_masks
-from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.presets import PRESETS, Preset
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
-from nlfilter_torch.edits.steps import Abstract, Colorize, Defocus, Detail, Recolor
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.build import nonlocal_operator
@@ -26,13 +27,12 @@ LINE = ((0.25, 0.25), (0.5, 0.25))
 IN, OUT = Stroke(LINE, 0.05, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
 BLUE, KEEP = Stroke(LINE, 0.05, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
 ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
-WHOLE = Recipe(
-    Detail(ALPHA, INSIDE, 0.7, (IN, OUT), 30.0),
-    Colorize((BLUE,), 0.5),
-    Recolor((BLUE, KEEP), 0.5, 20.0),
-    Defocus((IN,), 4.0),
-    Abstract(0.1, 0.5, 3.0, 5),
-)
+DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, time=0.7, bandwidth=30.0)
+COLORIZE = Step("colorize", (BLUE,), strength=0.5)
+RECOLOR = Step("recolor", (BLUE, KEEP), reach=0.5, tolerance=20.0)
+DEFOCUS = Step("defocus", (IN,), radius=4.0)
+ABSTRACT = Step("abstract", power=0.2, edges=0.5, edge_width=0.3, tones=5)
+WHOLE = Recipe((DETAIL, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT))
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +84,11 @@ def test_thinning_keeps_the_ends() -> None:
 
 def test_detail(pixels: torch.Tensor) -> None:
     wanted = enhance(pixels, torch.tensor(ALPHA), photometric_bandwidth=30 / 255, generator=seeded())
-    assert torch.equal(Recipe(Detail(ALPHA, bandwidth=30.0)).apply(pixels), wanted)
+    assert torch.equal(Recipe((Step("detail", alpha=ALPHA, bandwidth=30.0),)).apply(pixels), wanted)
 
 
 def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
-    found = Recipe(WHOLE.detail).apply(pixels)
+    found = Recipe((DETAIL,)).apply(pixels)
     mask = colour_masks(pixels, mask_of([IN], SIZE), negative=mask_of([OUT], SIZE), time=0.7, generator=seeded())
     operator = nonlocal_operator(
         reduce_channels(pixels, "luminance"), photometric_bandwidth=30 / 255, generator=seeded()
@@ -100,8 +100,8 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
 
     assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
     # The same sliders on both sides are those of the whole.
-    same = Recipe(replace(WHOLE.detail, inside=ALPHA)).apply(pixels)
-    assert torch.allclose(same, Recipe(Detail(ALPHA, bandwidth=30.0)).apply(pixels), atol=1e-5)
+    same = Recipe((DETAIL.changed(inside=ALPHA),)).apply(pixels)
+    assert torch.allclose(same, Recipe((Step("detail", alpha=ALPHA, bandwidth=30.0),)).apply(pixels), atol=1e-5)
 
 
 def test_colours(pixels: torch.Tensor) -> None:
@@ -109,7 +109,7 @@ def test_colours(pixels: torch.Tensor) -> None:
     grey = reduce_channels(pixels, "luminance")
     wanted = colorize(grey, strokes, painted, strength=0.5, generator=seeded())
     for image in (pixels, grey):
-        assert torch.equal(Recipe(colorize=WHOLE.colorize).apply(image), wanted)
+        assert torch.equal(Recipe((COLORIZE,)).apply(image), wanted)
     kept = recolor(
         pixels,
         strokes,
@@ -119,58 +119,129 @@ def test_colours(pixels: torch.Tensor) -> None:
         photometric_bandwidth=0.2,
         generator=seeded(),
     )
-    assert torch.equal(Recipe(recolor=WHOLE.recolor).apply(pixels), kept)
+    assert torch.equal(Recipe((RECOLOR,)).apply(pixels), kept)
     with pytest.raises(ValueError, match="recolor needs a colour photograph"):
-        Recipe(recolor=WHOLE.recolor).apply(grey)
+        Recipe((RECOLOR,)).apply(grey)
 
 
 def test_blur_and_painting(pixels: torch.Tensor) -> None:
     blurred = defocus(pixels, mask_of([IN], SIZE), radius=0.04 * 48, generator=seeded())
-    assert torch.equal(Recipe(defocus=WHOLE.defocus).apply(pixels), blurred)
-    for line, width in ((3.0, 0.3), (20.0, 0.96)):  # lines get no thinner than what a pixel can show
-        step = replace(WHOLE.abstract, width=line)
-        wanted = abstract(pixels, power=0.1, edges=0.5, edge_width=width, tones=5, generator=seeded())
-        assert torch.equal(Recipe(abstract=step).apply(pixels), wanted)
+    assert torch.equal(Recipe((DEFOCUS,)).apply(pixels), blurred)
+    for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines get no thinner than what a pixel can show
+        step = ABSTRACT.changed(edge_width=line)
+        wanted = abstract(pixels, power=0.2, edges=0.5, edge_width=width, tones=5, generator=seeded())
+        assert torch.equal(Recipe((step,)).apply(pixels), wanted)
 
 
 def test_steps_follow_one_another(pixels: torch.Tensor) -> None:
-    both = Recipe(Detail(INSIDE), defocus=WHOLE.defocus).apply(pixels)
-    first = Recipe(Detail(INSIDE)).apply(pixels).clamp(0, 1)
-    assert torch.equal(both, Recipe(defocus=WHOLE.defocus).apply(first))
+    """In their order, and as often as they are there."""
+    crisp = Step("detail", alpha=INSIDE)
+    for steps in ((crisp, DEFOCUS), (DEFOCUS, crisp), (crisp, Step("tone", clarity=2.0), crisp)):
+        wanted = pixels
+        for step in steps:
+            wanted = Recipe((step,)).apply(wanted.clamp(0, 1))
+        assert torch.equal(Recipe(steps).apply(pixels), wanted)
+        assert Recipe.from_json(Recipe(steps).to_json(), "edit.json") == Recipe(steps)
+
+
+def test_the_other_edits_are_steps(pixels: torch.Tensor) -> None:
+    sharp = sharpen(pixels, amount=6.0, guide_blur=0.8, patch_size=3, generator=seeded())
+    assert torch.equal(Recipe((Step("sharpen", amount=6.0, guide_blur=0.8, patch_size=3),)).apply(pixels), sharp)
+    toned = adjust_tone(pixels, contrast=1.2, clarity=2.0, generator=seeded())
+    assert torch.equal(Recipe((Step("tone", clarity=2.0),)).apply(pixels), toned)
+    for level in (None, 12.0):
+        clean = denoise(pixels, noise_level=None if level is None else level / 255, generator=seeded())
+        assert torch.equal(Recipe((Step("denoise", noise_level=level),)).apply(pixels), clean)
+
+
+def test_all_options_of_detail_are_in_files(pixels: torch.Tensor) -> None:
+    step = Step("detail", residual=0.5, channels="all", patch_size=3)
+    assert Recipe.from_json(Recipe((step,)).to_json(), "edit.json") == Recipe((step,))
+    alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
+    wanted = enhance(pixels, alpha, residual=0.5, channels="all", patch_size=3, generator=seeded())
+    assert torch.equal(Recipe((step,)).apply(pixels), wanted)
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_idle_steps_change_nothing(edit: str, pixels: torch.Tensor) -> None:
+    assert not Step.idle(edit).changes()
+    assert Recipe((Step.idle(edit),)).apply(pixels) is pixels
+    assert Step(edit, (BLUE, IN)).changes()
 
 
 def test_what_changes_nothing_is_left_out(pixels: torch.Tensor) -> None:
-    idle = Recipe(Detail(inside=INSIDE), recolor=Recolor((KEEP,)))
+    idle = Recipe((Step.idle("detail").changed(inside=INSIDE), Step("recolor", (KEEP,))))
     assert idle.apply(pixels) is pixels
     assert Recipe.from_json(idle.to_json(), "edit.json") == Recipe()
 
 
 def test_files_hold_the_whole_edit() -> None:
     assert Recipe.from_json(WHOLE.to_json(), "edit.json") == WHOLE
-    assert set(json.loads(WHOLE.to_json())) == {"detail", "colorize", "recolor", "defocus", "abstract"}
+    entries = json.loads(WHOLE.to_json())
+    assert list(entries) == ["version", "steps"]
+    assert [step["edit"] for step in entries["steps"]] == ["detail", "colorize", "recolor", "defocus", "abstract"]
+
+
+def test_files_from_before_there_was_a_list_of_steps() -> None:
+    """In the order that was fixed, with the names and units of then, and with what changes nothing left out."""
+    strokes = [BLUE.entries()]
+    text = json.dumps(
+        {
+            "abstract": {"edges": 0.5, "width": 3.0},
+            "recolor": {"strokes": strokes, "tolerance": 20.0, "reach": 0.8},
+            "detail": {"inside": INSIDE, "spread": 0.7, "strokes": [IN.entries()]},
+        }
+    )
+    assert Recipe.from_json(text, "edit.json") == Recipe(
+        (
+            Step("detail", (IN,), alpha=(1.0,) * 4, inside=INSIDE, time=0.7),
+            Step("recolor", (BLUE,), tolerance=20.0),
+            Step("abstract", power=0.0, edges=0.5, edge_width=3.0 * 0.1),
+        )
+    )
+    preset = '{"alpha": [2, 1], "bandwidth": 20, "landmarks": 30, "sampling": "uniform", "spatial_bandwidth": null}'
+    step = Step("detail", alpha=(2.0, 1.0), bandwidth=20, landmarks=30, sampling="uniform")
+    assert Recipe.from_json(preset, "look.json") == Recipe((step,))
+    assert Preset.from_json(preset, "look.json") == Preset((2.0, 1.0), 20, landmarks=30, sampling="uniform")
 
 
 def test_presets_are_edits(tmp_path: Path) -> None:
     crisp = PRESETS["crisp"]
-    assert Recipe.find("crisp") == Recipe(Detail.of(crisp))
+    assert Recipe.find("crisp") == Recipe((crisp.step,))
     path = tmp_path / "look.json"
     path.write_text(crisp.to_json())
-    assert Recipe.find(str(path)) == Recipe(Detail.of(crisp))
-    assert Recipe.find("crisp").to_json() == crisp.to_json()  # so that detail --preset takes it too
+    assert Recipe.find(str(path)) == Recipe((crisp.step,))
+    assert Preset.from_json(Recipe.find("crisp").to_json(), "it") == crisp  # so that detail --preset takes it too
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("{", "it is not JSON"),
-        ("[1]", "it must hold steps out of detail"),
-        ('{"detial": {}}', "it must hold steps out of detail"),
+        ("[1]", "it must hold a list of steps"),
+        ('{"detial": {}}', "it must hold a list of steps"),
         ('{"detail": 1}', "detail in edit.json must hold entries in braces"),
         ('{"detail": {"power": 1}}', "must hold no other entries than alpha"),
-        ('{"abstract": {"strokes": []}}', "must hold no other entries than power, edges, width, tones, got strokes"),
+        (
+            '{"abstract": {"strokes": []}}',
+            "must hold no other entries than power, edges, edge_width, tones, .*, got strokes",
+        ),
         ('{"abstract": {"tones": 2.5}}', "tones of abstract in edit.json must be a whole number"),
         ('{"recolor": {"reach": 1}}', "reach of recolor in edit.json must be a number from 0 to 0.999, got 1"),
         ('{"detail": {"inside": [1, 1]}}', "inside of detail in edit.json must have as many numbers as alpha"),
+        ('{"steps": []}', "version in edit.json must be 1, got null"),
+        (
+            '{"version": 2, "steps": []}',
+            "version in edit.json must be 1, got 2; newer files need a newer nlfilter-torch",
+        ),
+        ('{"version": 1, "steps": {}}', "steps in edit.json must be a list"),
+        ('{"version": 1, "steps": [], "detail": {}}', "no other entries than version, steps, got detail"),
+        ('{"version": 1, "steps": [{}]}', "step 1 in edit.json must hold an entry edit, one of denoise, detail"),
+        ('{"version": 1, "steps": [{"edit": ["tone"]}]}', "step 1 in edit.json must hold an entry edit"),
+        (
+            '{"version": 1, "steps": [{"edit": "tone"}, {"edit": "tone", "clarity": "1"}]}',
+            'clarity of tone, step 2 in edit.json must be a number from -1000000 to 1000000, got "1"',
+        ),
         ('{"defocus": {"strokes": {}}}', "strokes of defocus in edit.json must be a list"),
         ('{"defocus": {"strokes": [{"points": []}]}}', "must hold strokes with points, radius and paint"),
         (
@@ -199,7 +270,7 @@ def test_files_that_hold_no_edit(text: str, sentence: str) -> None:
 def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
     photo, edit, out = tmp_path / "in.png", tmp_path / "edit.json", tmp_path / "out.png"
     write_photograph(Photograph(pixels), photo)
-    recipe = Recipe(Detail(ALPHA, INSIDE, strokes=(IN,)), defocus=WHOLE.defocus)
+    recipe = Recipe((DETAIL, Step("tone"), DEFOCUS))
     edit.write_text(recipe.to_json())
     assert main(["apply", str(photo), str(out), "--preset", str(edit)]) == 0
     assert (read_photograph(out).pixels - recipe.apply(pixels).clamp(0, 1)).abs().max() < 0.6 / 255
@@ -216,6 +287,7 @@ def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_more_memory_is_asked_for_by_hungrier_steps() -> None:
     assert (Recipe().landmarks, Recipe().factors) == (100, 1)
-    assert Recipe(recolor=WHOLE.recolor, defocus=WHOLE.defocus, colorize=WHOLE.colorize).factors == 1
-    assert Recipe(WHOLE.detail).factors == 2
+    assert Recipe((RECOLOR, DEFOCUS, COLORIZE)).factors == 1
+    assert Recipe((DETAIL,)).factors == 2
+    assert Recipe((Step("denoise", patch_size=9),)).patch_size == 9
     assert (WHOLE.landmarks, WHOLE.factors) == (200, 2)

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
 from nlfilter_torch import defocus, nonlocal_operator
-from nlfilter_torch.edits.defocus import LOCALITY, RADIUS, blur_by, focus_map
+from nlfilter_torch.edits.defocus import blur_by, focus_map
+from nlfilter_torch.edits.parameters import DEFOCUS
 from nlfilter_torch.plotting import show_images
 
 PORTRAIT: tuple[Box, ...] = (
@@ -54,7 +55,9 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     disparity = _disparity(image)
     distance = (disparity - disparity[region > 0].median()).abs()
     lens = defocus(image, region)
-    true = blur_by(image, ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1), RADIUS * min(image.shape[-2:]), "disc")
+    true = blur_by(
+        image, ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1), DEFOCUS["radius"].pixels(None, image.shape[-2:]), "disc"
+    )
     panels |= {
         "(e) photograph and spots": marked(image, region),
         "(f) focus map": default_map(image, region),
@@ -78,7 +81,7 @@ def default_map(image: Tensor, region: Tensor) -> Tensor:
     operator = nonlocal_operator(
         image,
         photometric_bandwidth=25 / 255,
-        spatial_bandwidth=LOCALITY * min(image.shape[-2:]),
+        spatial_bandwidth=DEFOCUS["spatial_bandwidth"].share * min(image.shape[-2:]),
         patch_size=3,
         guide_channels="all",
     )

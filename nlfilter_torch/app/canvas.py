@@ -93,7 +93,7 @@ class Easel:
     def draw(self, upto: str | None) -> None:
         """Work the picture out, up to a step or with all of them, and its mask; this may be done in a thread."""
         self.pictures["after"] = drawing.picture(self._session.render(upto))
-        mask = self._session.preview.mask(self._session.recipe.detail)
+        mask = self._session.preview.mask(self._session.recipe.last("detail"))
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
 
     def show(self) -> None:
@@ -111,7 +111,7 @@ class Easel:
         """Show the strokes of the step, with the one that is being painted, or none of them."""
         strokes: tuple[Stroke, ...] = ()
         if self._session.opened is not None and self._show_strokes.value:
-            strokes = getattr(self._session.recipe, self._step).strokes
+            strokes = self._session.recipe.last(self._step).strokes
             if self._line:
                 height, width = self._session.preview.size
                 points = tuple((x / width, y / height) for x, y in self._line)

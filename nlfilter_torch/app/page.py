@@ -147,8 +147,8 @@ class Editor:
             self._drawing = False
 
     def _draw_response(self) -> None:
-        detail = self.recipe.detail
-        curves = [(OUTSIDE, detail.alpha), *([(INSIDE, detail.inside)] if detail.has_region() else [])]
+        detail = self.recipe.last("detail")
+        curves = [(OUTSIDE, detail["alpha"]), *([(INSIDE, detail.sliders_inside)] if detail.has_region() else [])]
         self._panel.draw_response(drawing.response_svg(self.session.preview.layers(detail).eigenvalues, curves))
 
     # Files

@@ -8,24 +8,14 @@ from nicegui import ui
 
 from nlfilter_torch.app import controls
 from nlfilter_torch.app.controls import Control, Slider
+from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, PURPOSES
-from nlfilter_torch.edits.recipe import STEPS, Recipe
-from nlfilter_torch.edits.steps import Detail
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
 
 COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
-INTRO = {
-    "detail": "Paint on what is to have sliders of its own; all that looks like it follows.",
-    "recolor": "Choose a colour and paint a little of it on a thing; its likes take it.",
-    "colorize": "For grey photographs: paint some colours, and they spread over what looks alike nearby.",
-    "defocus": "Paint some of what is to stay sharp; what is unlike it or far away is blurred.",
-    "abstract": "A painting of the photograph: flat areas with clear outlines.",
-}
-BRUSHES: dict[str, dict[str, str]] = {
-    "detail": {"in": "Edit this", "out": "Not this"},
-    "recolor": {"colour": "Paint", "keep": "Keep as it is"},
-    "colorize": {"colour": "Paint"},
-    "defocus": {"in": "Keep sharp"},
-}
+BRUSHES: dict[str, dict[str, str]] = {edit.name: dict(edit.brushes) for edit in EDITS.values() if edit.brushes}
+TABS = ("detail", *(edit for edit in EDITS if edit != "detail"))
 BANDWIDTH = 20.0  # grey levels, to begin with where the photograph is not asked
 
 
@@ -81,33 +71,33 @@ class Panel:
         self._layout: tuple[int, bool] = (0, False)
         with ui.tabs(on_change=lambda event: desk.switch(event.value)).classes("w-full") as tabs:
             tabs.props("dense no-caps align=justify")
-            for step in STEPS:
+            for step in TABS:
                 ui.tab(step, label=step.capitalize())
         with ui.tab_panels(tabs, value="detail", animated=False, keep_alive=True).classes("w-full bg-transparent"):
-            for step in STEPS:
+            for step in TABS:
                 with ui.tab_panel(step).classes("gap-1"):
                     if step == "detail":
                         self._build_detail()
                     else:
-                        ui.label(INTRO[step]).classes("hint")
-                        self._sliders += [self._slider(control) for control in controls.OF_STEP[step]]
+                        ui.label(EDITS[step].hint).classes("hint")
+                        self._sliders += [self._slider(control) for control in controls.OF_EDIT[step]]
                         self._build_brush(step)
         self.follow()
 
     def follow(self) -> None:
         """Show the edit as it is."""
-        detail = self._desk.recipe.detail
+        detail = self._desk.recipe.last("detail")
         self._following = True
-        if self._layout != (len(detail.alpha), detail.has_region()):
-            self._layout = (len(detail.alpha), detail.has_region())
+        if self._layout != (len(detail["alpha"]), detail.has_region()):
+            self._layout = (len(detail["alpha"]), detail.has_region())
             self._build_detail_sliders(detail)
         for slider in (*self._sliders, *self._detail_sliders):
             slider.follow()
-        automatic = isinstance(detail.bandwidth, str)
+        automatic = isinstance(detail["bandwidth"], str)
         self._automatic.set_value(automatic)
         self._bandwidth.set_visibility(not automatic)
-        if not isinstance(detail.bandwidth, str):
-            self._bandwidth.set_value(detail.bandwidth)
+        if not isinstance(detail["bandwidth"], str):
+            self._bandwidth.set_value(detail["bandwidth"])
         self._following = False
 
     def draw_response(self, svg: str) -> None:
@@ -137,17 +127,17 @@ class Panel:
             self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
         self._build_brush("detail")
 
-    def _build_detail_sliders(self, detail: Detail) -> None:
+    def _build_detail_sliders(self, detail: Step) -> None:
         self._box.clear()
         self._detail_sliders = []
         with self._box:
             if detail.has_region():
                 ui.label("In the region").classes("group")
-                inside = controls.detail_sliders("inside", len(detail.inside))
+                inside = controls.detail_sliders("inside", len(detail.sliders_inside))
                 self._detail_sliders += [self._slider(control, " in the region") for control in inside]
-                self._detail_sliders.append(self._slider(controls.SPREAD))
+                self._detail_sliders.append(self._slider(controls.OF_EDIT["detail"][0]))
                 ui.label("Elsewhere").classes("group")
-            outside = controls.detail_sliders("alpha", len(detail.alpha))
+            outside = controls.detail_sliders("alpha", len(detail["alpha"]))
             self._detail_sliders += [self._slider(control) for control in outside]
 
     def _build_brush(self, step: str) -> None:
@@ -156,7 +146,7 @@ class Panel:
         brush = self._desk.brush
         ui.label("Brush").classes("group")
         if step == "detail":
-            ui.label(INTRO[step]).classes("hint")
+            ui.label(EDITS[step].hint).classes("hint")
         with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
             words = ui.toggle(BRUSHES[step], value=brush.word[step]).props("dense no-caps unelevated")
             words.on_value_change(lambda event: brush.word.update({step: event.value}))
@@ -189,11 +179,9 @@ class Panel:
         if name is None:
             return
         self._presets.set_value(None)  # so that the same one can be chosen again
-        found = Detail.of(PRESETS[name])
-        entries = {entry: getattr(found, entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
-        entries["inside"] = self._desk.recipe.detail.inside
-        if len(found.alpha) != len(entries["inside"]):
-            entries["inside"] = found.inside
+        preset, inside = PRESETS[name], self._desk.recipe.last("detail")["inside"]
+        entries = {entry: getattr(preset, entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
+        entries["inside"] = inside if inside is not None and len(inside) == len(preset.alpha) else None
         self._desk.change("detail", entries, True)
 
     def _set_bandwidth(self, value: float | str) -> None:

@@ -16,10 +16,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.edits.applying import prepare, scribbles_of, shared
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.detail import MASK_BANDWIDTH
 from nlfilter_torch.edits.recipe import Recipe
-from nlfilter_torch.edits.steps import Detail, FilterStep
-from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import nonlocal_operator, operator_from_features
 from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures
@@ -29,7 +31,6 @@ from nlfilter_torch.operator.spectrum import Spectrum
 Key = tuple[object, ...]  # the settings that something was worked out from
 
 PIXELS = 1_000_000  # of a preview, at most
-MASK_BANDWIDTH = 25 / 255  # of the masks of nlfilter_torch.edits.detail
 
 
 def stride_for(height: int, width: int, pixels: int = PIXELS) -> int:
@@ -47,7 +48,7 @@ def reduce(image: Tensor, stride: int) -> Tensor:
 
 
 def sampled_operator(
-    guide: Tensor, stride: int, detail: Detail, *, bandwidth: float | Tensor, channels: GuideChannels, patch_size: int
+    guide: Tensor, stride: int, detail: Step, *, bandwidth: float | Tensor, channels: GuideChannels, patch_size: int
 ) -> NonlocalOperator:
     """The filter of every ``stride``-th pixel of a guide, by the patches around it in the guide itself.
 
@@ -59,19 +60,19 @@ def sampled_operator(
             guide,
             patch_size=patch_size,
             photometric_bandwidth=bandwidth,
-            spatial_bandwidth=detail.spatial_bandwidth,
-            num_landmarks=detail.landmarks,
-            landmarks=detail.sampling,  # type: ignore[arg-type]  # checked there
+            spatial_bandwidth=detail["spatial_bandwidth"],
+            num_landmarks=detail["landmarks"],
+            landmarks=detail["sampling"],
             guide_channels=channels,
             generator=generator,
         )
-    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, detail.spatial_bandwidth, channels)
+    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, detail["spatial_bandwidth"], channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
     return operator_from_features(
         recipe(guide, stride=stride),
         size=size,
-        num_landmarks=min(detail.landmarks, size[0] * size[1]),
-        landmarks=detail.sampling,  # type: ignore[arg-type]  # checked there
+        num_landmarks=min(detail["landmarks"], size[0] * size[1]),
+        landmarks=detail["sampling"],
         generator=generator,
     )
 
@@ -145,51 +146,52 @@ class Preview:
         self._layers: Layers | None = None
         self._masks: MaskMaker | None = None
         self._mask: tuple[Key, Tensor] | None = None
-        self._filter: tuple[Key, Callable[[FilterStep], Tensor]] | None = None
-        self._pictures: dict[str, tuple[Key, Tensor]] = {}
+        self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
+        self._pictures: dict[int, tuple[Key, Tensor]] = {}
 
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of the preview."""
         return (self.pixels.shape[-2], self.pixels.shape[-1])
 
-    def layers(self, detail: Detail) -> Layers:
+    def layers(self, detail: Step) -> Layers:
         """The layers for a filter's settings; slow when these have changed."""
-        key = (*detail.preset.options().items(), len(detail.alpha))
+        order = len(detail["alpha"]) - 1
+        key = (*shared(detail), order)
         if self._layers is None or self._layers.key != key:
             luminance = reduce_channels(self.photograph.float(), "luminance")
-            bandwidth = detail.preset.options()["photometric_bandwidth"]
+            bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
             operator = sampled_operator(
                 luminance,
                 self.stride,
                 detail,
                 bandwidth=estimate_bandwidth(luminance) if bandwidth == "auto" else bandwidth,
                 channels="luminance",
-                patch_size=detail.patch_size,
+                patch_size=detail["patch_size"],
             )
-            layers = detail_layers(operator, reduce_channels(self.pixels, "luminance"), order=len(detail.alpha) - 1)
+            layers = detail_layers(operator, reduce_channels(self.pixels, "luminance"), order=order)
             self._layers = Layers(key, layers, operator.spectrum().eigenvalues[0])
         return self._layers
 
-    def mask(self, detail: Detail) -> Tensor | None:
+    def mask(self, detail: Step) -> Tensor | None:
         """Where the sliders inside hold, (1, 1, h, w), or None without strokes; slow the first time only."""
         if not detail.has_region():
             return None
-        key = (detail.strokes, detail.spread, detail.landmarks, detail.spatial_bandwidth)
+        key = (detail.strokes, detail["time"], detail["landmarks"], detail["spatial_bandwidth"])
         if self._mask is None or self._mask[0] != key:
             if self._masks is None or self._masks.key != key[2:]:
-                spread = Detail(landmarks=detail.landmarks, spatial_bandwidth=detail.spatial_bandwidth)
+                plain = Step("detail", landmarks=detail["landmarks"], spatial_bandwidth=detail["spatial_bandwidth"])
                 operator = sampled_operator(
                     self.photograph.float(),
                     self.stride,
-                    spread,
+                    plain,
                     bandwidth=MASK_BANDWIDTH,
                     channels="all",
                     patch_size=5,
                 )
                 self._masks = MaskMaker(operator.spectrum(), key[2:])
-            inner, outer = detail.regions(self.size)
-            self._mask = (key, self._masks.mask(inner, outer, detail.spread))
+            (inner,), others = scribbles_of(detail, self.size)
+            self._mask = (key, self._masks.mask(inner, others.get("negative"), detail["time"]))
         return self._mask[1]
 
     def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
@@ -201,35 +203,43 @@ class Preview:
         """
         result, drawn = self.pixels, False
         key: Key = ()
-        for name, step in zip(recipe.names, recipe.steps, strict=True):
-            if step.changes():
-                before, key = key, (*key, step)
-                if isinstance(step, Detail):
-                    result = self._blend(step, result)
-                elif isinstance(step, FilterStep):
-                    held = self._pictures.get(name)
-                    if held is None or held[0] != key:
-                        # The first picture to be drawn anew is that of the step someone works on: its filter is held.
-                        edit = self._filter_of(step, result, before, keep=not drawn)
-                        held = self._pictures[name] = (key, edit(step))
-                        drawn = True
-                    result = held[1]
-            if name == upto:
-                break
+        places = [i for i, step in enumerate(recipe.steps) if step.edit == upto]
+        for i, step in enumerate(recipe.steps[: places[-1] + 1] if places else recipe.steps):
+            if not step.changes():
+                continue
+            before, key = key, (*key, step)
+            if not before and is_of_layers(step):
+                result = self._blend(step)
+                continue
+            cached = self._pictures.get(i)
+            if cached is None or cached[0] != key:
+                # The first picture to be drawn anew is that of the step someone works on: its filter is kept.
+                edit = self._filter_of(step, result, before, keep=not drawn)
+                cached = self._pictures[i] = (key, edit(step))
+                drawn = True
+            result = cached[1]
         return result.clamp(0, 1)
 
-    def _blend(self, detail: Detail, image: Tensor) -> Tensor:
+    def _blend(self, detail: Step) -> Tensor:
         layers, mask = self.layers(detail).layers, self.mask(detail)
-        return edit_luminance(image, lambda _: detail.blend(layers, mask))
+        edited = weigh_layers(layers, torch.tensor(detail["alpha"]))
+        if mask is not None:
+            edited = torch.lerp(edited, weigh_layers(layers, torch.tensor(detail.sliders_inside)), mask)
+        return edit_luminance(self.pixels, lambda _: edited)
 
-    def _filter_of(self, step: FilterStep, image: Tensor, before: Key, *, keep: bool) -> Callable[[FilterStep], Tensor]:
-        """What the filter of a step makes of the picture before it; slow, unless it is held."""
-        key = (*before, type(step), *step.share())
+    def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
+        """What the filter of a step makes of the picture before it; slow, unless it is cached."""
+        key = (*before, step.edit, *shared(step))
         if self._filter is not None and self._filter[0] == key:
             return self._filter[1]
         if keep:
             self._filter = None  # two of them would take twice the memory
-        edit = step.hold(image.clamp(0, 1))
+        edit = prepare(step, image.clamp(0, 1), stride=self.stride)
         if keep:
             self._filter = (key, edit)
         return edit
+
+
+def is_of_layers(step: Step) -> bool:
+    """Whether a step weighs layers of luminance, from which the picture follows its sliders at once."""
+    return step.edit == "detail" and step["residual"] is None and step["channels"] == "luminance"

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from nlfilter_torch.app.preview import PIXELS, Preview
 from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.recipe import STEPS, Recipe
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, thin
 from nlfilter_torch.io.photographs import (
     BITS,
@@ -96,9 +97,9 @@ class Session:
             raise ValueError("open a photograph first")
         return self.opened.preview
 
-    def set(self, step: str, **values: Any) -> None:
-        """Change entries of a step; :meth:`commit` makes it a change that can be undone."""
-        self.recipe = replace(self.recipe, **{step: replace(getattr(self.recipe, step), **values)})
+    def set(self, edit: str, **values: Any) -> None:
+        """Change the last step of an edit, or add one; :meth:`commit` makes it a change that can be undone."""
+        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(**values))
 
     def commit(self) -> None:
         """End a change, so that undo goes back to before it."""
@@ -143,13 +144,14 @@ class Session:
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
         entries = {"points": [list(point) for point in shares], "radius": round(radius, 4), "paint": paint}
-        if not STEPS[step].PAINTS:
+        words = EDITS[step].words
+        if not words:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
-        stroke = Stroke.from_entries(entries, STEPS[step].PAINTS, step)
-        detail = self.recipe.detail
-        if step == "detail" and paint == "in" and not detail.has_region():  # what was set for all is meant for it
-            self.set("detail", inside=detail.alpha, alpha=(1.0,) * len(detail.alpha))
-        self.set(step, strokes=(*getattr(self.recipe, step).strokes, stroke))
+        stroke = Stroke.from_entries(entries, words, step)
+        last = self.recipe.last(step)
+        if step == "detail" and paint == "in" and not last.has_region():  # what was set for all is meant for it
+            self.set("detail", inside=last["alpha"], alpha=(1.0,) * len(last["alpha"]))
+        self.set(step, strokes=(*last.strokes, stroke))
         self.commit()
 
     def render(self, upto: str | None = None) -> Tensor:
@@ -193,7 +195,8 @@ class Session:
         recipe, photograph = self.recipe, self.opened.photograph
         check_output(target, photograph)
         height, width = photograph.pixels.shape[-2:]
-        check_memory(Path(self.opened.name), width, height, working_bytes(recipe.landmarks, 5, factors=recipe.factors))
+        needed = working_bytes(recipe.landmarks, recipe.patch_size, factors=recipe.factors)
+        check_memory(Path(self.opened.name), width, height, needed)
         pixels = recipe.apply(photograph.pixels)
         if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
             photograph = replace(photograph, icc=None)

@@ -10,24 +10,18 @@ import typer
 from typer.core import TyperCommand
 
 from nlfilter_torch import __version__
-from nlfilter_torch.cli.abstract import abstract
 from nlfilter_torch.cli.app import app as app_verb
 from nlfilter_torch.cli.apply import apply
 from nlfilter_torch.cli.batch import batch
-from nlfilter_torch.cli.colorize import colorize
-from nlfilter_torch.cli.defocus import defocus
 from nlfilter_torch.cli.demo import demo
-from nlfilter_torch.cli.denoise import denoise
-from nlfilter_torch.cli.detail import detail
+from nlfilter_torch.cli.edits import command
 from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
 from nlfilter_torch.cli.interrupts import INTERRUPTED, tell
 from nlfilter_torch.cli.presets import presets
-from nlfilter_torch.cli.recolor import recolor
-from nlfilter_torch.cli.sharpen import sharpen
-from nlfilter_torch.cli.tone import tone
 from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
+from nlfilter_torch.edits.parameters import EDITS
 
 NAME = "nlfilter-torch"
 
@@ -61,10 +55,9 @@ def _check_finite(option: str, value: Any) -> None:
 
 app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 app.command(name="app", cls=Verb)(app_verb)
-for _verb in (
-    *(detail, sharpen, tone, denoise, recolor, colorize, defocus, abstract),
-    *(apply, fit, presets, batch, frames, inspect, demo),
-):
+for _edit in EDITS.values():
+    app.command(name=_edit.name, cls=Verb)(command(_edit))
+for _verb in (apply, fit, presets, batch, frames, inspect, demo):
     app.command(cls=Verb)(_verb)
 
 

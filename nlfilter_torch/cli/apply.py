@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.edits.recipe import Recipe
 
 Edit = Annotated[
     str,
@@ -28,20 +29,19 @@ def apply(
 ) -> None:
     """Edit a photograph as another one was edited in the browser: sliders, strokes and all.
 
-    Photographs that fit no memory are worked out in tiles, unless a step is defocus or abstraction.
+    Photographs that fit no memory are worked out in tiles, if all steps are of detail, recolor or colorize.
 
     Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
     """
+    recipe = Recipe.find(preset)
+
     from torch import Tensor
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.tiled import Job
-    from nlfilter_torch.edits.recipe import Recipe
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.tiled.recipe import edit_rows
     from nlfilter_torch.tiled.sources import Rows
-
-    recipe = Recipe.find(preset)
 
     def work(photograph: Photograph) -> Tensor:
         return recipe.apply(photograph.pixels)
@@ -55,9 +55,9 @@ def apply(
         depth,
         work,
         landmarks=recipe.landmarks,
-        patch_size=recipe.detail.patch_size,
+        patch_size=recipe.patch_size,
         factors=recipe.factors,
         memory=memory,
         by_rows=by_rows,
-        coloured=recipe.colorize.changes(),
+        coloured=recipe.gives_colour,
     )

@@ -1,6 +1,7 @@
 """``nlfilter-torch batch``: the same edit of the details for all photographs of a folder."""
 
 import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,8 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.detail import PresetName, detail
+from nlfilter_torch.cli.apply import apply
+from nlfilter_torch.cli.edits import edit_photograph, plain_step, take_defaults
 from nlfilter_torch.cli.interrupts import INTERRUPTED
+from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.recipe import Recipe
 
 if TYPE_CHECKING:
     from nlfilter_torch.cli.folders import Tally
@@ -33,7 +37,27 @@ Workers = Annotated[
 ]
 
 
+def _use_preset(context: typer.Context, name: str | None) -> str | None:
+    step = None if name is None else plain_step(Recipe.find(name))
+    if step is not None:
+        take_defaults(context, step)
+    return name
+
+
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|FILE",
+        callback=_use_preset,
+        is_eager=True,
+        help=f"One of {', '.join(PRESETS)}, or a file of any edits, such as `nlfilter-torch fit` and the editor make. "
+        "Options that are given count for more than a preset of detail; other edits take none.",
+    ),
+]
+
+
 def batch(
+    context: typer.Context,
     folder: Folder,
     target: Target,
     alpha: options.Alpha = "3,3,4,1.05",
@@ -45,11 +69,11 @@ def batch(
     landmarks: options.Landmarks = 100,
     sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
-    preset: PresetName = None,
+    preset: Preset = None,
     workers: Workers = None,
     memory: options.Memory = None,
 ) -> None:
-    """Edit the details of all photographs of a folder, as `nlfilter-torch detail` edits one.
+    """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
 
     A file that cannot be edited is reported and the others are done; the exit status is 1 then. After an interruption
     the same command does what is left. The workers share --memory.
@@ -80,6 +104,17 @@ def batch(
         "sampling": sampling,
         "seed": seed,
     }
+    edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
+    recipe = None if preset is None else Recipe.find(preset)
+    if preset is not None and recipe is not None and plain_step(recipe) is None:
+        sources = {name: context.get_parameter_source(name) for name in settings}
+        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        if given:
+            raise ValueError(
+                f"--{given[0].replace('_', '-')} is an option of detail, but {preset} holds another edit; "
+                "leave it out, or write it into the file"
+            )
+        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=preset)
     paths = pictures(folder)
     with connected_ranks() as ranks:
         prepare(paths, target, settings)
@@ -92,7 +127,7 @@ def batch(
                 edit_folder(
                     share,
                     target,
-                    partial(detail, **settings, memory=room),
+                    partial(edit, memory=room),
                     workers=count,
                     threads=max(1, cores // count),
                     tell=_tell,

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -89,19 +89,3 @@ def build_operator(
         guide_channels="all",
         generator=torch.Generator().manual_seed(seed),
     )
-
-
-def common(bandwidth: float | None, spatial_bandwidth: float | None, landmarks: int, seed: int) -> dict[str, Any]:
-    """Keyword arguments of an edit from the options that all of them share; what is left out is left out."""
-    given: dict[str, Any] = {"num_landmarks": landmarks, "generator": torch.Generator().manual_seed(seed)}
-    if bandwidth is not None:
-        given["photometric_bandwidth"] = bandwidth / options.LEVELS
-    if spatial_bandwidth is not None:
-        given["spatial_bandwidth"] = spatial_bandwidth
-    return given
-
-
-def check_colour(channels: int, verb: str, remedy: str) -> None:
-    """Raise unless a photograph of so many channels has colours."""
-    if channels < 3:
-        raise ValueError(f"{verb} needs a colour photograph, got a grey one; {remedy}")

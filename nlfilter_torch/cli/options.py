@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nlfilter_torch.edits.presets import BANDWIDTHS, DISTANCES, GAINS, MAX_LANDMARKS, MAX_PATCH, MAX_SLIDERS
+from nlfilter_torch.edits.declaration import BANDWIDTHS, DISTANCES, GAINS, MAX_LANDMARKS, MAX_PATCH, MAX_SLIDERS
 
 if TYPE_CHECKING:
     from nlfilter_torch.io.photographs import Depth
@@ -77,11 +77,11 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
     return tuple(numbers)
 
 
-def parse_bandwidth(text: str) -> float | Literal["auto"]:
-    """``--bandwidth`` in units of the picture.
+def parse_levels(text: str) -> float | Literal["auto"]:
+    """``--bandwidth`` in grey levels.
 
-    >>> parse_bandwidth("51"), parse_bandwidth("auto")
-    (0.2, 'auto')
+    >>> parse_levels("51"), parse_levels("auto")
+    (51.0, 'auto')
     """
     if text == "auto":
         return "auto"
@@ -96,7 +96,17 @@ def parse_bandwidth(text: str) -> float | Literal["auto"]:
             f"--bandwidth must be from {BANDWIDTHS[0]:g} to {BANDWIDTHS[1]:.0f} grey levels, or auto, got {text!r}; "
             "20 suits most photographs"
         )
-    return levels / LEVELS
+    return levels
+
+
+def parse_bandwidth(text: str) -> float | Literal["auto"]:
+    """``--bandwidth`` in units of the picture.
+
+    >>> parse_bandwidth("51"), parse_bandwidth("auto")
+    (0.2, 'auto')
+    """
+    levels = parse_levels(text)
+    return levels if levels == "auto" else levels / LEVELS
 
 
 Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF or WebP file.")]
@@ -198,28 +208,6 @@ Full = Annotated[
     typer.Option(
         "--full",
         help="In tiles: work from every pixel, not from a million of them. Takes two or three times as long.",
-    ),
-]
-# Of verbs whose edit has bandwidths of its own.
-OwnBandwidth = Annotated[
-    float | None,
-    typer.Option(
-        "--bandwidth",
-        min=BANDWIDTHS[0],
-        max=BANDWIDTHS[1],
-        metavar="LEVELS",
-        help="How different two spots may be and still count as alike, in grey levels from 0 to 255. Left out: what "
-        "suits this command.",
-    ),
-]
-OwnSpatialBandwidth = Annotated[
-    float | None,
-    typer.Option(
-        "--spatial-bandwidth",
-        min=DISTANCES[0],
-        max=DISTANCES[1],
-        metavar="PIXELS",
-        help="How far apart two spots may be and still count as alike. Left out: what suits this command.",
     ),
 ]
 StrokesFile = Annotated[

@@ -1,7 +1,9 @@
 """What someone paints or marks on a photograph that is read by rows, by rows as well."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +20,7 @@ from nlfilter_torch.cli.scribbles import (
     with_sliders,
 )
 from nlfilter_torch.cli.tiled import Job
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.sources import Picture, transparency
 
 Floats = NDArray[np.float32]
@@ -136,3 +139,17 @@ class MarkRows:
 def mark_rows(job: Job, regions: list[str] | None, option: str) -> MarkRows | None:
     """What :func:`selection` gives for rectangles alone, by rows."""
     return MarkRows(job.size, plain_rectangles(job.size, regions, option)) if regions else None
+
+
+def of_edit(step: Step, job: Job, source: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What :func:`nlfilter_torch.cli.scribbles.of_edit` gives, by rows, and what errors call the files."""
+    if step.edit == "detail":
+        regions, alpha = region_rows(job, given.get("mask"), given.get("region"), torch.tensor(step["alpha"]))
+        return {"regions": regions, "alpha": alpha, "name": source}
+    path = given.get("strokes")
+    found: dict[str, Any] = {
+        "strokes": stroke_rows(job, path, given.get("region")),
+        "names": (source, str(path or "--region")),
+    }
+    keep = mark_rows(job, given.get("keep"), "--keep")
+    return found if keep is None else found | {"keep": keep}

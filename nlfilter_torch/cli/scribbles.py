@@ -1,13 +1,16 @@
 """Scribbles, masks and rectangles on a photograph, from the options that give them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph
 
 
@@ -41,6 +44,27 @@ class Rectangle:
                 f"columns {x} to {x + width - 1} and rows {y} to {y + height - 1} in {text!r}; move or shrink it"
             )
         return Rectangle(slice(y, y + height), slice(x, x + width), note if colon else None)
+
+
+def of_edit(
+    step: Step, photograph: Photograph, given: Mapping[str, Any]
+) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
+    """What the options of an edit paint and mark on a photograph, as :func:`scribbles_of` has it for strokes."""
+    if step.edit in ("recolor", "colorize"):
+        keep = selection(photograph, None, given.get("keep"), option="--keep")
+        strokes = colour_strokes(photograph, given.get("strokes"), given.get("region"))
+        return strokes, {} if keep is None else {"keep": keep}
+    if step.edit == "defocus":
+        focus = selection(photograph, given.get("mask"), given.get("region"), option="--region")
+        if focus is None:
+            raise ValueError(
+                "give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60"
+            )
+        return (focus,), {}
+    if step.edit != "detail":
+        return (), {}
+    found = slider_regions(photograph, given.get("mask"), given.get("region"), torch.tensor(step["alpha"]))
+    return ((), {}) if found is None else (found[:1], {"alpha": found[1]})
 
 
 def colour_strokes(photograph: Photograph, path: Path | None, regions: list[str] | None) -> tuple[Tensor, Tensor]:

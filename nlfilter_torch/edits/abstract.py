@@ -11,22 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import (
-    check_count,
-    check_not_negative,
-    check_number,
-    check_photograph,
-    check_positive,
-    check_reach,
-    check_share,
-)
+from nlfilter_torch.core.checks import check_count, check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
+from nlfilter_torch.edits.parameters import ABSTRACT
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 
-PATCH_SIZE, LANDMARKS = 3, 200  # by default
-LOCALITY = 0.15  # default spatial bandwidth as a share of the short side
 # What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel
 # has likes, there where it is like no other, such as on a border, and back everywhere as the power goes to 0.
 TIMES_UNEXPLAINED = 10
@@ -34,7 +25,6 @@ LEAST = 1e-4  # of r
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones where the image is flat, and where it has an edge
-MOST_TONES = 1 << 16  # as many as 16 bits have
 FLAT = 1e-12  # of squared gradients; keeps the derivative of their root finite
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, at which a step is crisp
 
@@ -43,14 +33,14 @@ EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, at which 
 def abstract(
     image: Tensor,
     *,
-    power: float | Tensor = 0.1,
-    edges: float = 0.0,
-    edge_width: float = 1.0,
-    tones: int | None = None,
-    photometric_bandwidth: float | Tensor | str = "auto",
+    power: float | Tensor = ABSTRACT.defaults["power"],
+    edges: float = ABSTRACT.defaults["edges"],
+    edge_width: float | None = None,
+    tones: int | None = ABSTRACT.defaults["tones"],
+    photometric_bandwidth: float | Tensor | str = ABSTRACT.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = PATCH_SIZE,
-    num_landmarks: int = LANDMARKS,
+    patch_size: int = ABSTRACT.defaults["patch_size"],
+    num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
     """Take the small detail out of a photograph and keep its outlines: ``W^k y`` with a fractional k.
@@ -62,7 +52,7 @@ def abstract(
         image: (B, C, H, W) in [0, 1]; lines and tones want C = 1 or 3.
         power: k >= 0, a number or a tensor of shape () or (B,). At 0 the image comes back.
         edges: darkness of the lines, 0 for none, 1 for black ones.
-        edge_width: of the lines, in pixels, at most half the short side.
+        edge_width: of the lines, in pixels, at most half the short side; None is 0.2 % of it, and at least 0.3 pixels.
         tones: number of tones of luminance, from 2 to 65536; None leaves it continuous.
         photometric_bandwidth: h_y; larger makes larger flat areas.
         spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
@@ -107,11 +97,11 @@ class Abstraction:
 
     def __init__(self, image: Tensor, **options: Any) -> None:
         check_photograph(image, "image")
-        options = {"patch_size": PATCH_SIZE, "num_landmarks": LANDMARKS, **options}
+        options = {name: ABSTRACT.defaults[name] for name in ("patch_size", "num_landmarks")} | options
         check_count(options["num_landmarks"], "num_landmarks")
         options["num_landmarks"] = min(options["num_landmarks"], image[0, 0].numel())
         self._image = image
-        nearness = nearby(options.get("spatial_bandwidth"), LOCALITY, image.shape[-2:])
+        nearness = nearby(options.get("spatial_bandwidth"), ABSTRACT["spatial_bandwidth"].share, image.shape[-2:])
         self._options = {**options, "spatial_bandwidth": nearness}
 
     @cached_property
@@ -128,18 +118,22 @@ class Abstraction:
 
     @full_precision
     def __call__(
-        self, *, power: float | Tensor = 0.1, edges: float = 0.0, edge_width: float = 1.0, tones: int | None = None
+        self,
+        *,
+        power: float | Tensor = ABSTRACT.defaults["power"],
+        edges: float = ABSTRACT.defaults["edges"],
+        edge_width: float | None = None,
+        tones: int | None = ABSTRACT.defaults["tones"],
     ) -> Tensor:
         """The abstract image (B, C, H, W); arguments and errors are those of :func:`abstract`."""
         image = self._image
-        check_not_negative(power, "power", "0 leaves the image as it is", image.shape[0])
-        check_number(edges, "edges")
-        check_share(edges, "edges")
-        check_number(edge_width, "edge_width")
-        check_positive(edge_width, "edge_width")
-        check_reach(edge_width, "edge_width", (image.shape[-2], image.shape[-1]))
-        if tones is not None:
-            check_count(tones, "tones", least=2, most=MOST_TONES)
+        ABSTRACT["power"].check_argument(power, image.shape[0])
+        ABSTRACT["edges"].check_argument(edges)
+        ABSTRACT["edge_width"].check_argument(edge_width)
+        size = (image.shape[-2], image.shape[-1])
+        width = ABSTRACT["edge_width"].pixels(edge_width, size)
+        check_reach(width, "edge_width", size)
+        ABSTRACT["tones"].check_argument(tones)
         if (edges > 0 or tones is not None) and image.shape[1] not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {image.shape[1]}; select some")
 
@@ -148,7 +142,7 @@ class Abstraction:
             return flat.to(image.dtype)
         luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
         toned = luminance if tones is None else quantize(luminance, tones)
-        toned = toned * (1 - edges * (1 - edge_lines(luminance, edge_width)))
+        toned = toned * (1 - edges * (1 - edge_lines(luminance, width)))
         return (merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned).to(image.dtype)
 
 

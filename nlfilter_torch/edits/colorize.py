@@ -9,17 +9,16 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import (
-    check_choice,
     check_count,
     check_image,
     check_patch_size,
     check_photograph,
     check_positive,
     check_same_size,
-    check_share,
 )
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance
+from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import check_painted, propagate_strokes
 from nlfilter_torch.operator.build import nonlocal_operator
@@ -47,10 +46,8 @@ class Stage:
     smoothness: float
 
 
-SIMILAR, PATCH_SIZE, LANDMARKS = 40 / 255, 5, 100  # photometric bandwidth, size of patches and M by default
-# Found on five photographs of 160x240 with 6 to 60 random strokes; all of it may be doubled or halved at a cost of less
-# than 0.3 dB.
-LOCALITY = 0.5625  # default spatial bandwidth as a share of the short side, so that a preview and the photograph agree
+# These, and the defaults of COLORIZE, were found on five photographs of 160x240 with 6 to 60 random strokes; all of it
+# may be doubled or halved at a cost of less than 0.3 dB.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 2.0), Stage(2 / 9, 3.0, 3, 0.5, 2.0)
 
 
@@ -60,13 +57,13 @@ def colorize(
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
-    method: Method = "regression",
-    strength: float | Tensor = 1.0,
+    method: Method = COLORIZE.defaults["method"],
+    strength: float | Tensor = COLORIZE.defaults["strength"],
     time: float | Tensor = 1.0,
-    photometric_bandwidth: float | Tensor = SIMILAR,
+    photometric_bandwidth: float | Tensor = COLORIZE.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = PATCH_SIZE,
-    num_landmarks: int = LANDMARKS,
+    patch_size: int = COLORIZE.defaults["patch_size"],
+    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Colour a grey image from strokes; its luminance stays as it is.
@@ -107,7 +104,7 @@ def colorize(
         (True, True)
     """
     check_photograph(grey, "grey", channels=1)
-    check_choice(method, "method", ("regression", "kmeans"))
+    COLORIZE["method"].check_argument(method)
     check_positive(photometric_bandwidth, "photometric_bandwidth", grey.shape[0])
     if spatial_bandwidth is not None:
         check_positive(spatial_bandwidth, "spatial_bandwidth", grey.shape[0])
@@ -136,9 +133,10 @@ class Colorization:
 
     def __init__(self, grey: Tensor, *, hold: bool = True, **options: Any) -> None:
         self._grey = grey
-        defaults = {"photometric_bandwidth": SIMILAR, "patch_size": PATCH_SIZE, "num_landmarks": LANDMARKS}
+        own = ("photometric_bandwidth", "patch_size", "num_landmarks")
+        defaults = {name: COLORIZE.defaults[name] for name in own}
         options = {**defaults, **options}
-        bandwidth = nearby(options.get("spatial_bandwidth"), LOCALITY, grey.shape[-2:])
+        bandwidth = nearby(options.get("spatial_bandwidth"), COLORIZE["spatial_bandwidth"].share, grey.shape[-2:])
         options["num_landmarks"] = min(options["num_landmarks"], grey[0].numel())
 
         def spectrum(stage: Stage) -> Spectrum:
@@ -157,8 +155,8 @@ class Colorization:
         strokes: Tensor,
         stroke_mask: Tensor,
         *,
-        method: Method = "regression",
-        strength: float | Tensor = 1.0,
+        method: Method = COLORIZE.defaults["method"],
+        strength: float | Tensor = COLORIZE.defaults["strength"],
         time: float | Tensor = 1.0,
     ) -> Tensor:
         """The image in colour, (B, 3, H, W); arguments and errors are those of :func:`colorize`."""
@@ -168,7 +166,7 @@ class Colorization:
             check_image(tensor, name, channels=channels, batch=batch)
             check_same_size(tensor, size, name, "grey image")
         check_painted(stroke_mask)
-        check_share(strength, "strength", batch)
+        COLORIZE["strength"].check_argument(strength, batch)
         check_positive(time, "time", batch)
 
         luminance = grey.to(working_dtype(grey))

@@ -9,26 +9,21 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import (
-    check_choice,
     check_image,
-    check_number,
     check_photograph,
-    check_positive,
     check_reach,
     check_same_size,
 )
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.components import Pixels, Spots, find_spots
+from nlfilter_torch.edits.parameters import DEFOCUS
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
 
 Aperture = Literal["disc", "gaussian"]
 
-SIMILAR, PATCH_SIZE = 25 / 255, 3  # photometric bandwidth and size of patches by default
-RADIUS = 0.025  # default radius of the blur as a share of the short side
-LOCALITY = 0.2  # default spatial bandwidth, likewise
 REACH = 0.7  # of the correlations with the spots of the focus region
 CLOSING, SMOOTHING = 0.015, 0.04  # sizes, as shares of the short side, of the gaps in a focus map that are filled
 GUIDED = 12  # radius of the smoothing, in pixels, from twice of which on it takes every other one and fewer
@@ -42,10 +37,10 @@ def defocus(
     focus_region: Tensor,
     *,
     radius: float | None = None,
-    aperture: Aperture = "disc",
-    photometric_bandwidth: float | Tensor = SIMILAR,
+    aperture: Aperture = DEFOCUS.defaults["aperture"],
+    photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = PATCH_SIZE,
+    patch_size: int = DEFOCUS.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
     """Blur what is unlike, or far from, a region that stays in focus.
@@ -86,11 +81,11 @@ def defocus(
     check_photograph(image, "image")
     if image.shape[1] not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
-    check_choice(aperture, "aperture", ("disc", "gaussian"))
-    reach = RADIUS * min(image.shape[-2:]) if radius is None else radius
-    check_number(reach, "radius", "pass a float or None")
-    check_positive(reach, "radius")
-    check_reach(reach, "radius", (image.shape[-2], image.shape[-1]))
+    DEFOCUS["aperture"].check_argument(aperture)
+    DEFOCUS["radius"].check_argument(radius)
+    size = (image.shape[-2], image.shape[-1])
+    reach = DEFOCUS["radius"].pixels(radius, size)
+    check_reach(reach, "radius", size)
     held = Defocusing(
         image,
         photometric_bandwidth=photometric_bandwidth,
@@ -111,8 +106,8 @@ class Defocusing:
 
     def __init__(self, image: Tensor, **options: Any) -> None:
         self._image = image
-        options = {"photometric_bandwidth": SIMILAR, "patch_size": PATCH_SIZE, **options}
-        nearness = nearby(options.get("spatial_bandwidth"), LOCALITY, image.shape[-2:])
+        options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
+        nearness = nearby(options.get("spatial_bandwidth"), DEFOCUS["spatial_bandwidth"].share, image.shape[-2:])
         self._options = {**options, "spatial_bandwidth": nearness}
 
     @cached_property
@@ -132,7 +127,7 @@ class Defocusing:
         return focus_map(self._spectrum, pixels, focus_region.to(pixels))
 
     @full_precision
-    def blur(self, focus: Tensor, radius: float, aperture: Aperture = "disc") -> Tensor:
+    def blur(self, focus: Tensor, radius: float, aperture: Aperture = DEFOCUS.defaults["aperture"]) -> Tensor:
         """The image (B, C, H, W), blurred by ``radius`` where it is not in ``focus``."""
         pixels = self._image.to(working_dtype(self._image))
         return blur_by(pixels, 1 - focus, radius, aperture).to(self._image.dtype)

@@ -7,15 +7,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_image, check_not_negative, check_photograph
+from nlfilter_torch.core.checks import check_count, check_image, check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import nearby
+from nlfilter_torch.edits.parameters import DENOISE
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.operator.operator import NonlocalOperator
 
-LOCALITY = 0.2  # default spatial bandwidth as a share of the short side
 GUIDE_BLUR = 0.7  # pixels; the guide's own noise would link pixels by it
 ORDER = 2
 QUIET = 0.1 / 255  # a noise level below what eight bits resolve: nothing to do
@@ -26,11 +26,11 @@ MEDIAN = 0.6745  # of the absolute value of a normal variable
 def denoise(
     image: Tensor,
     *,
-    noise_level: float | Tensor | None = None,
+    noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
     photometric_bandwidth: float | Tensor | None = None,
     spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = 5,
-    num_landmarks: int = 200,
+    patch_size: int = DENOISE.defaults["patch_size"],
+    num_landmarks: int = DENOISE.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
     """Remove noise of known or estimated strength.
@@ -64,8 +64,7 @@ def denoise(
     """
     check_photograph(image, "image")
     check_count(num_landmarks, "num_landmarks")
-    if noise_level is not None:
-        check_not_negative(noise_level, "noise_level", "0 changes nothing", image.shape[0])
+    DENOISE["noise_level"].check_argument(noise_level, image.shape[0])
     pixels = image.to(working_dtype(image))
     level = estimate_noise(pixels) if noise_level is None else torch.as_tensor(noise_level).to(pixels).reshape(-1)
 
@@ -73,7 +72,7 @@ def denoise(
     operator = nonlocal_operator(
         soften(pixels, GUIDE_BLUR),
         photometric_bandwidth=heard if photometric_bandwidth is None else photometric_bandwidth,
-        spatial_bandwidth=nearby(spatial_bandwidth, LOCALITY, pixels.shape[-2:]),
+        spatial_bandwidth=nearby(spatial_bandwidth, DENOISE["spatial_bandwidth"].share, pixels.shape[-2:]),
         patch_size=patch_size,
         num_landmarks=min(num_landmarks, pixels.shape[-2] * pixels.shape[-1]),
         guide_channels="all",

@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_photograph, check_positive, check_tensor
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter
+from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.filtering.filters import blend_sliders, filter_regions, polynomial_filter
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -23,8 +25,10 @@ def enhance(
     regions: Tensor | None = None,
     *,
     negative: Tensor | None = None,
-    residual: float | Tensor | None = None,
-    time: float | Tensor = 1.0,
+    outside: Tensor | None = None,
+    residual: float | Tensor | None = DETAIL.defaults["residual"],
+    channels: str = DETAIL.defaults["channels"],
+    time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
     **options: Any,
@@ -39,7 +43,9 @@ def enhance(
             with them; (k+1,) is for all regions.
         regions: (B, K, H, W), non-negative weights of the pixels of K regions; None edits the whole image.
         negative: (B, 1 or K, H, W), weights of pixels whose likes are left out, see :func:`diffusion_mask`.
+        outside: sliders (k+1,) of what is in no region; None leaves it as it is.
         residual: weight of what the eigenvectors do not explain, see :func:`polynomial_filter`.
+        channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
         time: diffusion time of the masks; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         mask_bandwidth: photometric bandwidth of the masks.
@@ -62,25 +68,32 @@ def enhance(
     """
     check_photograph(image, "image")
     check_tensor(alpha, "alpha")
+    DETAIL["channels"].check_argument(channels)
     check_positive(mask_bandwidth, "mask_bandwidth", image.shape[0])
     pixels = image.to(working_dtype(image))
     if regions is not None:
         check_image(regions, "regions", batch=image.shape[0])
         shared = {name: value for name, value in options.items() if name in SHARED}
+        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
+            shared["generator"] = torch.Generator(options["generator"].device)
+            shared["generator"].set_state(options["generator"].get_state())
         masks = colour_masks(
             pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared
         )
         sliders = alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha
-    elif negative is not None:
-        raise ValueError("negative must come with regions, got it alone; paint what is to be edited, too")
+    elif negative is not None or outside is not None:
+        name = "outside" if negative is None else "negative"
+        raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     operator = nonlocal_operator(reduce_channels(pixels, "luminance"), **options)
 
     def edit(planes: Tensor) -> Tensor:
         if regions is None:
             return polynomial_filter(operator, planes, alpha, residual=residual)
-        return filter_regions(operator, planes, masks, sliders, residual=residual)
+        if outside is None:
+            return filter_regions(operator, planes, masks, sliders, residual=residual)
+        return polynomial_filter(operator, planes, blend_sliders(masks, sliders, outside), residual=residual)
 
-    return edit_luminance(pixels, edit).to(image.dtype)
+    return (edit(pixels) if channels == "all" else edit_luminance(pixels, edit)).to(image.dtype)
 
 
 def colour_masks(
@@ -88,7 +101,7 @@ def colour_masks(
     regions: Tensor,
     *,
     negative: Tensor | None = None,
-    time: float | Tensor = 1.0,
+    time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
     **options: Any,

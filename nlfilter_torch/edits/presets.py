@@ -4,24 +4,15 @@ Names and units are those of the command line, so that the file can be read and 
 presets that have a name.
 """
 
-import json
-import reprlib
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nlfilter_torch.edits.recipe import Recipe, in_file
+from nlfilter_torch.edits.steps import Step
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
-
-#: Ranges of what presets and options hold: beyond them nothing useful is left, and numbers overflow.
-GAINS = (-1e6, 1e6)  # of sliders
-BANDWIDTHS = (0.01, 1e6)  # photometric, in grey levels of 255
-DISTANCES = (0.01, 1e6)  # spatial bandwidths, in pixels
-MAX_SLIDERS = 100
-MAX_PATCH = 99  # pixels
-MAX_LANDMARKS = 10_000
 
 
 @dataclass(frozen=True)
@@ -35,6 +26,8 @@ class Preset:
         patch_size: odd.
         landmarks: how many.
         sampling: ``"kmeans"``, ``"uniform"`` or ``"random"``.
+        residual: gain of what no landmark explains, or None for that of the finest layer.
+        channels: ``"luminance"`` or ``"all"``.
     """
 
     alpha: tuple[float, ...]
@@ -43,6 +36,8 @@ class Preset:
     patch_size: int = 5
     landmarks: int = 100
     sampling: str = "kmeans"
+    residual: float | None = None
+    channels: str = "luminance"
 
     def apply(self, image: "Tensor", *, generator: "torch.Generator | None" = None) -> "Tensor":
         """Edit a photograph as ``nlfilter-torch detail --preset`` does.
@@ -63,42 +58,39 @@ class Preset:
             >>> PRESETS["crisp"].apply(image).shape
             torch.Size([1, 3, 24, 24])
         """
-        import torch
+        from nlfilter_torch.edits.applying import apply_step
 
-        from nlfilter_torch.edits.detail import enhance
+        return apply_step(self.step, image, generator=generator)
 
-        return enhance(image, torch.tensor(self.alpha), generator=generator, **self.options())
-
-    def options(self) -> dict[str, Any]:
-        """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
-
-        >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
-        12.0
-        """
-        return {
-            "photometric_bandwidth": self.bandwidth if isinstance(self.bandwidth, str) else self.bandwidth / 255,
-            "spatial_bandwidth": self.spatial_bandwidth,
-            "patch_size": self.patch_size,
-            "num_landmarks": self.landmarks,
-            "landmarks": self.sampling,
-        }
+    @property
+    def step(self) -> Step:
+        """The edit as a step of a :class:`~nlfilter_torch.edits.recipe.Recipe`."""
+        return Step("detail", **asdict(self))
 
     def to_json(self) -> str:
-        """The preset as text, a line for each entry.
+        """The preset as text: a recipe of one step.
 
-        >>> print(Preset((3.0, 1.0)).to_json())
+        >>> print(Preset((3.0, 1.0), 20.0).to_json())
         {
-          "alpha": [3.0, 1.0],
-          "bandwidth": "auto",
-          "spatial_bandwidth": null,
-          "patch_size": 5,
-          "landmarks": 100,
-          "sampling": "kmeans"
+          "version": 1,
+          "steps": [
+            {
+              "edit": "detail",
+              "alpha": [3.0, 1.0],
+              "residual": null,
+              "channels": "luminance",
+              "time": 1.0,
+              "bandwidth": 20.0,
+              "spatial_bandwidth": null,
+              "patch_size": 5,
+              "landmarks": 100,
+              "sampling": "kmeans"
+            }
+          ]
         }
         <BLANKLINE>
         """
-        lines = [f'  "{name}": {json.dumps(value)}' for name, value in asdict(self).items()]
-        return "{\n" + ",\n".join(lines) + "\n}\n"
+        return in_file([self.step.to_json("    ", complete=True)])
 
     @staticmethod
     def from_json(text: str, name: str) -> "Preset":
@@ -109,18 +101,19 @@ class Preset:
             name: what errors call it.
 
         Raises:
-            ValueError: if ``text`` is no JSON object, or an entry is missing, unknown or not of its kind.
+            ValueError: if ``text`` is no JSON object, or holds more than the sliders of a whole photograph.
         """
-        entries = parse_json(text, name, "make one with nlfilter-torch fit")
-        if not isinstance(entries, dict) or "alpha" not in entries:
-            raise ValueError(f"{name} is no preset: it has no entry alpha; make one with nlfilter-torch fit")
-        for entry, value in entries.items():
-            if entry not in ENTRIES:
-                raise ValueError(f"{name} must hold no other entries than {', '.join(ENTRIES)}, got {entry}; remove it")
-            wanted, is_valid = ENTRIES[entry]
-            if not is_valid(value):
-                raise ValueError(f"{entry} in {name} must be {wanted}, got {shown(value)}; correct it")
-        return Preset(**entries | {"alpha": tuple(map(float, entries["alpha"]))})
+        return _preset(Recipe.from_json(text, name, REMEDY), name)
+
+
+REMEDY = "make one with nlfilter-torch fit"
+
+
+def _preset(recipe: Recipe, name: str) -> Preset:
+    """What a recipe says about the details of a whole photograph."""
+    if [step.edit for step in recipe.steps] != ["detail"] or recipe.steps[0].strokes:
+        raise ValueError(f"{name} is no preset: it holds other steps than detail, or strokes; use nlfilter-torch apply")
+    return Preset(**{field: recipe.steps[0][field] for field in Preset.__dataclass_fields__})
 
 
 #: The presets that have a name. Chosen by eye on astronaut, chelsea, coffee and rocket of scikit-image.
@@ -158,75 +151,4 @@ def find_preset(name: str) -> Preset:
         >>> find_preset("soft-skin").alpha
         (0.1, 0.4, 1.0, 1.0)
     """
-    spoken = name.lower().replace("-", " ").replace("_", " ")
-    if spoken in PRESETS:
-        return PRESETS[spoken]
-    path = Path(name)
-    if not path.is_file():
-        raise ValueError(
-            f"{name} does not exist or is no file, nor is it one of the presets {', '.join(PRESETS)}; "
-            "make a file with nlfilter-torch fit"
-        )
-    return Preset.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
-
-
-def parse_json(text: str, name: str, remedy: str) -> Any:
-    """What the text of the file ``name`` holds.
-
-    Raises:
-        ValueError: if it is not JSON, or nested deeper than Python can follow.
-    """
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
-        raise ValueError(f"{name} is no preset: {reason}; {remedy}") from error
-
-
-def shown(value: Any) -> str:
-    """A value of JSON for a message, however long or deeply nested it is.
-
-    >>> shown({"a": None}), shown([0] * 100)
-    ('{"a": null}', '[0, 0, 0, 0, 0, 0, ...]')
-    """
-    short = reprlib.repr(value)
-    try:
-        text = json.dumps(value)
-    except RecursionError:
-        return short
-    return text if len(text) <= 80 else short
-
-
-def is_within(value: Any, low: float, high: float) -> bool:
-    """Whether a value of JSON is a number in a range of finite ends; NaN is not."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
-
-
-def is_count(value: Any, most: int) -> bool:
-    """Whether a value of JSON is a whole number from 1 to ``most``."""
-    return isinstance(value, int) and is_within(value, 1, most)
-
-
-def is_sliders(value: Any) -> bool:
-    """Whether a value of JSON is a list of sliders."""
-    return isinstance(value, list) and 2 <= len(value) <= MAX_SLIDERS and all(is_within(v, *GAINS) for v in value)
-
-
-# What each entry must be, in words and as a test.
-ENTRIES: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "alpha": (
-        f"a list of 2 to {MAX_SLIDERS} numbers, none beyond {GAINS[1]:.0f}",
-        is_sliders,
-    ),
-    "bandwidth": (
-        f'a positive number of grey levels, from {BANDWIDTHS[0]:g} to {BANDWIDTHS[1]:.0f}, or "auto"',
-        lambda v: v == "auto" or is_within(v, *BANDWIDTHS),
-    ),
-    "spatial_bandwidth": (
-        f"a positive number of pixels, from {DISTANCES[0]:g} to {DISTANCES[1]:.0f}, or null",
-        lambda v: v is None or is_within(v, *DISTANCES),
-    ),
-    "patch_size": (f"an odd number from 1 to {MAX_PATCH}", lambda v: is_count(v, MAX_PATCH) and v % 2 == 1),
-    "landmarks": (f"a whole number from 1 to {MAX_LANDMARKS}", lambda v: is_count(v, MAX_LANDMARKS)),
-    "sampling": ('"kmeans", "uniform" or "random"', lambda v: v in ("kmeans", "uniform", "random")),
-}
+    return _preset(Recipe.find(name), name)

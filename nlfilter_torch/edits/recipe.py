@@ -1,53 +1,86 @@
-"""A whole edit as a small JSON file: sliders, strokes and the settings of every step, for any photograph.
+"""A whole edit as a small JSON file: steps in their order, each with its parameters and strokes, for any photograph.
 
-What the editor saves and ``nlfilter-torch apply`` takes. Sizes are shares of the picture and strokes lie where they lie
-in it, so that an edit that was made on a preview holds for the photograph. The steps come in the order of
-:attr:`Recipe.steps`, each from what the one before made, and those that change nothing are left out.
+What the editor saves and ``nlfilter-torch apply`` and ``batch`` take::
+
+    {
+      "version": 1,
+      "steps": [
+        {"edit": "denoise"},
+        {"edit": "detail", "alpha": [2.0, 2.0, 2.0, 1.0]}
+      ]
+    }
+
+Entries that are left out have the defaults of the command of that name. Strokes lie where they lie in the picture, so
+that an edit that was made on a preview holds for the photograph. Imports no torch until it is applied.
 """
 
-import json
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+from nlfilter_torch.edits.declaration import parse_json, shown
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.steps import Step
 
-from nlfilter_torch.edits.presets import Preset, find_preset, parse_json, shown
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import NONE, Abstract, Colorize, Defocus, Detail, Recolor, Step
+if TYPE_CHECKING:
+    from torch import Tensor
+
+VERSION = 1
+ORDER = tuple(EDITS)  # in which the editor adds steps
+FORMER_ORDER = ("detail", "colorize", "recolor", "defocus", "abstract")  # of files without a list of steps
+REMEDY = "save one in the editor"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """An edit of a photograph, step by step; as it comes, it changes nothing."""
+    """An edit of a photograph, step by step; without steps it changes nothing.
 
-    detail: Detail = field(default_factory=Detail)
-    colorize: Colorize = field(default_factory=Colorize)
-    recolor: Recolor = field(default_factory=Recolor)
-    defocus: Defocus = field(default_factory=Defocus)
-    abstract: Abstract = field(default_factory=Abstract)
+    Attributes:
+        steps: each edits what the one before made; of any kind, in any order, and any number of times.
+    """
 
-    @property
-    def steps(self) -> tuple[Step, ...]:
-        """All steps, in their order."""
-        return (self.detail, self.colorize, self.recolor, self.defocus, self.abstract)
+    steps: tuple[Step, ...] = ()
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all steps, in their order."""
-        return tuple(STEPS)
+    def acting(self) -> tuple[Step, ...]:
+        """The steps that change anything."""
+        return tuple(step for step in self.steps if step.changes())
+
+    def last(self, edit: str) -> Step:
+        """The last step of an edit, or one that changes nothing if there is none."""
+        return next((step for step in reversed(self.steps) if step.edit == edit), Step.idle(edit))
+
+    def with_last(self, step: Step) -> "Recipe":
+        """The edit with another last step of its kind; the first of its kind is put where it usually comes."""
+        places = [i for i, other in enumerate(self.steps) if other.edit == step.edit]
+        if places:
+            return Recipe((*self.steps[: places[-1]], step, *self.steps[places[-1] + 1 :]))
+        rank = ORDER.index(step.edit)
+        place = max((i + 1 for i, other in enumerate(self.steps) if ORDER.index(other.edit) < rank), default=0)
+        return Recipe((*self.steps[:place], step, *self.steps[place:]))
 
     @property
     def landmarks(self) -> int:
         """The largest number of landmarks of any step, at least the default, for an estimate of the memory needed."""
-        return max(self.detail.landmarks, 200 if self.abstract.changes() else 100)
+        return max([100, *(step["landmarks"] for step in self.acting)])
+
+    @property
+    def patch_size(self) -> int:
+        """The largest patches of any step, at least the default, likewise."""
+        return max([5, *(step["patch_size"] for step in self.acting)])
 
     @property
     def factors(self) -> int:
         """Arrays as large as a factor that the hungriest step holds at once; patches in colour count as one."""
-        return 2 if self.detail.has_region() else 1
+        return 2 if any(step.has_region() for step in self.acting) else 1
 
-    def apply(self, image: Tensor) -> Tensor:
+    @property
+    def gives_colour(self) -> bool:
+        """Whether a grey photograph becomes one in colour."""
+        return any(step.declared.coloured for step in self.acting)
+
+    def apply(self, image: "Tensor") -> "Tensor":
         """Edit a photograph.
 
         Args:
@@ -63,112 +96,109 @@ class Recipe:
         Example:
             >>> import torch
             >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
-            >>> recipe = Recipe(Detail(alpha=(3.0, 1.0), inside=(1.0, 1.0)), abstract=Abstract(edges=1.0))
+            >>> recipe = Recipe((Step("detail", alpha=(3.0, 1.0)), Step("tone"), Step("detail", alpha=(0.5, 1.0))))
             >>> recipe.apply(image).shape, Recipe().apply(image) is image
             (torch.Size([1, 3, 24, 24]), True)
         """
+        from nlfilter_torch.edits.applying import apply_step
+
         result = image
-        for step in self.steps:
-            if step.changes():
-                result = step.apply(image if result is image else result.clamp(0, 1))
+        for step in self.acting:
+            result = apply_step(step, image if result is image else result.clamp(0, 1))
         return result
 
     def to_json(self) -> str:
-        """The edit as text; a plain preset where that says it all, so that ``detail --preset`` takes it too.
+        """The edit as text, without steps that change nothing.
 
-        >>> print(Recipe(defocus=Defocus((Stroke(((0.5, 0.5),), 0.1, "in"),))).to_json())
+        >>> print(Recipe((Step("tone"), Step("detail", alpha=(2.0, 1.0)))).to_json())
         {
-          "defocus": {
-            "strokes": [
-              {"paint": "in", "radius": 0.1, "points": [[0.5, 0.5]]}
-            ],
-            "radius": 2.5
-          }
+          "version": 1,
+          "steps": [
+            {
+              "edit": "tone",
+              "contrast": 1.2
+            },
+            {
+              "edit": "detail",
+              "alpha": [2.0, 1.0]
+            }
+          ]
         }
         <BLANKLINE>
         """
-        steps = {name: step for name, step in zip(STEPS, self.steps, strict=True) if step.changes()}
-        if set(steps) <= {"detail"} and not self.detail.strokes:
-            return self.detail.preset.to_json()
-        blocks = [f'  "{name}": {{\n{_lines(step)}\n  }}' for name, step in steps.items()]
-        return "{\n" + ",\n".join(blocks) + "\n}\n"
+        return in_file(step.to_json("    ") for step in self.acting)
 
     @staticmethod
-    def from_json(text: str, name: str) -> "Recipe":
-        """Read what :meth:`to_json` or :meth:`Preset.to_json` wrote; what is left out has its default.
+    def from_json(text: str, name: str, remedy: str = REMEDY) -> "Recipe":
+        """Read what :meth:`to_json` wrote, or a file from before there was a list of steps.
 
         Args:
             text: the file's content.
             name: what errors call it.
+            remedy: end of the sentence for files that hold something else.
 
         Raises:
             ValueError: if ``text`` is no JSON object, or an entry is unknown or not of its kind.
         """
-        entries = parse_json(text, name, "save one in the editor")
+        entries = parse_json(text, name, remedy)
         if isinstance(entries, dict) and "alpha" in entries:
-            return Recipe(Detail.of(Preset.from_json(text, name)))
-        if not isinstance(entries, dict) or not set(entries) <= set(STEPS):
-            raise ValueError(
-                f"{name} is no preset: it must hold steps out of {', '.join(STEPS)}; save one in the editor"
-            )
-        return Recipe(**{step: _read(STEPS[step], value, f"{step} in {name}") for step, value in entries.items()})
+            return Recipe((Step.from_entries("detail", entries, name, bare=True, before=True),))
+        if isinstance(entries, dict) and "steps" in entries:
+            return Recipe(tuple(_read_steps(entries, name)))
+        if not isinstance(entries, dict) or not set(entries) <= set(FORMER_ORDER):
+            raise ValueError(f"{name} is no preset: it must hold a list of steps; {remedy}")
+        former = [edit for edit in FORMER_ORDER if edit in entries]
+        return Recipe(
+            tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", before=True) for edit in former)
+        )
 
     @staticmethod
     def find(name: str) -> "Recipe":
-        """The preset of that name, or the edit in the file at that path.
+        """The preset of that name (``soft-skin`` is ``soft skin``), or the edit in the file at that path.
 
         Raises:
             ValueError: if there is neither, or the file holds none.
         """
+        from nlfilter_torch.edits.presets import PRESETS
+
+        spoken = name.lower().replace("-", " ").replace("_", " ")
+        if spoken in PRESETS:
+            return Recipe((PRESETS[spoken].step,))
         path = Path(name)
-        if path.is_file():
-            return Recipe.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
-        return Recipe(Detail.of(find_preset(name)))
+        if not path.is_file():
+            raise ValueError(
+                f"{name} does not exist or is no file, nor is it one of the presets {', '.join(PRESETS)}; "
+                "make a file with nlfilter-torch fit"
+            )
+        return Recipe.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
 
 
-STEPS: dict[str, Any] = {
-    "detail": Detail,
-    "colorize": Colorize,
-    "recolor": Recolor,
-    "defocus": Defocus,
-    "abstract": Abstract,
-}
+def in_file(steps: Iterable[str]) -> str:
+    """The text of a file of steps that are text already."""
+    text = ",\n".join(steps)
+    listed = f"[\n{text}\n  ]" if text else "[]"
+    return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
 
 
-def _lines(step: Any) -> str:
-    """The entries of a step, a line for each, and a line for each stroke."""
-    lines = []
-    for entry in fields(step):
-        value = getattr(step, entry.name)
-        if entry.name == "strokes":
-            strokes = ",\n".join(f"      {json.dumps(stroke.entries())}" for stroke in value)
-            lines.append(f'    "strokes": [\n{strokes}\n    ]' if value else '    "strokes": []')
-        else:
-            lines.append(f'    "{entry.name}": {json.dumps(value)}')
-    return ",\n".join(lines)
-
-
-def _read(kind: Any, entries: Any, place: str) -> Any:
-    """A step from what JSON holds."""
-    if not isinstance(entries, dict):
-        raise ValueError(f"{place} must hold entries in braces, got {shown(entries)}; correct it")
-    values: dict[str, Any] = {}
-    for entry, value in entries.items():
-        if entry == "strokes" and kind.PAINTS:
-            if not isinstance(value, list):
-                raise ValueError(f"strokes of {place} must be a list, got {shown(value)}; correct them")
-            values[entry] = tuple(Stroke.from_entries(stroke, kind.PAINTS, place) for stroke in value)
-            continue
-        if entry not in kind.VALID:
-            known = [*kind.VALID, *(["strokes"] if kind.PAINTS else [])]
-            raise ValueError(f"{place} must hold no other entries than {', '.join(known)}, got {entry}; remove it")
-        wanted, is_valid = kind.VALID[entry]
-        if not is_valid(value):
-            raise ValueError(f"{entry} of {place} must be {wanted}, got {shown(value)}; correct it")
-        values[entry] = tuple(map(float, value)) if isinstance(value, list) else value
-    if kind is Detail:
-        values.setdefault("alpha", NONE)
-        values.setdefault("inside", (1.0,) * len(values["alpha"]))
-        if len(values["inside"]) != len(values["alpha"]):
-            raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
-    return kind(**values)
+def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
+    """The steps of a file."""
+    unknown = entries.keys() - {"version", "steps"}
+    if unknown:
+        raise ValueError(f"{name} must hold no other entries than version, steps, got {min(unknown)}; remove it")
+    if entries.get("version") != VERSION:
+        raise ValueError(
+            f"version in {name} must be {VERSION}, got {shown(entries.get('version'))}; "
+            "newer files need a newer nlfilter-torch"
+        )
+    if not isinstance(entries["steps"], list):
+        raise ValueError(f"steps in {name} must be a list, got {shown(entries['steps'])}; correct it")
+    steps = []
+    for number, step in enumerate(entries["steps"], 1):
+        if not isinstance(step, dict) or step.get("edit") not in ORDER:
+            raise ValueError(
+                f"step {number} in {name} must hold an entry edit, one of {', '.join(ORDER)}, got {shown(step)}; "
+                "correct it"
+            )
+        rest = {entry: value for entry, value in step.items() if entry != "edit"}
+        steps.append(Step.from_entries(step["edit"], rest, f"{step['edit']}, step {number} in {name}"))
+    return steps

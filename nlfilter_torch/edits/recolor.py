@@ -8,10 +8,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_share, check_unit_range
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_unit_range
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.components import Spots, find_spots
+from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.spectrum import Spectrum
@@ -21,7 +22,6 @@ FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FU
 DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: two colours on one thing are no error
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
-PATCH_SIZE = 3
 
 CONVERTED = 8192  # pixels that one thread converts at once
 VECTOR = 64  # a multiple of the floats that a processor works on at once
@@ -34,9 +34,9 @@ def recolor(
     stroke_mask: Tensor,
     *,
     keep: Tensor | None = None,
-    reach: float | Tensor = 0.8,
-    photometric_bandwidth: float | Tensor = 0.12,
-    patch_size: int = PATCH_SIZE,
+    reach: float | Tensor = RECOLOR.defaults["reach"],
+    photometric_bandwidth: float | Tensor = RECOLOR.defaults["photometric_bandwidth"],
+    patch_size: int = RECOLOR.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
     """Give the colour of strokes to everything that looks like the spots they are painted on.
@@ -85,13 +85,13 @@ class Recoloring:
 
     Args:
         image: of :func:`recolor`.
-        patch_size: likewise.
-        **options: of :func:`nonlocal_operator`.
+        **options: of its filter; those left out are its defaults.
     """
 
-    def __init__(self, image: Tensor, *, patch_size: int = PATCH_SIZE, **options: Any) -> None:
+    def __init__(self, image: Tensor, **options: Any) -> None:
         self._image = image
-        self._options = {**options, "patch_size": patch_size}
+        defaults = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")}
+        self._options = {**defaults, **options}
 
     @cached_property
     def _spectrum(self) -> Spectrum:
@@ -101,7 +101,12 @@ class Recoloring:
 
     @full_precision
     def __call__(
-        self, strokes: Tensor, stroke_mask: Tensor, *, keep: Tensor | None = None, reach: float | Tensor = 0.8
+        self,
+        strokes: Tensor,
+        stroke_mask: Tensor,
+        *,
+        keep: Tensor | None = None,
+        reach: float | Tensor = RECOLOR.defaults["reach"],
     ) -> Tensor:
         """The image (B, 3, H, W) under strokes; arguments and errors are those of :func:`recolor`."""
         image = self._image
@@ -113,7 +118,7 @@ class Recoloring:
         check_painted(stroke_mask)
         if keep is not None:
             check_unit_range(keep, "keep")
-        check_share(reach, "reach", batch, below=True)
+        RECOLOR["reach"].check_argument(reach, batch)
 
         pixels = image.to(working_dtype(image))
         painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.edits.presets import is_within, shown
+from nlfilter_torch.edits.declaration import is_within, shown
 
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 SMALLEST = 0.75  # pixels; the least radius, at which a dot still covers a pixel
@@ -69,16 +69,6 @@ class Stroke:
 
 def _is_point(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(is_within(v, -2, 2) for v in value)
-
-
-def painted(strokes: Iterable[Stroke], word: str) -> tuple[Stroke, ...]:
-    """Those of the strokes whose paint is that word."""
-    return tuple(stroke for stroke in strokes if stroke.paint == word)
-
-
-def coloured(strokes: Iterable[Stroke]) -> tuple[Stroke, ...]:
-    """Those whose paint is a colour."""
-    return tuple(stroke for stroke in strokes if stroke.paint.startswith("#"))
 
 
 def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:

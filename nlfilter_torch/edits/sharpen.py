@@ -5,24 +5,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_number, check_photograph, check_reach, check_weight
+from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.denoise import soften
+from nlfilter_torch.edits.parameters import SHARPEN
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-
-BANDWIDTH = 10 / 255  # of softened patches
 
 
 @full_precision
 def sharpen(
     image: Tensor,
     *,
-    amount: float | Tensor = 4.0,
-    guide_blur: float = 1.2,
-    photometric_bandwidth: float | Tensor | str = BANDWIDTH,
+    amount: float | Tensor = SHARPEN.defaults["amount"],
+    guide_blur: float = SHARPEN.defaults["guide_blur"],
+    photometric_bandwidth: float | Tensor | str = SHARPEN.defaults["photometric_bandwidth"],
     **options: Any,
 ) -> Tensor:
     """Sharpen a photograph, noisy or not.
@@ -52,10 +51,8 @@ def sharpen(
         (torch.Size([1, 3, 32, 32]), True)
     """
     check_photograph(image, "image")
-    check_weight(amount, "amount", image.shape[0])
-    check_number(guide_blur, "guide_blur")
-    if not guide_blur >= 0:
-        raise ValueError(f"guide_blur must be at least 0, got {guide_blur}; 0 leaves the guide as it is")
+    SHARPEN["amount"].check_argument(amount, image.shape[0])
+    SHARPEN["guide_blur"].check_argument(guide_blur)
     check_reach(guide_blur, "guide_blur", (image.shape[-2], image.shape[-1]))
     pixels = image.to(working_dtype(image))
     guide = reduce_channels(pixels, "luminance")

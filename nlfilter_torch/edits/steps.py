@@ -1,297 +1,174 @@
-"""The steps of a whole edit, as an editor has them: sliders, strokes and settings, all of them relative to the picture.
+"""A step of a whole edit: the name of an edit, its parameters and strokes, all of them relative to the picture.
 
-Each is a value: nothing in it depends on the photograph, so that one that was made on a preview holds for the original.
+It is a value: nothing in it depends on the photograph, so that one that was made on a preview holds for the original.
+Imports no torch.
 """
 
-from abc import abstractmethod
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
-from typing import Any, ClassVar, Protocol
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+from nlfilter_torch.edits.declaration import Edit, Parameter, is_within, shown
+from nlfilter_torch.edits.parameters import EDITS
 
-from nlfilter_torch.edits.abstract import Abstraction
-from nlfilter_torch.edits.colorize import Colorization
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.defocus import Defocusing
-from nlfilter_torch.edits.detail import colour_masks
-from nlfilter_torch.edits.presets import ENTRIES, Preset, is_count, is_sliders, is_within
-from nlfilter_torch.edits.recolor import Recoloring
-from nlfilter_torch.edits.scribbles import Stroke, coloured, mask_of, paint, painted
-from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import reduce_channels
-
-Valid = tuple[str, Callable[[Any], bool]]  # what an entry must be, in words and as a test
+if TYPE_CHECKING:
+    from nlfilter_torch.edits.scribbles import Stroke
 
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
+# Files written before there was a list of steps left out what changes nothing.
+BEFORE: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
 
 
-def seeded() -> torch.Generator:
-    """The randomness that the command line starts with."""
-    return torch.Generator().manual_seed(0)
-
-
-def _within(low: float, high: float) -> Valid:
-    return f"a number from {low:g} to {high:g}", lambda value: is_within(value, low, high)
-
-
-class Step(Protocol):
-    """One step of an edit."""
-
-    VALID: ClassVar[dict[str, Valid]]
-    PAINTS: ClassVar[tuple[str, ...]]
-
-    @property
-    def strokes(self) -> tuple[Stroke, ...]:
-        """What is painted for it."""
-        ...
-
-    def changes(self) -> bool:
-        """Whether it does anything."""
-        ...
-
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
-        ...
-
-
-class FilterStep(Step):
-    """A step whose filter serves any other of its kind as well, as long as they :meth:`share` it."""
-
-    def share(self) -> tuple[object, ...]:
-        """The settings, if any, that the filter depends on beside the image."""
-        return ()
-
-    @abstractmethod
-    def hold(self, image: Tensor) -> Callable[[Any], Tensor]:
-        """What steps that share the filter make of an image (1, C, H, W); the first of them makes it."""
-
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
-        return self.hold(image)(self)
-
-
-@dataclass(frozen=True)
-class Detail:
-    """Detail sliders, and others inside what looks like the strokes.
+@dataclass(frozen=True, init=False)
+class Step:
+    """One step of an edit.
 
     Attributes:
-        alpha: sliders, fine to coarse, outside of the region, and everywhere if there is none.
-        inside: sliders inside the region, as many.
-        spread: how far the region reaches to what is less like the strokes.
-        strokes: painted ``in`` for the region's likes, ``out`` for what is to stay outside.
-        bandwidth: and what follows, as :class:`Preset` has them.
+        edit: its name, one of :data:`~nlfilter_torch.edits.parameters.EDITS`.
+        strokes: what is painted for it.
+        values: of the parameters that differ from their defaults, in the order of their declaration.
+
+    Example:
+        >>> Step("abstract", edges=1.0)["power"], Step("abstract", power=0.1).values
+        (0.1, ())
     """
 
-    alpha: tuple[float, ...] = NONE
-    inside: tuple[float, ...] = NONE
-    spread: float = 1.0
-    strokes: tuple[Stroke, ...] = ()
-    bandwidth: float | str = "auto"
-    spatial_bandwidth: float | None = None
-    patch_size: int = 5
-    landmarks: int = 100
-    sampling: str = "kmeans"
+    edit: str
+    strokes: tuple["Stroke", ...]
+    values: tuple[tuple[str, Any], ...]
 
-    PAINTS: ClassVar[tuple[str, ...]] = ("in", "out")
-    VALID: ClassVar[dict[str, Valid]] = ENTRIES | {
-        "inside": (
-            "a list of as many numbers as alpha",
-            is_sliders,
-        ),
-        "spread": _within(0.05, 20),
-    }
+    def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Any) -> None:
+        """Parameters that are left out have their defaults."""
+        declared = EDITS[edit]
+        unknown = values.keys() - {parameter.name for parameter in declared}
+        if unknown:
+            raise TypeError(f"{edit} has no parameter {min(unknown)}; it has {', '.join(p.name for p in declared)}")
+        given = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
+        for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(given))):
+            object.__setattr__(self, name, value)
 
     @staticmethod
-    def of(preset: Preset) -> "Detail":
-        """The sliders of a preset, for the whole photograph."""
-        return Detail(**asdict(preset), inside=(1.0,) * len(preset.alpha))
+    def idle(edit: str) -> "Step":
+        """The step that changes nothing, from which the editor starts."""
+        values: dict[str, Any] = {
+            p.name: NONE if p.kind == "sliders" else p.idle for p in EDITS[edit] if p.idle is not ...
+        }
+        return Step(edit, **values)
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of a parameter."""
+        return dict(self.values).get(name, EDITS[self.edit][name].default)
+
+    def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Any) -> "Step":
+        """The step with other strokes or parameters."""
+        return Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
 
     @property
-    def preset(self) -> Preset:
-        """The sliders outside of the region, and the filter."""
-        return Preset(**{f.name: getattr(self, f.name) for f in fields(Preset)})
+    def declared(self) -> Edit:
+        """What the edit is."""
+        return EDITS[self.edit]
+
+    def painted(self, word: str) -> tuple["Stroke", ...]:
+        """Its strokes that say a word; for ``colour``, those that are a colour."""
+        return tuple(s for s in self.strokes if s.paint == word or (word == "colour" and s.paint.startswith("#")))
+
+    @property
+    def sliders_inside(self) -> tuple[float, ...]:
+        """Sliders inside the region, as many as outside."""
+        inside: tuple[float, ...] | None = self["inside"]
+        return inside or (1.0,) * len(self["alpha"])
 
     def has_region(self) -> bool:
-        """Whether sliders of their own count somewhere."""
-        return bool(painted(self.strokes, "in"))
+        """Whether detail has sliders of their own somewhere."""
+        return self.edit == "detail" and bool(self.painted("in"))
 
     def changes(self) -> bool:
         """Whether it does anything."""
-        return any(a != 1 for a in (*self.alpha, *(self.inside if self.has_region() else ())))
-
-    def regions(self, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
-        """What is painted as in and as out, (1, 1, H, W); None for nothing out."""
-        inner, outer = (mask_of(painted(self.strokes, word), size) for word in ("in", "out"))
-        return inner, outer if bool(outer.any()) else None
-
-    def blend(self, layers: Tensor, mask: Tensor | None) -> Tensor:
-        """The layers (1, k+1, C, H, W) weighed by the sliders of every pixel; mask (1, 1, H, W)."""
-        outside = weigh_layers(layers, torch.tensor(self.alpha))
-        return outside if mask is None else torch.lerp(outside, weigh_layers(layers, torch.tensor(self.inside)), mask)
-
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]."""
-        if not self.has_region():
-            return self.preset.apply(image, generator=seeded())
-        inner, outer = self.regions((image.shape[-2], image.shape[-1]))
-        mask = colour_masks(
-            image,
-            inner,
-            negative=outer,
-            time=self.spread,
-            num_landmarks=self.landmarks,
-            spatial_bandwidth=self.spatial_bandwidth,
-            generator=seeded(),
+        if self.declared.needs:
+            return bool(self.painted(self.declared.words[0]))
+        acting = [p for p in self.declared if p.idle is not ...]
+        return any(not p.is_idle(self[p.name]) for p in acting) or (
+            self.has_region() and any(slider != 1 for slider in self.sliders_inside)
         )
-        options = self.preset.options()
-        operator = nonlocal_operator(reduce_channels(image, "luminance"), **options, generator=seeded())
-        order = len(self.alpha) - 1
-        return edit_luminance(image, lambda y: self.blend(detail_layers(operator, y, order=order), mask))
+
+    def in_units(self, size: tuple[int, int], stride: int = 1) -> list[tuple[Parameter, Any]]:
+        """Parameters and their values for an image of a size, see :meth:`Parameter.argument_of`."""
+        return [(p, p.argument_of(self[p.name], size, stride)) for p in self.declared]
+
+    def arguments(self, size: tuple[int, int], stride: int = 1) -> dict[str, Any]:
+        """Arguments of the edit's function for an image of a size."""
+        return {p.keyword: value for p, value in self.in_units(size, stride) if p.is_option}
+
+    def to_json(self, indent: str = "", *, complete: bool = False) -> str:
+        """The step as a JSON object, a line for each entry, and a line for each stroke.
+
+        Args:
+            indent: of all lines.
+            complete: whether defaults are written, too, so that they can be changed by hand.
+        """
+        entries = [("edit", json.dumps(self.edit))]
+        for parameter in self.declared:
+            value = self[parameter.name]
+            acts = parameter.idle is not ... and not parameter.is_idle(value)
+            if value != parameter.default or acts or (complete and parameter.is_option):
+                entries.append((parameter.name, json.dumps(value)))
+        if self.strokes:
+            strokes = ",\n".join(f"{indent}    {json.dumps(stroke.entries())}" for stroke in self.strokes)
+            entries.append(("strokes", f"[\n{strokes}\n{indent}  ]"))
+        lines = ",\n".join(f'{indent}  "{name}": {value}' for name, value in entries)
+        return f"{indent}{{\n{lines}\n{indent}}}"
+
+    @staticmethod
+    def from_entries(edit: str, entries: Any, place: str, *, bare: bool = False, before: bool = False) -> "Step":
+        """Check what JSON holds.
+
+        Args:
+            edit: name of an edit.
+            entries: of the step.
+            place: what errors call it.
+            bare: whether the file holds nothing else; errors then name it only.
+            before: whether the file was written before there was a list of steps.
+
+        Raises:
+            ValueError: if an entry is unknown or not of its kind.
+        """
+        if not isinstance(entries, dict):
+            raise ValueError(f"{place} must hold entries in braces, got {shown(entries)}; correct it")
+        declared, values = EDITS[edit], dict(BEFORE.get(edit, {})) if before else {}
+        strokes: tuple[Stroke, ...] = ()
+        for entry, value in entries.items():
+            if entry == "strokes" and declared.brushes:
+                strokes = _read_strokes(value, declared, place)
+                continue
+            found = _find(declared, entry)
+            if found is None:
+                names = [*(p.name for p in declared), *(["strokes"] if declared.brushes else [])]
+                raise ValueError(f"{place} must hold no other entries than {', '.join(names)}, got {entry}; remove it")
+            parameter, factor = found
+            converted = value * factor if factor != 1 and is_within(value, -1e300, 1e300) else value
+            if not parameter.is_valid(converted):
+                where = f"{'in' if bare else 'of'} {place}"
+                raise ValueError(f"{entry} {where} must be {parameter.wanted}, got {shown(value)}; correct it")
+            values[parameter.name] = tuple(map(float, converted)) if isinstance(converted, list) else converted
+        step = Step(edit, strokes, **values)
+        if edit == "detail" and len(step.sliders_inside) != len(step["alpha"]):
+            raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
+        return step
 
 
-@dataclass(frozen=True)
-class Colorize(FilterStep):
-    """Colours for a grey photograph; a coloured one is taken for grey.
-
-    Attributes:
-        strokes: of colour.
-        strength: how much colour goes to what resembles no stroke, from 0 to 1.
-    """
-
-    strokes: tuple[Stroke, ...] = ()
-    strength: float = 1.0
-
-    PAINTS: ClassVar[tuple[str, ...]] = ("colour",)
-    VALID: ClassVar[dict[str, Valid]] = {"strength": _within(0, 1)}
-
-    def changes(self) -> bool:
-        """Whether it does anything."""
-        return bool(self.strokes)
-
-    def hold(self, image: Tensor, *, both: bool = True) -> Callable[["Colorize"], Tensor]:
-        """Colours from any strokes for the image; its two filters are there together, or one after the other."""
-        held = Colorization(reduce_channels(image, "luminance"), generator=seeded(), hold=both)
-        size = (image.shape[-2], image.shape[-1])
-        return lambda step: held(*paint(step.strokes, size), strength=step.strength)
-
-    def apply(self, image: Tensor) -> Tensor:
-        """The edited image, from (1, C, H, W) in [0, 1]; in the memory of one filter."""
-        return self.hold(image, both=False)(self)
+def _find(declared: Edit, entry: str) -> tuple[Parameter, float] | None:
+    """The parameter that an entry is, and what its value is multiplied by."""
+    for parameter in declared:
+        factors: Mapping[str, float] = {parameter.name: 1.0, **dict(parameter.former)}
+        if entry in factors:
+            return parameter, factors[entry]
+    return None
 
 
-@dataclass(frozen=True)
-class Recolor(FilterStep):
-    """New colours for what looks like the strokes.
+def _read_strokes(value: Any, declared: Edit, place: str) -> tuple["Stroke", ...]:
+    from nlfilter_torch.edits.scribbles import Stroke
 
-    Attributes:
-        strokes: of colour, or painted ``keep``: their likes stay as they are.
-        reach: how far a colour spreads from what is alike to what is less so, from 0 to 0.999.
-        tolerance: how different two colours may be and still count as alike, in units of CIE Lab.
-    """
-
-    strokes: tuple[Stroke, ...] = ()
-    reach: float = 0.8
-    tolerance: float = 12.0
-
-    PAINTS: ClassVar[tuple[str, ...]] = ("colour", "keep")
-    VALID: ClassVar[dict[str, Valid]] = {"reach": _within(0, 0.999), "tolerance": _within(1, 100)}
-
-    def changes(self) -> bool:
-        """Whether it does anything."""
-        return bool(coloured(self.strokes))
-
-    def share(self) -> tuple[object, ...]:
-        """The tolerance."""
-        return (self.tolerance,)
-
-    def hold(self, image: Tensor) -> Callable[["Recolor"], Tensor]:
-        """The image under any strokes."""
-        if image.shape[1] != 3:
-            raise ValueError("recolor needs a colour photograph, got a grey one; use colorize, which colours grey ones")
-        held = Recoloring(image, photometric_bandwidth=self.tolerance / 100, generator=seeded())
-        size = (image.shape[-2], image.shape[-1])
-
-        def edit(step: Recolor) -> Tensor:
-            keep = mask_of(painted(step.strokes, "keep"), size)
-            strokes = paint(coloured(step.strokes), size)
-            return held(*strokes, keep=keep if bool(keep.any()) else None, reach=step.reach)
-
-        return edit
-
-
-@dataclass(frozen=True)
-class Defocus(FilterStep):
-    """A blur of all but what looks like the strokes, and is near them.
-
-    Attributes:
-        strokes: painted ``in`` on what stays sharp.
-        radius: of the strongest blur, in hundredths of the short side.
-    """
-
-    strokes: tuple[Stroke, ...] = ()
-    radius: float = 2.5
-
-    PAINTS: ClassVar[tuple[str, ...]] = ("in",)
-    VALID: ClassVar[dict[str, Valid]] = {"radius": _within(0.1, 20)}
-
-    def changes(self) -> bool:
-        """Whether it does anything."""
-        return bool(self.strokes)
-
-    def hold(self, image: Tensor) -> Callable[["Defocus"], Tensor]:
-        """The image with any strokes in focus."""
-        held = Defocusing(image, generator=seeded())
-        size = (image.shape[-2], image.shape[-1])
-        focus = lru_cache(1)(lambda strokes: held.focus(mask_of(strokes, size)))
-        return lambda step: held.blur(focus(step.strokes), step.radius / 100 * min(size))
-
-
-@dataclass(frozen=True)
-class Abstract(FilterStep):
-    """A painting of the photograph: flat areas, lines along edges, few tones.
-
-    Attributes:
-        power: how much detail goes: 0 none, 0.1 all but outlines.
-        edges: darkness of lines, from 0 to 1.
-        width: of lines, in thousandths of the short side.
-        tones: to which brightness is reduced, or None.
-    """
-
-    power: float = 0.0
-    edges: float = 0.0
-    width: float = 2.0
-    tones: int | None = None
-
-    PAINTS: ClassVar[tuple[str, ...]] = ()
-    VALID: ClassVar[dict[str, Valid]] = {
-        "power": _within(0, 10),
-        "edges": _within(0, 1),
-        "width": _within(0.1, 20),
-        "tones": (
-            "a whole number from 2 to 64, or null",
-            lambda v: v is None or (is_count(v, 64) and v >= 2),
-        ),
-    }
-
-    @property
-    def strokes(self) -> tuple[Stroke, ...]:
-        """None: it holds for the whole photograph."""
-        return ()
-
-    def changes(self) -> bool:
-        """Whether it does anything."""
-        return self.power > 0 or self.edges > 0 or self.tones is not None
-
-    def hold(self, image: Tensor) -> Callable[["Abstract"], Tensor]:
-        """A painting of the image, of any kind."""
-        held, short = Abstraction(image, generator=seeded()), min(image.shape[-2:])
-
-        def edit(step: Abstract) -> Tensor:
-            width = max(step.width / 1000 * short, 0.3)
-            return held(power=step.power, edges=step.edges, edge_width=width, tones=step.tones)
-
-        return edit
+    if not isinstance(value, list):
+        raise ValueError(f"strokes of {place} must be a list, got {shown(value)}; correct them")
+    return tuple(Stroke.from_entries(stroke, declared.words, place) for stroke in value)

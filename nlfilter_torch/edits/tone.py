@@ -5,9 +5,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_order, check_photograph, check_weight
+from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.parameters import TONE
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -17,8 +18,8 @@ from nlfilter_torch.operator.features import reduce_channels
 def adjust_tone(
     image: Tensor,
     *,
-    contrast: float | Tensor = 1.0,
-    clarity: float | Tensor = 1.0,
+    contrast: float | Tensor = TONE["contrast"].idle,
+    clarity: float | Tensor = TONE["clarity"].idle,
     order: int = 3,
     **options: Any,
 ) -> Tensor:
@@ -49,8 +50,8 @@ def adjust_tone(
     """
     check_photograph(image, "image")
     check_order(order)
-    check_weight(contrast, "contrast", image.shape[0])
-    check_weight(clarity, "clarity", image.shape[0])
+    TONE["contrast"].check_argument(contrast, image.shape[0])
+    TONE["clarity"].check_argument(clarity, image.shape[0])
     operator = nonlocal_operator(reduce_channels(image, "luminance"), **options)
 
     def slider(value: float | Tensor) -> Tensor:

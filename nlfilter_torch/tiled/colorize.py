@@ -7,10 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_choice, check_count, check_patch_size, check_positive, check_share
+from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_share
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colorize import FAR, LOCALITY, NEAR, Stage
+from nlfilter_torch.edits.colorize import FAR, NEAR, Stage
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
+from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.filtering.scribbles import FittedStrokes, fit_strokes
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel
@@ -38,11 +39,11 @@ def stream_colorize(
     stroke_mask: RowSource | None = None,
     *,
     method: Literal["regression"] = "regression",
-    strength: float = 1.0,
-    photometric_bandwidth: float = 40 / 255,
+    strength: float = COLORIZE.defaults["strength"],
+    photometric_bandwidth: float = COLORIZE.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | None = None,
-    patch_size: int = 5,
-    num_landmarks: int = 100,
+    patch_size: int = COLORIZE.defaults["patch_size"],
+    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     generator: torch.Generator | None = None,
     statistics: Statistics = "sample",
     sample: int = SAMPLE,
@@ -115,11 +116,11 @@ def colorize_rows(
     stroke_mask: RowSource | None = None,
     *,
     method: str = "regression",
-    strength: float = 1.0,
-    photometric_bandwidth: float = 40 / 255,
+    strength: float = COLORIZE.defaults["strength"],
+    photometric_bandwidth: float = COLORIZE.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | None = None,
-    patch_size: int = 5,
-    num_landmarks: int = 100,
+    patch_size: int = COLORIZE.defaults["patch_size"],
+    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     generator: torch.Generator | None = None,
     names: tuple[str, str] = ("source", "strokes"),
 ) -> Rows:
@@ -127,7 +128,7 @@ def colorize_rows(
 
     ``names`` are those of source and strokes in error messages.
     """
-    check_choice(method, "method", ("regression", "kmeans"))
+    COLORIZE["method"].check_argument(method)
     if method == "kmeans":
         raise ValueError(
             "method must be regression where a picture is worked out by rows, got kmeans, which takes all pixels at "
@@ -139,7 +140,7 @@ def colorize_rows(
     check_count(num_landmarks, "num_landmarks")
     picture = Picture(source, names[0])
     guide = Guide(source, names[0], lambda colours: reduce_channels(colours, "luminance"))
-    bandwidth = nearby(spatial_bandwidth, LOCALITY, guide.size)
+    bandwidth = nearby(spatial_bandwidth, COLORIZE["spatial_bandwidth"].share, guide.size)
     check_positive(bandwidth, "spatial_bandwidth")
     painted = read_strokes(guide, strokes, stroke_mask, passes, name=names[1])
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha, check_choice, check_count, check_positive
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
 from nlfilter_torch.filtering.fitted import FittedFilter
 from nlfilter_torch.operator.features import reduce_channels
@@ -26,7 +27,7 @@ def stream_detail(
     *,
     negative: RowSource | None = None,
     residual: float | None = None,
-    time: float = 1.0,
+    time: float = DETAIL.defaults["time"],
     width: float = 4.0,
     channels: Literal["luminance", "all"] = "luminance",
     statistics: Statistics = "sample",
@@ -104,7 +105,7 @@ def detail_rows(
     negative: RowSource | None = None,
     outside: Tensor | None = None,
     residual: float | None = None,
-    time: float = 1.0,
+    time: float = DETAIL.defaults["time"],
     width: float = 4.0,
     channels: Literal["luminance", "all"] = "luminance",
     name: str = "source",

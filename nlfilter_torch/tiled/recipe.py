@@ -5,15 +5,15 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nlfilter_torch.edits.applying import seeded
 from nlfilter_torch.edits.recipe import Recipe
-from nlfilter_torch.edits.scribbles import Stroke, coloured, mask_of, paint, painted
-from nlfilter_torch.edits.steps import Colorize, Detail, Recolor, Step, seeded
+from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.colorize import colorize_rows
 from nlfilter_torch.tiled.detail import detail_rows
 from nlfilter_torch.tiled.recolor import recolor_rows
@@ -83,11 +83,11 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
         OSError: if the folder has no room.
     """
     picture = Picture(source, name)
-    steps = [step for step in recipe.steps if step.changes()]
+    steps = recipe.acting
     for step in steps:
-        if type(step) not in BY_ROWS:
+        if step.edit not in ROWS:
             raise ValueError(
-                f"{type(step).__name__.lower()} takes the whole photograph at once, and {name} is too large for that; "
+                f"{step.edit} takes the whole photograph at once, and {name} is too large for that; "
                 "allow more memory, or leave that step out"
             )
     with ExitStack() as stack:
@@ -117,44 +117,25 @@ def _kept(rows: Rows, size: tuple[int, int], folder: Path) -> Iterator[RowSource
 
 
 def rows_of(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
-    """The rows of a picture after a step."""
-    return BY_ROWS[type(step)](step, passes, source, name)
-
-
-def _detail(step: Detail, passes: Passes, source: RowSource, name: str) -> Rows:
-    sliders: dict[str, Any] = {"alpha": torch.tensor(step.alpha)}
-    if step.has_region():
-        size = Picture(source).size
-        inner, outer = (CoveredRows(painted(step.strokes, word), size) for word in ("in", "out"))
-        sliders = {
-            "alpha": torch.tensor(step.inside),
-            "outside": torch.tensor(step.alpha),
-            "regions": inner,
-            "negative": outer if outer.any() else None,
-            "time": step.spread,
-        }
-    return detail_rows(passes, source, **sliders, name=name, generator=seeded(), **step.preset.options())
-
-
-def _colorize(step: Colorize, passes: Passes, source: RowSource, name: str) -> Rows:
-    strokes = ColouredRows(step.strokes, Picture(source).size)
-    return colorize_rows(passes, source, strokes, strength=step.strength, generator=seeded(), names=(name, "strokes"))
-
-
-def _recolor(step: Recolor, passes: Passes, source: RowSource, name: str) -> Rows:
+    """The rows that a step makes of a picture."""
     size = Picture(source).size
-    keep = CoveredRows(painted(step.strokes, "keep"), size)
-    return recolor_rows(
-        passes,
-        source,
-        ColouredRows(coloured(step.strokes), size),
-        keep=keep if keep.any() else None,
-        reach=step.reach,
-        photometric_bandwidth=step.tolerance / 100,
-        generator=seeded(),
-        names=(name, "strokes"),
-    )
+    arguments = step.arguments(size) | {"generator": seeded()}
+    if step.edit != "detail":
+        arguments |= {"strokes": ColouredRows(step.painted("colour"), size), "names": (name, "strokes")}
+        keep = CoveredRows(step.painted("keep"), size)
+        arguments |= {"keep": keep} if keep.any() else {}
+        return ROWS[step.edit](passes, source, **arguments)
+    arguments |= {"alpha": torch.tensor(step["alpha"]), "name": name}
+    if step.has_region():
+        outer = CoveredRows(step.painted("out"), size)
+        arguments |= {
+            "alpha": torch.tensor(step.sliders_inside),
+            "outside": torch.tensor(step["alpha"]),
+            "regions": CoveredRows(step.painted("in"), size),
+            "negative": outer if outer.any() else None,
+        }
+    return ROWS[step.edit](passes, source, **arguments)
 
 
-# The other steps need the whole picture at once.
-BY_ROWS: dict[type, Callable[..., Rows]] = {Detail: _detail, Colorize: _colorize, Recolor: _recolor}
+#: The edits that can be done by rows; the others take the whole picture at once.
+ROWS: dict[str, Callable[..., Rows]] = {"detail": detail_rows, "colorize": colorize_rows, "recolor": recolor_rows}

@@ -15,6 +15,7 @@ from nlfilter_torch.core.checks import check_count, check_patch_size, check_shar
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, split_luminance
 from nlfilter_torch.edits.components import Pixels, Spots, label_spots, spot_sums, unit_vectors
+from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.recolor import Dye, colour_guide, divide
 from nlfilter_torch.filtering.scribbles import walk_basis
 from nlfilter_torch.operator.kernel import Kernel
@@ -50,9 +51,9 @@ def stream_recolor(
     stroke_mask: RowSource | None = None,
     *,
     keep: RowSource | None = None,
-    reach: float = 0.8,
-    photometric_bandwidth: float = 0.12,
-    patch_size: int = 3,
+    reach: float = RECOLOR.defaults["reach"],
+    photometric_bandwidth: float = RECOLOR.defaults["photometric_bandwidth"],
+    patch_size: int = RECOLOR.defaults["patch_size"],
     statistics: Statistics = "sample",
     sample: int = SAMPLE,
     tile_rows: int | None = None,
@@ -122,9 +123,9 @@ def recolor_rows(
     stroke_mask: RowSource | None = None,
     *,
     keep: RowSource | None = None,
-    reach: float = 0.8,
-    photometric_bandwidth: float = 0.12,
-    patch_size: int = 3,
+    reach: float = RECOLOR.defaults["reach"],
+    photometric_bandwidth: float = RECOLOR.defaults["photometric_bandwidth"],
+    patch_size: int = RECOLOR.defaults["patch_size"],
     names: tuple[str, str] = ("source", "strokes"),
     **options: Any,
 ) -> Rows:

@@ -1,0 +1,180 @@
+"""A command for every edit: its options are made from the declaration of its parameters."""
+
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import typer
+
+from nlfilter_torch.cli import options
+from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
+
+TYPES = {"number": float, "count": int, "odd": int, "sliders": str}
+
+
+def plain_step(recipe: Recipe) -> Step | None:
+    """The only step of a recipe, if it is one that options of ``detail`` can say."""
+    step = recipe.steps[0] if len(recipe.steps) == 1 else None
+    return step if step is not None and step.edit == "detail" and not step.strokes else None
+
+
+def take_defaults(context: typer.Context, step: Step) -> None:
+    """Let the values of a step take the place of the options' defaults."""
+    context.default_map = {name: option_value(step.declared[name], value) for name, value in step.values}
+
+
+def _use_preset(context: typer.Context, name: str | None) -> str | None:
+    if name is not None:
+        step = plain_step(Recipe.find(name))
+        if step is None:
+            raise ValueError(
+                f"--preset must be a file with one step, of detail and without strokes, got {name}; "
+                "use nlfilter-torch apply, which takes any"
+            )
+        take_defaults(context, step)
+    return name
+
+
+PresetName = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|FILE",
+        callback=_use_preset,
+        is_eager=True,
+        help=f"One of {', '.join(PRESETS)} (`nlfilter-torch presets` describes them), or a file that "
+        "`nlfilter-torch fit` made, in place of the defaults here; options that are given count for more.",
+    ),
+]
+#: Options for what is painted or marked on the photograph, by the name of the edit.
+SCRIBBLES: dict[str, dict[str, Any]] = {
+    "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile},
+    "recolor": {"strokes": options.StrokesFile, "region": options.ColourRegions, "keep": options.Keeps},
+    "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions},
+    "defocus": {"region": options.Regions, "mask": options.MaskFile},
+}
+
+
+def option_value(parameter: Parameter, value: Any) -> Any:
+    """A value as its option gives it.
+
+    >>> option_value(EDITS["detail"]["alpha"], (3.0, 1.05)), option_value(EDITS["tone"]["bandwidth"], 20.0)
+    ('3,1.05', '20')
+    """
+    if parameter.kind == "sliders":
+        return ",".join(f"{slider:.9g}" for slider in value)
+    return f"{value:.9g}" if parameter.words and not isinstance(value, str) else value
+
+
+def option(parameter: Parameter) -> Any:
+    """The annotation of an option."""
+    kind: Any = Literal[parameter.choices] if parameter.choices else TYPES[parameter.kind]
+    limits: dict[str, Any] = {}
+    if parameter.words:
+        kind = str
+    elif parameter.kind in ("number", "count"):
+        limits = {"min": kind(parameter.low), "max": kind(parameter.high)}
+    elif parameter.kind == "odd":
+        limits = {"max": int(parameter.high)}
+    names = [parameter.name, *(name for name, factor in parameter.former if factor == 1)]
+    decorated = typer.Option(
+        *(f"--{name.replace('_', '-')}" for name in names),
+        metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
+        help=parameter.help,
+        **limits,
+    )
+    return Annotated[kind | None if parameter.optional else kind, decorated]
+
+
+def signature(edit: Edit) -> inspect.Signature:
+    """The arguments of the command of an edit."""
+    found: list[tuple[str, Any, Any]] = [
+        ("source", options.Source, inspect.Parameter.empty),
+        ("target", options.Target, inspect.Parameter.empty),
+        *((name, annotation, None) for name, annotation in SCRIBBLES.get(edit.name, {}).items()),
+        *((p.name, option(p), option_value(p, p.default)) for p in edit if p.is_option),
+        ("depth", options.OutputDepth, None),
+        ("seed", options.Seed, 0),
+    ]
+    if edit.tiled:
+        found += [("memory", options.Memory, None), ("full", options.Full, False)]
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Signature([inspect.Parameter(n, kind, default=d, annotation=a) for n, a, d in found])
+
+
+def command(edit: Edit) -> Callable[..., None]:
+    """The command of an edit."""
+
+    def run(source: str, target: str, **given: Any) -> None:
+        edit_photograph(edit.name, source, target, **given)
+
+    run.__name__, run.__doc__ = edit.name, edit.help
+    run.__signature__ = signature(edit)  # type: ignore[attr-defined]  # typer looks at it
+    run.__annotations__ = {}
+    return run
+
+
+def step_of(edit: Edit, given: dict[str, Any]) -> Step:
+    """The step that options describe, without what is painted for it."""
+    values = {}
+    for parameter in edit:
+        if parameter.name not in given:
+            continue
+        value = given[parameter.name]
+        if parameter.kind == "sliders":
+            value = options.parse_sliders(value, f"--{parameter.name}")
+        elif parameter.words:
+            value = options.parse_levels(value)
+        values[parameter.name] = value
+    return Step(edit.name, **values)
+
+
+def edit_photograph(
+    name: str,
+    source: str,
+    target: str,
+    *,
+    depth: options.FileDepth | None = None,
+    seed: int = 0,
+    memory: float | None = None,
+    full: bool = False,
+    **given: Any,
+) -> None:
+    """Do the edit of a name to a file; options are those of its command, and those left out have their defaults."""
+    edit = EDITS[name]
+    step = step_of(edit, given)
+
+    from torch import Tensor
+
+    from nlfilter_torch.cli import editing, scribble_rows, scribbles
+    from nlfilter_torch.cli.tiled import Job
+    from nlfilter_torch.edits.applying import apply_to, check_channels, seeded
+    from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.tiled.recipe import ROWS
+    from nlfilter_torch.tiled.sources import Rows
+
+    def work(photograph: Photograph) -> Tensor:
+        check_channels(name, photograph.pixels.shape[1])
+        return apply_to(step, photograph.pixels, *scribbles.of_edit(step, photograph, given), generator=seeded(seed))
+
+    def by_rows(job: Job) -> Rows:
+        check_channels(name, job.picture.shape[2])
+        painted = scribble_rows.of_edit(step, job, source, given)
+        arguments = {p.keyword: value for p, value in step.in_units(job.size) if p.is_option}
+        return ROWS[name](job.passes(full), job.picture.rows, **(arguments | painted), generator=seeded(seed))
+
+    editing.edit_file(
+        source,
+        target,
+        depth,
+        work,
+        landmarks=step["landmarks"],
+        patch_size=step["patch_size"],
+        factors=2 if name == "detail" and (given.get("region") or given.get("mask")) else 1,
+        memory=memory,
+        by_rows=by_rows if edit.tiled else None,
+        coloured=edit.coloured,
+    )

@@ -1,0 +1,446 @@
+"""The edits and their parameters: everything that functions, commands, files, the editor and the documentation share.
+
+``docs/parameters.md`` is made from it (``python -m benchmarks.parameters docs/parameters.md``).
+"""
+
+from typing import Any
+
+from nlfilter_torch.edits.declaration import (
+    BANDWIDTHS,
+    DISTANCES,
+    GAINS,
+    MAX_LANDMARKS,
+    MAX_PATCH,
+    Edit,
+    Parameter,
+    Slider,
+)
+
+ALIKE = "How different two spots may be and still count as alike"
+CRISP = (3.0, 3.0, 4.0, 1.05)
+
+
+def _filter(
+    *, bandwidth: Any = None, share: float = 0.0, patch_size: int = 5, landmarks: int = 100, auto: bool = False
+) -> tuple[Parameter, ...]:
+    """Parameters of the filter of an edit, with its defaults."""
+    levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) touch fine texture only, large ones (40) treat "
+    photometric = Parameter(
+        "bandwidth",
+        "number",
+        bandwidth,
+        levels + ("much as detail. `auto` looks at the picture." if auto else "much as one."),
+        *BANDWIDTHS,
+        "levels",
+        words=("auto",) if auto else (),
+        optional=bandwidth is None,
+        argument="photometric_bandwidth",
+    )
+    reach = "as far as the picture goes" if share == 0 else f"{share:g} of the short side"
+    return (
+        photometric,
+        Parameter(
+            "spatial_bandwidth",
+            "number",
+            None,
+            f"How far apart two spots may be and still count as alike. Left out: {reach}.",
+            *DISTANCES,
+            "px",
+            optional=True,
+            share=share,
+        ),
+        Parameter(
+            "patch_size",
+            "odd",
+            patch_size,
+            "Width of the patch around each spot that is compared; an odd number. 1 compares single pixels.",
+            1,
+            MAX_PATCH,
+            "px",
+        ),
+        Parameter(
+            "landmarks",
+            "count",
+            landmarks,
+            "Number of typical patches that stand for the whole picture. More are truer, slower and take more memory.",
+            1,
+            MAX_LANDMARKS,
+            argument="num_landmarks",
+            metavar="N",
+        ),
+        Parameter(
+            "sampling",
+            "choice",
+            "kmeans",
+            "How the typical patches are found: by grouping similar ones, on a regular grid, or at random.",
+            choices=("kmeans", "uniform", "random"),
+            argument="landmarks",
+        ),
+    )
+
+
+DETAIL = Edit(
+    "detail",
+    """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
+
+    Colours stay as they are where nothing clips, and so do the file's depth, transparency, colour profile and notes of
+    the camera (EXIF). Photographs that fit no memory are worked out in tiles; best as TIFF files or arrays of zarr,
+    read in parts.
+
+    Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,4,1.05`
+
+    A look with a name: `nlfilter-torch detail in.jpg out.jpg --preset crisp`
+
+    Smooth skin or noise away: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
+
+    Sharpen all that looks like a spot: `nlfilter-torch detail in.jpg out.jpg --region 60,300,20,20`
+
+    By the name of a look: `nlfilter-torch detail in.jpg out.jpg --preset "soft skin"` (see `nlfilter-torch presets`)
+
+    Edit like another photograph: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
+    """,
+    (
+        Parameter(
+            "alpha",
+            "sliders",
+            CRISP,
+            "One slider for each layer, from the finest detail to the smooth shading, with commas between. 1 leaves a "
+            "layer as it is, 3 makes it three times as strong, 0 takes it away.",
+            *GAINS,
+            "gain",
+            idle=1.0,
+            metavar="A,B,...,Z",
+        ),
+        Parameter(
+            "inside",
+            "sliders",
+            None,
+            "The sliders inside what looks like the strokes; as many. Left out: 1 for each.",
+            *GAINS,
+            "gain",
+            optional=True,
+            is_option=False,  # --region has them
+        ),
+        Parameter(
+            "residual",
+            "number",
+            None,
+            "Strength of the grain that no typical patch explains. 1 leaves it as it is, which keeps noise down. "
+            "Left out: as the first slider of --alpha.",
+            *GAINS,
+            "gain",
+            domain="finite",
+            optional=True,
+            idle=None,
+        ),
+        Parameter(
+            "channels",
+            "choice",
+            "luminance",
+            "Edit brightness and keep the colours, or edit red, green and blue alike, colours too.",
+            domain="choice",
+            choices=("luminance", "all"),
+        ),
+        Parameter(
+            "time",
+            "number",
+            1.0,
+            "How far the edit of a region spreads to what is less like it: 0.5 little, 5 far.",
+            0.05,
+            20,
+            domain="positive",
+            former=(("spread", 1.0),),
+            metavar="TIME",
+            slider=Slider("Reach of the region", 0.1, 5, 0.1),
+        ),
+        *_filter(bandwidth="auto", auto=True),
+    ),
+    hint="Paint on what is to have sliders of its own; all that looks like it follows.",
+    brushes=(("in", "Edit this"), ("out", "Not this")),
+    tiled=True,
+)
+
+SHARPEN = Edit(
+    "sharpen",
+    """Sharpen a photograph and leave its noise alone: one slider instead of those of `nlfilter-torch detail`.
+
+    Example: `nlfilter-torch sharpen in.jpg out.jpg --amount 5`
+    """,
+    (
+        Parameter(
+            "amount",
+            "number",
+            4.0,
+            "Strength: 1 leaves the photograph as it is, 4 is visible, 8 is strong.",
+            *GAINS,
+            "gain",
+            domain="finite",
+            idle=1.0,
+            slider=Slider("Amount", 0, 10, 0.5, live=False),
+        ),
+        Parameter(
+            "guide_blur",
+            "number",
+            1.2,
+            "How much noise and the finest grain are overlooked: 0 not at all.",
+            0,
+            1e4,
+            "px",
+            domain="not negative",
+            zero="0 leaves the guide as it is",
+            slider=Slider("Grain overlooked", 0, 4, 0.1, live=False),
+        ),
+        *_filter(bandwidth=10.0, auto=True),
+    ),
+    hint="Sharper edges without more noise.",
+)
+
+TONE = Edit(
+    "tone",
+    """Raise or lower contrast without a change of colour or of mean brightness, but where the picture clips.
+
+    Example: `nlfilter-torch tone in.jpg out.jpg --contrast 1.2 --clarity 2`
+    """,
+    (
+        Parameter(
+            "contrast",
+            "number",
+            1.2,
+            "Contrast of the smooth shading: 1 leaves it, 1.4 is strong, 0.7 flattens.",
+            *GAINS,
+            "gain",
+            domain="finite",
+            idle=1.0,
+            slider=Slider("Contrast", 0.5, 1.5, 0.05, live=False),
+        ),
+        Parameter(
+            "clarity",
+            "number",
+            1.0,
+            "Contrast of the largest details on it: 1 leaves it, 4 is strong.",
+            *GAINS,
+            "gain",
+            domain="finite",
+            idle=1.0,
+            slider=Slider("Clarity", 0, 5, 0.1, live=False),
+        ),
+        *_filter(bandwidth="auto", auto=True),
+    ),
+    hint="Contrast of large shapes, and of the detail on them.",
+)
+
+DENOISE = Edit(
+    "denoise",
+    """Remove noise from a photograph.
+
+    Example: `nlfilter-torch denoise in.jpg out.jpg`
+
+    Gently: `nlfilter-torch denoise in.jpg out.jpg --noise-level 3`
+    """,
+    (
+        Parameter(
+            "noise_level",
+            "number",
+            None,
+            "Strength of the noise: its standard deviation in grey levels of 255. Left out: estimated.",
+            0,
+            255,
+            "levels",
+            domain="not negative",
+            zero="0 changes nothing",
+            optional=True,
+            idle=0.0,
+            slider=Slider("Noise", 0, 50, 0.5, live=False),
+        ),
+        *_filter(share=0.2, landmarks=200),
+    ),
+    hint="Less noise: its standard deviation in grey levels of 255.",
+)
+
+RECOLOR = Edit(
+    "recolor",
+    """Give things another colour: paint a little of it on one, and all that look alike take it.
+
+    Brightness stays as it is to the last bit, and so does whatever looks like none of the strokes. Photographs that fit
+    no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
+
+    A red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
+
+    Spare the wood: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
+    """,
+    (
+        Parameter(
+            "reach",
+            "number",
+            0.8,
+            "How far the colour spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+            0,
+            0.999,
+            domain="below 1",
+            metavar="0...1",
+            slider=Slider("Reach", 0, 0.95, 0.05),
+        ),
+        Parameter(
+            "tolerance",
+            "number",
+            12.0,
+            "How different two colours may be and still count as alike, in units of CIE Lab.",
+            1,
+            100,
+            "lab",
+            argument="photometric_bandwidth",
+            former=(("bandwidth", 1.0),),
+            slider=Slider("Tolerance", 3, 40, 1, live=False),
+        ),
+        *_filter(patch_size=3)[1:],
+    ),
+    hint="Choose a colour and paint a little of it on a thing; its likes take it.",
+    brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
+    needs=True,
+    tiled=True,
+)
+
+COLORIZE = Edit(
+    "colorize",
+    """Colour a grey photograph: paint some strokes, and the colours spread over what looks alike nearby.
+
+    Brightness stays as it is. A photograph in colour is taken for a grey one: its own colours are replaced. Photographs
+    that fit no memory are worked out in tiles, by regression; best as TIFF files or arrays of zarr, read in parts.
+
+    Example: `nlfilter-torch colorize grey.jpg out.jpg --strokes paint.png`
+
+    Without painting: `nlfilter-torch colorize grey.jpg out.jpg --region 10,10,30,30:skyblue --region 10,300,9,9:green`
+    """,
+    (
+        Parameter(
+            "strength",
+            "number",
+            1.0,
+            "How much colour goes to what resembles no stroke: 1 colours everything, 0 leaves it grey.",
+            0,
+            1,
+            domain="share",
+            metavar="0...1",
+            slider=Slider("Fill", 0, 1, 0.05),
+        ),
+        Parameter(
+            "method",
+            "choice",
+            "regression",
+            "Soft colours that mix between strokes, or one flat colour for each of as many pieces (k-means).",
+            domain="choice",
+            choices=("regression", "kmeans"),
+        ),
+        *_filter(bandwidth=40.0, share=0.5625)[:4],
+    ),
+    hint="For grey photographs: paint some colours, and they spread over what looks alike nearby.",
+    brushes=(("colour", "Paint"),),
+    needs=True,
+    coloured=True,
+    tiled=True,
+)
+
+DEFOCUS = Edit(
+    "defocus",
+    """Blur a photograph as a wide aperture would, but for what you mark and all that looks like it nearby.
+
+    Mark some spots of each part that is to stay sharp; the rest of it is found.
+
+    Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
+    """,
+    (
+        Parameter(
+            "radius",
+            "number",
+            2.5,
+            "Radius of the strongest blur, in hundredths of the short side.",
+            0.1,
+            20,
+            "%",
+            domain="positive",
+            slider=Slider("Blur", 0.5, 10, 0.1),
+        ),
+        Parameter(
+            "aperture",
+            "choice",
+            "disc",
+            "Turn dots into discs, as a lens does, or into soft spots.",
+            domain="choice",
+            choices=("disc", "gaussian"),
+        ),
+        *_filter(bandwidth=25.0, share=0.2, patch_size=3),
+    ),
+    hint="Paint some of what is to stay sharp; what is unlike it or far away is blurred.",
+    brushes=(("in", "Keep sharp"),),
+    needs=True,
+)
+
+ABSTRACT = Edit(
+    "abstract",
+    """Turn a photograph into a painting: flat areas with clear outlines.
+
+    Like a watercolour: `nlfilter-torch abstract in.jpg out.jpg`
+
+    Like a comic: `nlfilter-torch abstract in.jpg out.jpg --edges 1 --tones 8 --bandwidth 50`
+    """,
+    (
+        Parameter(
+            "power",
+            "number",
+            0.1,
+            "How much detail goes: 0 none, 0.1 all but outlines, 1 much more.",
+            0,
+            10,
+            domain="not negative",
+            zero="0 leaves the image as it is",
+            idle=0.0,
+            metavar="K",
+            slider=Slider("Flatten", 0, 1, 0.01),
+        ),
+        Parameter(
+            "edges",
+            "number",
+            0.0,
+            "Darkness of lines along edges: 0 draws none.",
+            0,
+            1,
+            domain="share",
+            idle=0.0,
+            metavar="0...1",
+            slider=Slider("Lines", 0, 1, 0.05),
+        ),
+        Parameter(
+            "edge_width",
+            "number",
+            0.2,
+            "Width of these lines, in hundredths of the short side.",
+            0.01,
+            2,
+            "%",
+            domain="positive",
+            least=0.3,  # thinner lines than a pixel can show
+            former=(("width", 0.1),),
+            slider=Slider("Width of lines", 0.05, 0.6, 0.01),
+        ),
+        Parameter(
+            "tones",
+            "count",
+            None,
+            "Reduce brightness to so many tones. Left out: no such steps.",
+            2,
+            1 << 16,  # as many as 16 bits have
+            domain="count",
+            optional=True,
+            idle=None,
+            metavar="N",
+            slider=Slider("Tones", 1, 16, 1, none=1),
+        ),
+        *_filter(bandwidth="auto", share=0.15, patch_size=3, landmarks=200, auto=True),
+    ),
+    hint="A painting of the photograph: flat areas with clear outlines.",
+)
+
+#: All edits, in the order in which the editor adds them to one another.
+EDITS: dict[str, Edit] = {
+    edit.name: edit for edit in (DENOISE, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT)
+}
