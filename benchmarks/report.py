@@ -180,21 +180,21 @@ def machine_lines(results: Results) -> str:
 
 
 def explanation(results: Results) -> str:
-    """What the floor is, in words, with its parts."""
+    """What the floor is, with its parts."""
     main = next(iter(records_of(results, "main")), None)
     if main is None:
         return ""
     floor = main["floor"]
     return (
-        "Times are medians of calls that take turns on the same image, each after a call that does not count, as in a "
-        "loop over pictures; what it costs to come after idle seconds is measured apart. A claim with quartiles "
-        "compares two calls that alternate: its figure is the median of the ratios of neighbouring samples. "
-        "The floor is what cannot be avoided with the matrix products of torch: "
+        "Times are medians of calls that alternate on the same image, each after an uncounted call, as in a loop over "
+        "pictures; the cost of a call after idle seconds is measured separately. A claim with quartiles compares two calls "
+        "that alternate: its figure is the median of the ratios of neighbouring samples. The floor is the minimum cost with "
+        "the matrix products of torch: "
         f"N x D x M and twice N x M x M ({seconds(floor['products'])} here) and {READS} reads of the factor "
-        f"({seconds(floor['read'])} each), every part measured beside the rest in several ways of which the quickest "
-        "counts; exponentials, features, landmarks and the memory for the factor are not in it. The kernels in C skip "
-        "the empty triangle of the whitening, so that the operator may be quicker. The other filters are "
-        "other operators; what they share with this one is the errand."
+        f"({seconds(floor['read'])} each), each part measured alongside in several ways, of which the fastest counts; "
+        "it excludes exponentials, features, landmarks and allocating the factor. The kernels in C skip the zero "
+        "triangle of the inverse Cholesky factor, so the operator may be faster than the floor. The other filters are "
+        "different operators for the same task."
     )
 
 

@@ -30,7 +30,7 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
 
     Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. With the
     layers, other sliders need no further products with the operator: ``(alpha[:, None, None, None] * layers).sum(1)``,
-    which is :meth:`PolynomialSliders.combine`.
+    which is what :class:`PolynomialSliders` does.
 
     Args:
         operator: W.
