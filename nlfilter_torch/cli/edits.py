@@ -105,6 +105,21 @@ def signature(edit: Edit) -> inspect.Signature:
     return inspect.Signature([inspect.Parameter(n, kind, default=d, annotation=a) for n, a, d in found])
 
 
+def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of detail of these names, in place of its ``**given``."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        own = [p for p in inspect.signature(function, eval_str=True).parameters.values() if p.kind != p.VAR_KEYWORD]
+        declared = [(p.name, option(p), option_value(p, p.default)) for p in map(EDITS["detail"].__getitem__, names)]
+        kind = inspect.Parameter.KEYWORD_ONLY
+        more = [inspect.Parameter(name, kind, default=value, annotation=note) for name, note, value in declared]
+        signature = inspect.Signature([*(p.replace(kind=kind) for p in own), *more])
+        setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
+        return function
+
+    return decorate
+
+
 def command(edit: Edit) -> Callable[..., None]:
     """The command of an edit."""
 

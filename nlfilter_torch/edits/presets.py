@@ -5,8 +5,9 @@ presets that have a name.
 """
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from nlfilter_torch.edits.parameters import DETAIL, FILTER
 from nlfilter_torch.edits.recipe import Recipe, in_file
 from nlfilter_torch.edits.steps import Step
 
@@ -31,13 +32,13 @@ class Preset:
     """
 
     alpha: tuple[float, ...]
-    bandwidth: float | str = "auto"
-    spatial_bandwidth: float | None = None
-    patch_size: int = 5
-    landmarks: int = 100
-    sampling: str = "kmeans"
-    residual: float | None = None
-    channels: str = "luminance"
+    bandwidth: float | str = DETAIL["bandwidth"].default
+    spatial_bandwidth: float | None = DETAIL["spatial_bandwidth"].default
+    patch_size: int = DETAIL["patch_size"].default
+    landmarks: int = DETAIL["landmarks"].default
+    sampling: str = DETAIL["sampling"].default
+    residual: float | None = DETAIL["residual"].default
+    channels: str = DETAIL["channels"].default
 
     def apply(self, image: "Tensor", *, generator: "torch.Generator | None" = None) -> "Tensor":
         """Edit a photograph as ``nlfilter-torch detail --preset`` does.
@@ -61,6 +62,14 @@ class Preset:
         from nlfilter_torch.edits.applying import apply_step
 
         return apply_step(self.step, image, generator=generator)
+
+    def options(self) -> dict[str, Any]:
+        """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
+
+        >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
+        12.0
+        """
+        return {name: value for name, value in self.step.arguments((0, 0)).items() if name in FILTER}
 
     @property
     def step(self) -> Step:
