@@ -187,8 +187,9 @@ def explanation(results: Results) -> str:
     floor = main["floor"]
     return (
         "Times are medians of calls that alternate on the same image, each after an uncounted call, as in a loop over "
-        "pictures; the cost of a call after idle seconds is measured separately. A claim with quartiles compares two calls "
-        "that alternate: its figure is the median of the ratios of neighbouring samples. The floor is the minimum cost with "
+        "pictures; the cost of a call after idle seconds is measured separately. A claim with quartiles compares two "
+        "calls that alternate: its figure is the median of the ratios of neighbouring samples. The floor is the "
+        "minimum cost with "
         "the matrix products of torch: "
         f"N x D x M and twice N x M x M ({seconds(floor['products'])} here) and {READS} reads of the factor "
         f"({seconds(floor['read'])} each), each part measured alongside in several ways, of which the fastest counts; "

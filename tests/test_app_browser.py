@@ -15,6 +15,7 @@ from PIL import Image
 from playwright.sync_api import Browser, expect
 
 from nlfilter_torch.cli import main
+from nlfilter_torch.edits.presets import find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
@@ -153,7 +154,7 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     opened.save("Save photo", "out.png")
     opened.save("Save edit", "edit.json")
 
-    recipe = Recipe.find(str(folder / "edit.json"))
+    recipe = find_recipe(str(folder / "edit.json"))
     assert recipe.last("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
     assert recipe.last("recolor").strokes[0].paint == "#8a46c8"
     saved = read_photograph(folder / "out.png").pixels
@@ -287,7 +288,7 @@ def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Ed
     other.page.close()
     for name, alpha, image in (("a.png", 3.0, cat()), ("b.png", 4.5, coffee)):
         wanted = Recipe().apply(image)
-        recipe = Recipe.find("crisp")
+        recipe = find_recipe("crisp")
         recipe = Recipe((Step("detail", alpha=(alpha, 1.0, 1.0, 1.0)),))
         assert (read_photograph(folder / name).pixels - recipe.apply(image).clamp(0, 1)).abs().max() <= 1 / 255
         assert difference(recipe.apply(image), wanted) > 5

@@ -12,7 +12,7 @@ from PIL import Image
 import nlfilter_torch.io.photographs
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import find_recipe
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import LINE, cat, difference
@@ -34,7 +34,7 @@ def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> 
     session.set("abstract", edges=0.5)
     saved = read_photograph(session.save("out.png")).pixels
     edit = session.save_preset("edit.json")
-    assert Recipe.find(str(edit)) == session.recipe
+    assert find_recipe(str(edit)) == session.recipe
     assert main(["apply", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
     assert difference(saved, read_photograph(photo.with_name("cli.png")).pixels) <= 1
     assert difference(saved, session.recipe.apply(cat())) <= 1

@@ -286,8 +286,8 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     settings = seen["args"][2].keywords
     assert settings.pop("memory") == 2.0  # of two ranks with two workers each
     smooth = PRESETS["smooth"]
-    assert settings["alpha"] == ",".join(map(str, smooth.alpha))
-    assert (settings["bandwidth"], settings["seed"]) == (str(smooth.bandwidth), 5)
+    assert settings["alpha"] == "0,0,0,1"
+    assert (settings["bandwidth"], settings["seed"]) == (f"{smooth.bandwidth:g}", 5)
     assert json.loads((tmp_path / "out" / RECORD).read_text()) == settings
     assert main(arguments) == 0
     assert (seen["workers"], seen["threads"]) == (6, 1)

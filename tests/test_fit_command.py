@@ -51,7 +51,7 @@ def test_fit_finds_the_sliders_and_how_much_they_explain(before: Path, capsys: p
 def test_fit_reads_every_depth(before: Path, name: str, options: tuple[object, ...]) -> None:
     preset = before.with_name("look.json")
     assert fit(before, edit(before, name, *options), preset) == 0
-    assert json.loads(preset.read_text())["alpha"] == pytest.approx(ALPHA, rel=0.02)
+    assert json.loads(preset.read_text())["steps"][0]["alpha"] == pytest.approx(ALPHA, rel=0.02)
 
 
 def test_an_edit_of_another_kind_is_explained_in_part(before: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,8 +99,9 @@ def test_preset_keeps_every_entry() -> None:
     ("text", "message"),
     [
         ("alpha = 1", "look.json is no preset: it is not JSON"),
-        ("[1, 2]", "look.json is no preset: it has no entry alpha"),
-        ('{"bandwidth": 3}', "look.json is no preset: it has no entry alpha"),
+        ("[1, 2]", "look.json is no preset: it must hold a list of steps"),
+        ('{"bandwidth": 3}', "look.json is no preset: it must hold a list of steps"),
+        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must be a file with one step, of detail and without"),
         ('{"alpha": [1]}', "alpha in look.json must be a list of 2 to 100 numbers, none beyond 1000000, got [1]"),
         ('{"alpha": [1, NaN]}', "alpha in look.json must be a list of 2 to 100 numbers"),
         ('{"alpha": [1, 1], "bandwidth": 0}', "bandwidth in look.json must be a positive number of grey levels"),
@@ -108,7 +109,7 @@ def test_preset_keeps_every_entry() -> None:
         ('{"alpha": [1, 1], "patch_size": 4}', "patch_size in look.json must be an odd number from 1 to 99, got 4"),
         ('{"alpha": [1, 1], "landmarks": true}', "landmarks in look.json must be a whole number from 1 to 10000"),
         ('{"alpha": [1, 1], "sampling": "best"}', 'sampling in look.json must be "kmeans", "uniform" or "random"'),
-        ('{"alpha": [1, 1], "colour": 1}', "look.json must hold no other entries than alpha, bandwidth"),
+        ('{"alpha": [1, 1], "colour": 1}', "look.json must hold no other entries than alpha, inside, residual"),
     ],
 )
 def test_a_preset_that_is_none_is_told(

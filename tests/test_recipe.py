@@ -13,7 +13,7 @@ from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import colour_masks
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import PRESETS, Preset
+from nlfilter_torch.edits.presets import PRESETS, Preset, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
 from nlfilter_torch.edits.steps import Step
@@ -207,11 +207,11 @@ def test_files_from_before_there_was_a_list_of_steps() -> None:
 
 def test_presets_are_edits(tmp_path: Path) -> None:
     crisp = PRESETS["crisp"]
-    assert Recipe.find("crisp") == Recipe((crisp.step,))
+    assert find_recipe("crisp") == Recipe((crisp.step,))
     path = tmp_path / "look.json"
     path.write_text(crisp.to_json())
-    assert Recipe.find(str(path)) == Recipe((crisp.step,))
-    assert Preset.from_json(Recipe.find("crisp").to_json(), "it") == crisp  # so that detail --preset takes it too
+    assert find_recipe(str(path)) == Recipe((crisp.step,))
+    assert Preset.from_json(find_recipe("crisp").to_json(), "it") == crisp  # so that detail --preset takes it too
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import find_recipe
 
 Edit = Annotated[
     str,
@@ -33,7 +33,7 @@ def apply(
 
     Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
     """
-    recipe = Recipe.find(preset)
+    recipe = find_recipe(preset)
 
     from torch import Tensor
 

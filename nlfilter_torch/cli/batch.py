@@ -10,10 +10,10 @@ import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.apply import apply
-from nlfilter_torch.cli.edits import edit_photograph, plain_step, take_defaults
+from nlfilter_torch.cli.edits import edit_photograph, plain_step, step_of, take_defaults, with_options
 from nlfilter_torch.cli.interrupts import INTERRUPTED
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.presets import PRESETS, find_recipe
 
 if TYPE_CHECKING:
     from nlfilter_torch.cli.folders import Tally
@@ -38,7 +38,7 @@ Workers = Annotated[
 
 
 def _use_preset(context: typer.Context, name: str | None) -> str | None:
-    step = None if name is None else plain_step(Recipe.find(name))
+    step = None if name is None else plain_step(find_recipe(name))
     if step is not None:
         take_defaults(context, step)
     return name
@@ -56,22 +56,16 @@ Preset = Annotated[
 ]
 
 
+@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name != "time"))
 def batch(
     context: typer.Context,
     folder: Folder,
     target: Target,
-    alpha: options.Alpha = "3,3,4,1.05",
-    bandwidth: options.Bandwidth = "auto",
-    residual: options.Residual = None,
-    channels: options.Edited = options.Channels.luminance,
-    spatial_bandwidth: options.SpatialBandwidth = None,
-    patch_size: options.PatchSize = 5,
-    landmarks: options.Landmarks = 100,
-    sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
     preset: Preset = None,
     workers: Workers = None,
     memory: options.Memory = None,
+    **given: Any,
 ) -> None:
     """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
 
@@ -82,8 +76,7 @@ def batch(
 
     On several machines that share the folders: `torchrun ... -m nlfilter_torch batch shots edited --preset look.json`
     """
-    options.parse_alpha(alpha)
-    options.parse_bandwidth(bandwidth)
+    step_of(EDITS["detail"], given)
 
     from nlfilter_torch.cli.folders import Tally, edit_folder, pictures, prepare
     from nlfilter_torch.cli.progress import steps
@@ -91,27 +84,17 @@ def batch(
     from nlfilter_torch.core.checks import check_patch_size
     from nlfilter_torch.core.communicator import connected_ranks
 
-    check_patch_size(patch_size)
+    check_patch_size(given["patch_size"])
     allowed_memory(memory)
-    settings: dict[str, Any] = {
-        "alpha": alpha,
-        "bandwidth": bandwidth,
-        "residual": residual,
-        "channels": channels,
-        "spatial_bandwidth": spatial_bandwidth,
-        "patch_size": patch_size,
-        "landmarks": landmarks,
-        "sampling": sampling,
-        "seed": seed,
-    }
+    settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
-    recipe = None if preset is None else Recipe.find(preset)
+    recipe = None if preset is None else find_recipe(preset)
     if preset is not None and recipe is not None and plain_step(recipe) is None:
         sources = {name: context.get_parameter_source(name) for name in settings}
-        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
-        if given:
+        beside = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        if beside:
             raise ValueError(
-                f"--{given[0].replace('_', '-')} is an option of detail, but {preset} holds another edit; "
+                f"--{beside[0].replace('_', '-')} is an option of detail, but {preset} holds another edit; "
                 "leave it out, or write it into the file"
             )
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=preset)

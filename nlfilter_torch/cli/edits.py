@@ -9,7 +9,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.presets import PRESETS, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 
@@ -29,7 +29,7 @@ def take_defaults(context: typer.Context, step: Step) -> None:
 
 def _use_preset(context: typer.Context, name: str | None) -> str | None:
     if name is not None:
-        step = plain_step(Recipe.find(name))
+        step = plain_step(find_recipe(name))
         if step is None:
             raise ValueError(
                 f"--preset must be a file with one step, of detail and without strokes, got {name}; "
@@ -103,6 +103,21 @@ def signature(edit: Edit) -> inspect.Signature:
         found += [("memory", options.Memory, None), ("full", options.Full, False)]
     kind = inspect.Parameter.KEYWORD_ONLY
     return inspect.Signature([inspect.Parameter(n, kind, default=d, annotation=a) for n, a, d in found])
+
+
+def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of detail of these names, in place of its ``**given``."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        own = [p for p in inspect.signature(function, eval_str=True).parameters.values() if p.kind != p.VAR_KEYWORD]
+        declared = [(p.name, option(p), option_value(p, p.default)) for p in map(EDITS["detail"].__getitem__, names)]
+        kind = inspect.Parameter.KEYWORD_ONLY
+        more = [inspect.Parameter(name, kind, default=value, annotation=note) for name, note, value in declared]
+        signature = inspect.Signature([*(p.replace(kind=kind) for p in own), *more])
+        setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
+        return function
+
+    return decorate
 
 
 def command(edit: Edit) -> Callable[..., None]:

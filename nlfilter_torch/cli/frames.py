@@ -1,12 +1,14 @@
 """``nlfilter-torch frames``: one edit for all frames of a film, without flicker."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
+from nlfilter_torch.edits.parameters import EDITS, FILTER
 
 Frames = Annotated[
     Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
@@ -24,18 +26,8 @@ References = Annotated[
 ]
 
 
-def frames(
-    folder: Frames,
-    target: Edited,
-    alpha: options.Alpha = "3,3,4,1.05",
-    bandwidth: options.Bandwidth = "auto",
-    residual: options.Residual = None,
-    references: References = 3,
-    patch_size: options.PatchSize = 5,
-    landmarks: options.Landmarks = 100,
-    sampling: options.LandmarkSampling = options.Sampling.kmeans,
-    seed: options.Seed = 0,
-) -> None:
+@with_options("alpha", "bandwidth", "residual", "patch_size", "landmarks", "sampling")
+def frames(folder: Frames, target: Edited, references: References = 3, seed: options.Seed = 0, **given: Any) -> None:
     """Edit the details of all frames of a film alike, so that nothing flickers.
 
     The sliders are those of `nlfilter-torch detail`; the filter is made once, and each frame is edited with it. Every
@@ -43,8 +35,7 @@ def frames(
 
     Example: `nlfilter-torch frames shots edited --alpha 2,2,2,1`
     """
-    sliders = options.parse_alpha(alpha)
-    grey_levels = options.parse_bandwidth(bandwidth)
+    step = step_of(EDITS["detail"], given)
 
     import torch
 
@@ -56,7 +47,7 @@ def frames(
     if target.exists() and target.resolve() == folder.resolve():
         raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
     check_folder(target)
-    needed = (1 + min(references, len(paths))) * working_bytes(landmarks, patch_size)
+    needed = (1 + min(references, len(paths))) * working_bytes(step["landmarks"], step["patch_size"])
     with steps(len(paths) + 1) as begin:
         begin("Learning from some frames")
         spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
@@ -71,13 +62,10 @@ def frames(
 
         edited = filter_frames(
             map(read, paths),
-            torch.tensor(sliders),
+            torch.tensor(step["alpha"]),
             references=samples,
-            residual=residual,
-            photometric_bandwidth=grey_levels,
-            patch_size=patch_size,
-            num_landmarks=landmarks,
-            landmarks=sampling.value,
+            residual=step["residual"],
+            **{name: value for name, value in step.arguments((0, 0)).items() if name in FILTER},
             generator=torch.Generator().manual_seed(seed),
         )
         target.mkdir(exist_ok=True)

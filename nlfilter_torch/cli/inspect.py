@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.cli.edits import with_options
 from nlfilter_torch.core.memory import working_bytes
 
 if TYPE_CHECKING:
@@ -37,16 +38,17 @@ MEANINGS = {
 }
 
 
+@with_options("alpha")
 def inspect(
     source: options.Source,
     folder: Folder,
-    alpha: options.Alpha = "3,3,4,1.05",
     bandwidth: options.Bandwidth = "auto",
     spatial_bandwidth: options.SpatialBandwidth = None,
     patch_size: options.PatchSize = 5,
     landmarks: options.Landmarks = 100,
     sampling: options.LandmarkSampling = options.Sampling.kmeans,
     seed: options.Seed = 0,
+    **given: str,
 ) -> None:
     """Show how the filter sees a photograph: the patterns it finds, how strong they are, and what sliders do to them.
 
@@ -54,7 +56,7 @@ def inspect(
 
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
-    sliders = options.parse_alpha(alpha)
+    sliders = options.parse_alpha(given["alpha"])
     grey_levels = options.parse_bandwidth(bandwidth)
 
     import torch

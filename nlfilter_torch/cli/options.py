@@ -27,13 +27,6 @@ class Sampling(StrEnum):
     random = "random"
 
 
-class Channels(StrEnum):
-    """What of the picture is edited."""
-
-    luminance = "luminance"
-    all = "all"
-
-
 class FileDepth(StrEnum):
     """What a channel of the output file holds."""
 
@@ -110,15 +103,6 @@ def parse_bandwidth(text: str) -> float | Literal["auto"]:
 
 
 Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF or WebP file.")]
-Alpha = Annotated[
-    str,
-    typer.Option(
-        "--alpha",
-        metavar="A,B,...,Z",
-        help="One slider for each layer, from the finest detail to the smooth shading, with commas between. 1 leaves a "
-        "layer as it is, 3 makes it three times as strong, 0 takes it away.",
-    ),
-]
 Bandwidth = Annotated[
     str,
     typer.Option(
@@ -175,20 +159,6 @@ Target = Annotated[
     typer.Argument(
         metavar="OUT", help="The edited photograph; the ending of its name (.png, .jpg, .tif, .webp) gives the type."
     ),
-]
-Residual = Annotated[
-    float | None,
-    typer.Option(
-        min=GAINS[0],
-        max=GAINS[1],
-        metavar="GAIN",
-        help="Strength of the grain that no typical patch explains. 1 leaves it as it is, which keeps noise down. "
-        "Left out: as the first slider of --alpha.",
-    ),
-]
-Edited = Annotated[
-    Channels,
-    typer.Option(help="Edit brightness and keep the colours, or edit red, green and blue alike, colours too."),
 ]
 OutputDepth = Annotated[
     FileDepth | None,

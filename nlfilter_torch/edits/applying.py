@@ -11,6 +11,7 @@ from nlfilter_torch.edits.colorize import Colorization, colorize
 from nlfilter_torch.edits.defocus import Defocusing, defocus
 from nlfilter_torch.edits.denoise import denoise
 from nlfilter_torch.edits.detail import enhance
+from nlfilter_torch.edits.parameters import FILTER
 from nlfilter_torch.edits.recolor import Recoloring, recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.sharpen import sharpen
@@ -18,7 +19,6 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.operator.features import reduce_channels
 
-FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 #: The edits as functions of an image, the scribbles on it and parameters.
 FUNCTIONS: dict[str, Callable[..., Tensor]] = {
     "denoise": denoise,

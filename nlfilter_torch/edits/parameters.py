@@ -18,6 +18,8 @@ from nlfilter_torch.edits.declaration import (
 
 ALIKE = "How different two spots may be and still count as alike"
 CRISP = (3.0, 3.0, 4.0, 1.05)
+#: Arguments of the filter of an edit.
+FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 
 
 def _filter(

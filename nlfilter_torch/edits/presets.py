@@ -5,8 +5,10 @@ presets that have a name.
 """
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from nlfilter_torch.edits.parameters import DETAIL, FILTER
 from nlfilter_torch.edits.recipe import Recipe, in_file
 from nlfilter_torch.edits.steps import Step
 
@@ -31,13 +33,13 @@ class Preset:
     """
 
     alpha: tuple[float, ...]
-    bandwidth: float | str = "auto"
-    spatial_bandwidth: float | None = None
-    patch_size: int = 5
-    landmarks: int = 100
-    sampling: str = "kmeans"
-    residual: float | None = None
-    channels: str = "luminance"
+    bandwidth: float | str = DETAIL["bandwidth"].default
+    spatial_bandwidth: float | None = DETAIL["spatial_bandwidth"].default
+    patch_size: int = DETAIL["patch_size"].default
+    landmarks: int = DETAIL["landmarks"].default
+    sampling: str = DETAIL["sampling"].default
+    residual: float | None = DETAIL["residual"].default
+    channels: str = DETAIL["channels"].default
 
     def apply(self, image: "Tensor", *, generator: "torch.Generator | None" = None) -> "Tensor":
         """Edit a photograph as ``nlfilter-torch detail --preset`` does.
@@ -61,6 +63,14 @@ class Preset:
         from nlfilter_torch.edits.applying import apply_step
 
         return apply_step(self.step, image, generator=generator)
+
+    def options(self) -> dict[str, Any]:
+        """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
+
+        >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
+        12.0
+        """
+        return {name: value for name, value in self.step.arguments((0, 0)).items() if name in FILTER}
 
     @property
     def step(self) -> Step:
@@ -151,4 +161,22 @@ def find_preset(name: str) -> Preset:
         >>> find_preset("soft-skin").alpha
         (0.1, 0.4, 1.0, 1.0)
     """
-    return _preset(Recipe.find(name), name)
+    return _preset(find_recipe(name), name)
+
+
+def find_recipe(name: str) -> Recipe:
+    """The preset of that name (``soft-skin`` is ``soft skin``), or the edit in the file at that path.
+
+    Raises:
+        ValueError: if there is neither, or the file holds none.
+    """
+    spoken = name.lower().replace("-", " ").replace("_", " ")
+    if spoken in PRESETS:
+        return Recipe((PRESETS[spoken].step,))
+    path = Path(name)
+    if not path.is_file():
+        raise ValueError(
+            f"{name} does not exist or is no file, nor is it one of the presets {', '.join(PRESETS)}; "
+            "make a file with nlfilter-torch fit"
+        )
+    return Recipe.from_json(path.read_text(encoding="utf-8", errors="replace"), name)

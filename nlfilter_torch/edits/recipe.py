@@ -16,7 +16,6 @@ that an edit that was made on a preview holds for the photograph. Imports no tor
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.edits.declaration import parse_json, shown
@@ -151,26 +150,6 @@ class Recipe:
         return Recipe(
             tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", before=True) for edit in former)
         )
-
-    @staticmethod
-    def find(name: str) -> "Recipe":
-        """The preset of that name (``soft-skin`` is ``soft skin``), or the edit in the file at that path.
-
-        Raises:
-            ValueError: if there is neither, or the file holds none.
-        """
-        from nlfilter_torch.edits.presets import PRESETS
-
-        spoken = name.lower().replace("-", " ").replace("_", " ")
-        if spoken in PRESETS:
-            return Recipe((PRESETS[spoken].step,))
-        path = Path(name)
-        if not path.is_file():
-            raise ValueError(
-                f"{name} does not exist or is no file, nor is it one of the presets {', '.join(PRESETS)}; "
-                "make a file with nlfilter-torch fit"
-            )
-        return Recipe.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
 
 
 def in_file(steps: Iterable[str]) -> str:

@@ -29,7 +29,7 @@ def stream_detail(
     residual: float | None = None,
     time: float = DETAIL.defaults["time"],
     width: float = 4.0,
-    channels: Literal["luminance", "all"] = "luminance",
+    channels: Literal["luminance", "all"] = DETAIL.defaults["channels"],
     statistics: Statistics = "sample",
     sample: int = SAMPLE,
     tile_rows: int | None = None,
@@ -107,7 +107,7 @@ def detail_rows(
     residual: float | None = None,
     time: float = DETAIL.defaults["time"],
     width: float = 4.0,
-    channels: Literal["luminance", "all"] = "luminance",
+    channels: Literal["luminance", "all"] = DETAIL.defaults["channels"],
     name: str = "source",
     **options: Any,
 ) -> Rows:
@@ -176,7 +176,7 @@ def rows_in_memory(
     *,
     num_landmarks: int = 100,
     patch_size: int = 5,
-    guide_channels: str = "luminance",
+    guide_channels: str = DETAIL.defaults["channels"],
     **_: Any,
 ) -> int:
     """Rows of a tile that fit in the memory of the passes.

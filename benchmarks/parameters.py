@@ -1,0 +1,127 @@
+"""The parameters of the edits as a page of the documentation, and in how many places each is declared.
+
+    python -m benchmarks.parameters docs/parameters.md
+
+Without a file it prints the places only; the exit status is 1 if a parameter is declared more than once.
+"""
+
+import argparse
+import ast
+from pathlib import Path
+
+import nlfilter_torch
+from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
+from nlfilter_torch.edits.parameters import EDITS, FILTER
+
+PACKAGE = Path(nlfilter_torch.__file__).parent
+INTERFACES = ("cli", "app")  # whose files may declare parameters of any edit
+FILES = ("edits/presets.py", "edits/recipe.py", "edits/steps.py", "edits/applying.py", "tiled/recipe.py")
+HEAD = """# Parameters
+
+Every edit's parameters, with the names, units, ranges and defaults that its command, files for `apply` and the editor
+share. An option is the name with dashes. Functions take images in [0, 1]: there, grey levels are divided by 255, units
+of CIE Lab by 100, and hundredths of the short side are pixels. This page is made by
+`python -m benchmarks.parameters docs/parameters.md`.
+"""
+
+
+def page() -> str:
+    """The text of the page."""
+    return HEAD + "".join(f"\n## {edit.name}\n\n{table(edit)}" for edit in EDITS.values())
+
+
+def table(edit: Edit) -> str:
+    """The parameters of an edit, a row for each."""
+    head = "| name | default | range | unit | in Python | what it does |\n|---|---|---|---|---|---|\n"
+    return head + "".join(f"| {' | '.join(cells(edit, parameter))} |\n" for parameter in edit)
+
+
+def cells(edit: Edit, parameter: Parameter) -> tuple[str, ...]:
+    """What the table says about a parameter."""
+    value = parameter.default
+    if value is None and parameter.share:
+        shown = f"{100 * parameter.share:g} % of the short side"
+    elif value is None:
+        shown = ""
+    else:
+        shown = ", ".join(f"{slider:g}" for slider in value) if isinstance(value, tuple) else f"{value}"
+    spans = {"choice": ", ".join(parameter.choices), "sliders": f"{parameter.low:g} to {parameter.high:g}, each"}
+    span = spans.get(parameter.kind, f"{parameter.low:g} to {parameter.high:g}")
+    unit = UNITS[parameter.unit][0] or {"gain": "times"}.get(parameter.unit, "")
+    words = " or ".join(parameter.words)
+    name = f"`{parameter.keyword}`" if parameter.is_option else "`alpha` of a region"
+    return f"`{parameter.name}`", shown, f"{span}{', or ' + words if words else ''}", unit, name, parameter.help
+
+
+def places(edit: Edit, parameter: Parameter) -> list[str]:
+    """Where a parameter of an edit has a declaration with values of its own: ``file:line`` of each."""
+    names = {parameter.name, parameter.keyword}
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        file = path.relative_to(PACKAGE).as_posix()
+        own = file in FILES or path.stem == edit.name or path.parent.name in INTERFACES
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        if file == "edits/parameters.py":
+            scope = next(n for n in tree.body if isinstance(n, ast.Assign) and named(n.targets[0]) == edit.name.upper())
+            found += [f"{file}:{n.lineno}" for n in ast.walk(scope) if declares(n, parameter.name)]
+        elif own:
+            found += [f"{file}:{line}" for line, name in literals(tree) if name in names]
+    return found
+
+
+def named(node: ast.expr) -> str:
+    """The name that a node is, or nothing."""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def declares(node: ast.AST, name: str) -> bool:
+    """Whether a node is ``Parameter("name", ...)``."""
+    return (
+        isinstance(node, ast.Call)
+        and named(node.func) == "Parameter"
+        and isinstance(node.args[0], ast.Constant)
+        and node.args[0].value == name
+    )
+
+
+def literals(tree: ast.Module) -> list[tuple[int, str]]:
+    """Lines and names of arguments and fields whose default is written out, but for None."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            positional = node.args.args[len(node.args.args) - len(node.args.defaults) :]
+            pairs = [*zip(positional, node.args.defaults, strict=True)]
+            pairs += [(a, d) for a, d in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True) if d is not None]
+            found += [(default.lineno, argument.arg) for argument, default in pairs if written_out(default)]
+        elif isinstance(node, ast.AnnAssign) and node.value is not None and written_out(node.value):
+            found.append((node.lineno, named(node.target)))
+    return found
+
+
+def written_out(node: ast.expr) -> bool:
+    """Whether a value is made of numbers and words alone."""
+    constants = [n for n in ast.walk(node) if isinstance(n, ast.Constant)]
+    others = [n for n in ast.walk(node) if isinstance(n, ast.Name | ast.Attribute | ast.Subscript | ast.Call)]
+    return bool(constants) and not others and any(n.value is not None for n in constants)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the places, write the page, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", nargs="?", type=Path, help="the page to write")
+    file = parser.parse_args(arguments).file
+    worst = 0
+    for edit in EDITS.values():
+        for parameter in edit:
+            if parameter.keyword in FILTER and parameter.name != "tolerance":
+                continue  # declared once for all edits, in _filter, with the edit's defaults
+            where = places(edit, parameter)
+            worst = max(worst, len(where))
+            print(f"{edit.name} {parameter.name}: {len(where)} ({', '.join(where)})")
+    if file is not None:
+        file.write_text(page(), encoding="utf-8")
+    return int(worst != 1)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
