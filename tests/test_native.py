@@ -12,19 +12,23 @@ from torch import Tensor
 
 from hatch_build import FOLDER, CompiledKernels
 from nlfilter_torch import nonlocal_operator
-from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core import instruction_sets
 from nlfilter_torch.core.autograd import OuterProduct
+from nlfilter_torch.core.kernels import definitions_only, library
+from nlfilter_torch.core.kernels.clusters import lloyd
+from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.operator import landmarks, newton, nystrom
+from nlfilter_torch.operator import landmarks, newton
 from nlfilter_torch.operator.newton import weighted_moment
 from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
-from nlfilter_torch.operator.spectrum import sum_grams
 from tests import reference
 
-LEVELS = [pytest.param(level, id=name) for level, name in enumerate(native.LEVELS) if 0 < level <= native.level]
+LEVELS = [
+    pytest.param(level, id=name) for level, name in enumerate(instruction_sets.NAMES) if 0 < level <= library.level
+]
 POSSIBLE = platform.machine() == "x86_64" and sys.platform == "linux" and shutil.which("cc") is not None
 
-pytestmark = pytest.mark.skipif(not native.level, reason="this installation or processor has no kernels in C")
+pytestmark = pytest.mark.skipif(not library.level, reason="this installation or processor has no kernels in C")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -33,7 +37,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 @pytest.fixture(params=LEVELS)
 def level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(native, "level", request.param)
+    monkeypatch.setattr(library, "level", request.param)
     return int(request.param)
 
 
@@ -45,25 +49,22 @@ def threads():
     torch.set_num_threads(before)
 
 
-def by_torch(monkeypatch: pytest.MonkeyPatch, function: Any, *arguments: Any) -> Any:
-    with monkeypatch.context() as context:
-        context.setattr(native, "level", 0)
+def by_torch(function: Any, *arguments: Any) -> Any:
+    with definitions_only():
         return function(*arguments)
 
 
 @pytest.mark.parametrize("completion", ["diagonal", "none"])
 @pytest.mark.parametrize("pixels", [1, 7, 31, 64, 65, 1000, 8256, 20_011])
 @pytest.mark.parametrize(("size", "marks"), [(1, 1), (9, 2), (25, 5), (27, 6), (3, 100)])
-def test_columns(
-    level: int, completion: Any, pixels: int, size: int, marks: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_columns(level: int, completion: Any, pixels: int, size: int, marks: int) -> None:
     z = random(2, size, marks, seed=1)
     x = random(2, size, pixels) * 0.7
     x[:, :, : min(pixels, marks)] = z[:, :, : min(pixels, marks)]  # columns that rounding may make longer than 1
     arguments = (x, z, whitener(z), completion)
     found = nystrom_factor(*arguments)
     expected = nystrom_factor(*(part.double() for part in arguments[:3]), completion)
-    plain = by_torch(monkeypatch, nystrom_factor, *arguments)
+    plain = by_torch(nystrom_factor, *arguments)
     for native_part, torch_part, exact in zip(found, plain, expected, strict=True):
         error, usual = (native_part - exact).abs().max(), (torch_part - exact).abs().max()
         assert error <= 2 * usual + 2e-6, (error, usual)
@@ -81,7 +82,7 @@ def test_columns_of_a_whitening_without_a_triangle(level: int) -> None:
 @pytest.mark.parametrize(("size", "marks"), [(1, 1), (9, 2), (27, 6), (3, 100), (6, 150)])
 @pytest.mark.parametrize("rank", [None, 9])
 def test_derivatives_of_columns(
-    level: int, completion: Any, pixels: int, size: int, marks: int, rank: int | None, monkeypatch: pytest.MonkeyPatch
+    level: int, completion: Any, pixels: int, size: int, marks: int, rank: int | None
 ) -> None:
     z = random(2, size, marks, seed=1)
     x = random(2, size, pixels) * 0.7
@@ -98,7 +99,7 @@ def test_derivatives_of_columns(
         )
         return [*found, whitening.tril()]
 
-    found, plain = gradients(torch.float32), by_torch(monkeypatch, gradients, torch.float32)
+    found, plain = gradients(torch.float32), by_torch(gradients, torch.float32)
     exact, size_of_terms = gradients(torch.float64), (whitener(z).mT.abs() @ (0 + along).abs()).max()
     for native_part, torch_part, part in zip(found, plain, exact, strict=True):
         error, usual = (native_part - part).abs().max(), (torch_part - part).abs().max()
@@ -135,7 +136,7 @@ def test_far_features_meet_the_floor_and_nan_is_not_hidden(level: int) -> None:
 
 @pytest.mark.parametrize("pixels", [1, 7, 255, 8256, 40_000])
 @pytest.mark.parametrize("marks", [1, 3, 50, 900])
-def test_sweep(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweep(level: int, pixels: int, marks: int) -> None:
     factor = random(2, marks, pixels).abs()
     factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
     diagonal = 1 - factor.square().sum(1).clamp(max=1)
@@ -143,7 +144,7 @@ def test_sweep(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPa
     arguments = (factor, diagonal, total, None)
     exact = newton._sweep(*(part.double() for part in arguments[:3]), None)
     found = newton._sweep(*arguments)
-    plain = by_torch(monkeypatch, newton._sweep, *arguments)
+    plain = by_torch(newton._sweep, *arguments)
     torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
     error, usual = (found[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
     assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
@@ -168,16 +169,17 @@ def test_products_with_few_rows(level: int, batch: int, pixels: int, rows: int, 
 @pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize("size", [1, 25])
 @pytest.mark.parametrize(("points", "marks"), [(1, 1), (5, 3), (64, 7), (65, 20), (1000, 50)])
-def test_landmarks(level: int, batch: int, size: int, points: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_landmarks(level: int, batch: int, size: int, points: int, marks: int) -> None:
     cloud = random(batch, size, points)
     pivots = landmarks._pivots(cloud, marks, torch.Generator().manual_seed(1))
-    expected = by_torch(monkeypatch, landmarks._pivots, cloud, marks, torch.Generator().manual_seed(1))
+    expected = by_torch(landmarks._pivots, cloud, marks, torch.Generator().manual_seed(1))
     assert torch.equal(pivots[:, :6], expected[:, :6])  # on a line that few explain all, and the rest is rounding
     assert torch.equal(pivots, expected) or size == 1
     start = cloud.gather(2, pivots.unsqueeze(1).expand(-1, size, -1))
     start[:, :, marks // 2 :] += 100.0 * (marks > 3)  # far from all points, where they stay
-    assignment = landmarks._lloyd(cloud, start)
-    assert (assignment == by_torch(monkeypatch, landmarks._lloyd, cloud, start)).float().mean() > 0.95
+    margin = landmarks.TIE * torch.finfo(torch.float32).eps
+    assignment = lloyd(cloud, start, 5, margin)
+    assert (assignment == by_torch(lloyd, cloud, start, 5, margin)).float().mean() > 0.95
     assert assignment.max() < max(marks // 2, 1) or marks <= 3
 
 
@@ -194,9 +196,7 @@ def test_landmarks(level: int, batch: int, size: int, points: int, marks: int, m
 )
 @pytest.mark.parametrize("spatial_bandwidth", [2.0, 5.0])
 @pytest.mark.parametrize("marks", [3, 10, 25])
-def test_ties_are_broken_by_one_rule(
-    level: int, image: torch.Tensor, spatial_bandwidth: float, marks: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ties_are_broken_by_one_rule(level: int, image: torch.Tensor, spatial_bandwidth: float, marks: int) -> None:
     filtered = random(1, 1, *image.shape)
 
     def build() -> tuple[torch.Tensor, torch.Tensor]:
@@ -209,18 +209,18 @@ def test_ties_are_broken_by_one_rule(
         )
         return operator.kernel.landmarks, operator @ filtered
 
-    for found, expected in zip(build(), by_torch(monkeypatch, build), strict=True):
+    for found, expected in zip(build(), by_torch(build), strict=True):
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("pixels", [1, 300, 40_000])
 @pytest.mark.parametrize("marks", [1, 3, 50, 900])
-def test_weighted_moments(level: int, pixels: int, marks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
     arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), None, random(2, marks, 1).double()
     factor, weights, total = (t.double() for t in arguments if t is not None)
     exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
     found = weighted_moment(*arguments)
-    plain = by_torch(monkeypatch, weighted_moment, *arguments)
+    plain = by_torch(weighted_moment, *arguments)
     error, usual = (found - exact).abs().max(), (plain - exact).abs().max()
     assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
 
@@ -228,10 +228,10 @@ def test_weighted_moments(level: int, pixels: int, marks: int, monkeypatch: pyte
 @pytest.mark.parametrize("pixels", [1, 17, 1024, 1025, 9000])
 @pytest.mark.parametrize("marks", [1, 3, 6, 7, 50, 400])
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_grams(level: int, pixels: int, marks: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
     factor, scaling, remainder = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, pixels).sigmoid()
     found = sum_grams(factor, scaling, remainder, count)
-    plain = by_torch(monkeypatch, sum_grams, factor, scaling, remainder, count)
+    plain = by_torch(sum_grams, factor, scaling, remainder, count)
     scaled = (factor * scaling.unsqueeze(1)).double()
     for j in range(count):
         exact = (scaled * remainder.double().unsqueeze(1) ** j) @ scaled.mT
@@ -241,26 +241,26 @@ def test_grams(level: int, pixels: int, marks: int, count: int, monkeypatch: pyt
     assert torch.equal(found, found.mT)
 
 
-def test_tensors_of_any_layout(level: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensors_of_any_layout(level: int) -> None:
     factor, vectors, images = random(1, 300, 6).mT, random(1, 6, 3).mT, random(1, 300, 3).mT
     torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
     torch.testing.assert_close(moment(factor, images), factor.double() @ images.double().mT, atol=1e-4, rtol=0)
     torch.testing.assert_close(spread(vectors, factor[..., 5:205:2]), vectors @ factor[..., 5:205:2])
     z, x, diagonal = random(1, 7, 4).mT, random(1, 300, 4).mT, random(1, 600)[:, ::2].sigmoid()
     arguments = (x, z, whitener(z), "diagonal")
-    torch.testing.assert_close(nystrom_factor(*arguments), by_torch(monkeypatch, nystrom_factor, *arguments))
+    torch.testing.assert_close(nystrom_factor(*arguments), by_torch(nystrom_factor, *arguments))
     arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, None)
-    found, expected = newton._sweep(*arguments), by_torch(monkeypatch, newton._sweep, *arguments)
+    found, expected = newton._sweep(*arguments), by_torch(newton._sweep, *arguments)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
 
 @pytest.fixture(params=[False, True], ids=["threads of torch", "threads of its own"])
 def own_threads(request: pytest.FixtureRequest):
-    openmp = native._openmp()
+    openmp = library._openmp()
     assert openmp is not None, "torch's OpenMP library was not found"
-    native.share_threads(native._library, None if request.param else openmp)
+    library.share_threads(library._library, None if request.param else openmp)
     yield
-    native.share_threads(native._library, openmp)
+    library.share_threads(library._library, openmp)
 
 
 @pytest.mark.usefixtures("own_threads")
@@ -291,35 +291,60 @@ def test_an_operator_is_that_of_the_dense_reference(level: int) -> None:
     torch.testing.assert_close(operator.to_dense()[0].double(), exact, atol=2e-5, rtol=0)
 
 
-@pytest.mark.filterwarnings("ignore:.torch.jit.script")  # torch's own way to forward derivatives
-def test_whom_they_suit() -> None:
-    plain = random(1, 3, 4)
-    assert native.suits(plain, plain.mT)
-    assert native.suits(torch.nn.Parameter(plain).detach())
-    assert not native.suits(plain, plain.double())
-    assert not native.suits(plain.half())
-    assert not native.suits(plain[:, :0])
-    assert not native.suits(plain.to("meta"))
-    assert not native.suits(plain.clone().requires_grad_())
-    with torch.no_grad():
-        assert native.suits(plain.clone().requires_grad_())
-    mapped = []
-    torch.vmap(lambda part: (mapped.append(native.suits(part)), part)[1])(plain)
-    assert mapped == [False]
-    with torch.autograd.forward_ad.dual_level():
-        assert not native.suits(torch.autograd.forward_ad.make_dual(plain, plain))
-    assert not native.suits(torch.imag(torch.complex(plain, plain).conj()))
+class Exhausted:
+    """A library whose kernels find no memory."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_: -1
 
 
 def test_without_memory_for_its_buffers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Exhausted:
-        def nlfilter_columns(self, *_: Any) -> int:
-            return -1
-
-    monkeypatch.setattr(native, "_library", Exhausted())
+    monkeypatch.setattr(library, "_library", Exhausted())
     x = random(1, 2, 9)
     with pytest.raises(MemoryError, match="make the image smaller"):
         nystrom_factor(x, x[:, :, :3], whitener(x[:, :, :3]), "diagonal")
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script")  # torch's own way to forward derivatives
+def test_which_tensors_the_dispatcher_sends_to_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "_library", Exhausted())
+    rows, factor = random(1, 2, 3), random(1, 3, 8)
+
+    def in_c(rows: Tensor, factor: Tensor) -> bool:
+        try:
+            found = spread(rows, factor)
+        except MemoryError:
+            return True
+        torch.testing.assert_close(found, rows @ factor)
+        return False
+
+    leaf = rows.clone().requires_grad_()
+    assert in_c(rows, factor)
+    assert in_c(rows.mT.contiguous().mT, torch.nn.Parameter(factor).detach())
+    assert in_c(torch.imag(torch.complex(rows, rows).conj()), factor)
+    assert not in_c(rows.double(), factor.double())
+    assert not in_c(random(2, 2, 3), random(2, 3, 0))
+    assert not in_c(leaf, factor)
+    with torch.no_grad():
+        assert in_c(leaf, factor)
+    with torch.inference_mode():
+        assert in_c(rows, factor)
+    with definitions_only():
+        assert not in_c(rows, factor)
+    assert in_c(rows, factor)
+    assert spread(rows.to("meta"), factor.to("meta")).is_meta
+    torch.vmap(lambda part: torch.testing.assert_close(spread(part, factor).shape, (1, 2, 8)))(rows.expand(4, 1, 2, 3))
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(rows, rows)
+        tangent = torch.autograd.forward_ad.unpack_dual(spread(dual, factor)).tangent
+        torch.testing.assert_close(tangent, rows @ factor)
+
+
+def test_negated_views_are_resolved() -> None:
+    rows, factor = random(1, 2, 3), random(1, 3, 8)
+    negated = torch.imag(torch.complex(rows, rows).conj())
+    assert negated.is_neg()
+    torch.testing.assert_close(spread(negated, factor), -rows @ factor)
 
 
 class Application:
@@ -335,7 +360,9 @@ class Application:
 
 
 def install(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    shutil.copytree(Path(native.__file__).parent, folder / FOLDER, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    shutil.copytree(
+        Path(library.__file__).parent, folder / FOLDER, ignore=shutil.ignore_patterns("*.so", "__pycache__")
+    )
     application = Application()
     hook = CompiledKernels(str(folder), {}, None, None, str(folder), "wheel", application)
     build_data: dict[str, Any] = {"artifacts": [], "pure_python": True}
@@ -365,10 +392,9 @@ def test_installing_goes_on_without_a_compiler(compiler: str, tmp_path: Path, mo
 
 
 def test_without_the_library_torch_does_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(native.instruction_sets, "__file__", str(tmp_path / "instruction_sets.py"))
-    assert native._load() is None
+    monkeypatch.setattr(instruction_sets, "__file__", str(tmp_path / "instruction_sets.py"))
+    assert library._load() is None
     image = random(1, 1, 20, 20).sigmoid()
     with_kernels = nonlocal_operator(image, num_landmarks=20).matmul(image)
-    without = by_torch(monkeypatch, lambda: nonlocal_operator(image, num_landmarks=20).matmul(image))
+    without = by_torch(lambda: nonlocal_operator(image, num_landmarks=20).matmul(image))
     torch.testing.assert_close(with_kernels, without, atol=1e-4, rtol=0)
-    assert nystrom.native is native

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 
 LIBRARIES = ("torch", "kornia", "numpy", "scikit-image", "scipy", "opencv-python-headless")
 
@@ -22,7 +22,7 @@ def describe() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "instructions": torch.backends.cpu.get_cpu_capability(),
-        "kernels": native.LEVELS[native.level],
+        "kernels": NAMES[level(load_library())],
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),

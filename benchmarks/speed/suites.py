@@ -19,7 +19,7 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.core import kernels as native
+from nlfilter_torch.core.kernels import definitions_only
 
 COMPARED = 1 << 27  # bytes of the largest factor that is made in float64, too; the main case always is
 
@@ -49,12 +49,8 @@ def without_kernels(call: Call) -> Call:
     """The same by torch alone, as it is where no C compiler was at hand."""
 
     def slower() -> None:
-        level = native.level
-        native.level = 0
-        try:
+        with definitions_only():
             call()
-        finally:
-            native.level = level
 
     return slower
 

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from nlfilter_torch.core.blocks import strips
 from nlfilter_torch.core.precision import full_precision
 
 Gradients = tuple[Tensor | None, ...]
@@ -59,23 +58,9 @@ def outer_product(left: Tensor, right: Tensor) -> Tensor:
     return OuterProduct(left, right)
 
 
-def strips_of_gradient(gradient: Tensor, count: int) -> Tensor:
-    """:func:`strips` of a gradient (1, M, N), low-rank or ordinary."""
-    if isinstance(gradient, OuterProduct) and count > 1:
-        return OuterProduct(gradient.left.expand(count, -1, -1), strips(gradient.right, count))
-    return strips(gradient, count)
-
-
 def factors_of(gradient: Tensor) -> tuple[Tensor, ...]:
     """The parts (B, M, r) and (B, r, N) of a low-rank gradient, or an ordinary gradient alone."""
     return (gradient.left, gradient.right) if isinstance(gradient, OuterProduct) else (gradient,)
-
-
-def write_columns(gradient: Tensor, block: slice, out: Tensor) -> Tensor:
-    """The columns ``block`` of a gradient (B, M, N), low-rank or ordinary, in ``out`` (B, M, n)."""
-    if isinstance(gradient, OuterProduct):
-        return torch.bmm(gradient.left, gradient.right[:, :, block], out=out)
-    return out.copy_(gradient[:, :, block])
 
 
 def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:

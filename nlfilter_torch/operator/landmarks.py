@@ -1,14 +1,13 @@
 """Features to landmarks, the few points through which every affinity passes. Paper: Sec. II-C, set A."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core import kernels as native
 from nlfilter_torch.core.communicator import Shard, from_first, gather_columns
+from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
@@ -27,7 +26,6 @@ ITERATIONS = 5
 # Scores that differ by so many units of rounding are tied. Constant and periodic pictures with coordinates have many
 # ties, which must not be decided by the order in which a kernel adds up.
 TIE = 16
-CACHED_SCORES = 1 << 20  # of points against centres; on a processor a batch goes in parts with no more
 LARGEST = 1e16  # features whose squares float32 can still add up
 MANY = 1 << 24  # a permutation of more pixels would take more memory than the image
 
@@ -104,10 +102,10 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shar
     # Half of them start the clusters, drawn at random.
     few = torch.randperm(points.shape[2], generator=generator, device=generator.device)
     few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)].to(points.device)
-    pivots = _pivots(gather_columns(points, few, None), count, generator)
-    start = from_first(few[pivots], shard).unsqueeze(1)  # (B, 1, M)
-    assignment = from_first(_lloyd(points, _pick(points, start)), shard)
-    return _cluster_means(subset, assignment, _pick(subset, start))
+    chosen = _pivots(gather_columns(points, few, None), count, generator)
+    start = from_first(few[chosen], shard).unsqueeze(1)  # (B, 1, M)
+    assignment = from_first(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps), shard)
+    return _cluster_means(subset, assignment, pick(subset, start))
 
 
 def _bounded(candidates: int, most: int, count: int) -> int:
@@ -153,15 +151,7 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         offsets = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points.device)
         images = points.split(1) if points.device.type == "cpu" else [points]  # columns of one at a time
         return torch.cat([_pivots_by_blocks(image, draws, offsets) for image in images])
-    if native.suits(points, draws):
-        return native.pivots(points, draws, EXPLAINED)
-    norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
-    ones = torch.ones_like(norms)
-
-    def affinities(pivot: Tensor) -> Tensor:
-        return _affinities(points, norms, _pick(points, pivot), _pick(norms, pivot))
-
-    return _draw_pivots(affinities, ones, ones, draws)[0].squeeze(1)
+    return pivots(points, draws, EXPLAINED)
 
 
 def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
@@ -175,107 +165,32 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
     residual = torch.ones_like(norms)
     columns = points.new_empty(batch, len(draws), size)
-    pivots: list[Tensor] = []
+    found: list[Tensor] = []
     for block, offset in zip(draws.split(BLOCK), offsets, strict=False):
-        first = sum(pivot.shape[2] for pivot in pivots)
+        first = sum(pivot.shape[2] for pivot in found)
         before = columns[:, :first]
-        chance = _chance(residual)
-        chance += chance.mean(2, keepdim=True)
-        summed = chance.cumsum(2, dtype=torch.float64)
+        odds = chance(residual, EXPLAINED)
+        odds += odds.mean(2, keepdim=True)
+        summed = odds.cumsum(2, dtype=torch.float64)
         ticks = (torch.arange(PROPOSED * len(block), device=points.device) + offset) / (PROPOSED * len(block))
         proposed = torch.searchsorted(summed, summed[:, :, -1:] * ticks).clamp_(max=size - 1)  # (B, 1, P)
-        few, lengths, known = (_pick(planes, proposed) for planes in (points, norms, before))
-        among = torch.baddbmm(_affinities(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
-        chosen, rows, scales = _draw_pivots(
-            partial(_row, among), _pick(residual, proposed), _pick(chance, proposed), block
+        few, lengths, known = (pick(planes, proposed) for planes in (points, norms, before))
+        among = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
+        chosen, rows, scales = draw_pivots(
+            partial(_row, among), pick(residual, proposed), pick(odds, proposed), block, EXPLAINED
         )
-        pivots.append(proposed.gather(2, chosen))  # (B, 1, n)
-        few, lengths, known = (_pick(planes, chosen) for planes in (few, lengths, known))
-        rest = torch.baddbmm(_affinities(points, norms, few, lengths), known.mT, before, alpha=-1)  # (B, n, S)
-        lower = _pick(rows, chosen).mT.tril(-1) + torch.diag_embed(scales)
+        found.append(proposed.gather(2, chosen))  # (B, 1, n)
+        few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))
+        rest = torch.baddbmm(affinities_between(points, norms, few, lengths), known.mT, before, alpha=-1)  # (B, n, S)
+        lower = pick(rows, chosen).mT.tril(-1) + torch.diag_embed(scales)
         columns[:, first : first + len(block)] = torch.linalg.solve_triangular(lower, rest, upper=False)
         residual -= columns[:, first : first + len(block)].square().sum(1, keepdim=True)
-    return torch.cat(pivots, dim=2).squeeze(1)
-
-
-def _draw_pivots(
-    affinities: Callable[[Tensor], Tensor], residual: Tensor, divisor: Tensor, draws: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Pivots (B, 1, M) of a random Cholesky decomposition, its rows (B, M, S), and what they were divided by, (B, M).
-
-    Args:
-        affinities: from pivots (B, 1, 1) to their rows (B, 1, S) of the matrix.
-        residual: its diagonal, (B, 1, S).
-        divisor: of the chances to be drawn, (B, 1, S).
-        draws: (M,) in [0, 1).
-    """
-    rows = residual.new_zeros(residual.shape[0], len(draws), residual.shape[2])
-    pivots, scales = [], []
-    for step, draw in enumerate(draws.unbind()):
-        # Summed in float64, as in C: rounding must not decide which of thousands is drawn.
-        summed = (_chance(residual) / divisor).cumsum(2, dtype=torch.float64)
-        pivot = torch.searchsorted(summed, draw * summed[:, :, -1:]).clamp_(max=residual.shape[2] - 1)  # (B, 1, 1)
-        before = rows[:, :step]
-        row = torch.baddbmm(affinities(pivot), _pick(before, pivot).mT, before, alpha=-1)
-        scale = row.gather(2, pivot).clamp(min=EXPLAINED).sqrt()
-        row /= scale
-        residual = residual - row.square()
-        rows[:, step] = row.squeeze(1)
-        pivots.append(pivot)
-        scales.append(scale)
-    return torch.cat(pivots, dim=2), rows, torch.cat(scales, dim=2).squeeze(1)
-
-
-def _chance(residual: Tensor) -> Tensor:
-    """Relative probability of a pivot."""
-    return residual.clamp(min=EXPLAINED).square().square()
-
-
-def _affinities(points: Tensor, norms: Tensor, others: Tensor, lengths: Tensor) -> Tensor:
-    """Affinities (B, M, S) of points (B, D, S) and others (B, D, M), with their squared norms (B, 1, S), (B, 1, M)."""
-    return torch.baddbmm(norms + lengths.mT, others.mT, points, beta=-1, alpha=2).clamp_(-60.0, 0.0).exp_()
+    return torch.cat(found, dim=2).squeeze(1)
 
 
 def _row(matrices: Tensor, pivot: Tensor) -> Tensor:
     """Row (B, 1, S), at ``pivot`` (B, 1, 1), of symmetric matrices (B, S, S)."""
-    return _pick(matrices, pivot).mT
-
-
-def _pick(planes: Tensor, at: Tensor) -> Tensor:
-    """Columns (B, R, M) of planes (B, R, S) at indices (B, 1, M)."""
-    return planes.gather(2, at.expand(-1, planes.shape[1], -1))
-
-
-def _lloyd(points: Tensor, start: Tensor) -> Tensor:
-    """Assignment (B, S) of points (B, D, S) to clusters, by Lloyd from the centres ``start`` (B, D, M).
-
-    A point as near to several centres, but for rounding, belongs to the first of them: see :data:`TIE`.
-    """
-    margin = TIE * torch.finfo(points.dtype).eps
-    if native.suits(points, start):
-        return native.lloyd(points, start, ITERATIONS, margin)
-    together = max(1, CACHED_SCORES // (points.shape[2] * start.shape[2]))
-    if points.device.type == "cpu" and together < points.shape[0]:
-        return torch.cat([_lloyd(*part) for part in zip(points.split(together), start.split(together), strict=True)])
-    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # distances, or sums and sizes, in a product
-    slack = margin * points.square().sum(1).unsqueeze(2)  # (B, S, 1)
-    centres = start
-    for step in range(ITERATIONS + 1):
-        score = _closeness(extended, centres)
-        best = score.amax(2, keepdim=True)
-        nearest = (score >= best - (slack + margin * best.abs())).byte().argmax(2)  # the first of those nearest
-        if step == ITERATIONS:
-            break
-        members = score.zero_().scatter_(2, nearest.unsqueeze(2), 1.0)
-        sums = extended @ members  # (B, D + 1, M)
-        sizes = sums[:, -1:]
-        centres = torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), start)
-    return nearest
-
-
-def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
-    """Half the squared length of points, (B, D + 1, S) with ones, less half their squared distance to centres."""
-    return extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)  # (B, S, M)
+    return pick(matrices, pivot).mT
 
 
 def _cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:

@@ -16,12 +16,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core import kernels as native
-from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
 from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum
+from nlfilter_torch.core.kernels.grams import gram, sum_grams
+from nlfilter_torch.core.kernels.sweeps import positive_root, sweep, weigh
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
 from nlfilter_torch.operator.landmarks import stratified
-from nlfilter_torch.operator.spectrum import sum_grams
 
 PER_LANDMARK = (8, 32, 160)  # pixels of the sample: its Jacobian is then within 35, 18 or 8 % of the true one
 EXPLORED = 8192  # pixels that the first guess comes from, at most
@@ -49,11 +48,7 @@ def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tens
     A pixel's equation is ``d (u . total + diagonal d) = 1``. Its positive root is formed without cancellation whichever
     sign ``u . total`` has; approximate affinities may be negative.
     """
-    half = spread((total / 2).mT, factor).squeeze(1)
-    root = torch.addcmul(diagonal, half, half).sqrt()
-    # Without a diagonal a negative sum has no root; the bound, below the rounding of 1 - |u|^2, keeps d finite.
-    least = torch.finfo(half.dtype).eps / 4
-    return torch.where(half < 0, (root - half) / diagonal.clamp(min=least), (root + half).clamp(min=least).reciprocal())
+    return positive_root(spread((total / 2).mT, factor).squeeze(1), diagonal)
 
 
 def isolated(scaling: Tensor) -> Tensor:
@@ -121,12 +116,8 @@ class Sample:
         """J, (B, M, M) in float64."""
         slope = scaling.square()
         slope = self.weight * slope / (1 + self.diagonal * slope)
-        if native.suits(self.factor, slope):
-            gram = native.grams(self.factor, slope.sqrt(), slope, 1)[:, 0].to(self.factor)
-        else:
-            gram = (self.factor * slope.unsqueeze(1)) @ self.factor.mT
-        gram = reduce_sum(gram, self.shard)
-        return gram.double() + torch.eye(gram.shape[1], dtype=torch.float64, device=gram.device)
+        total = reduce_sum(gram(self.factor, slope), self.shard)
+        return total.double() + torch.eye(total.shape[1], dtype=torch.float64, device=total.device)
 
     def residual(self, total: Tensor, found: Tensor) -> Tensor:
         """Largest deviation of a row sum from 1 among the sample, (B,), where d(total) has the moment ``found``."""
@@ -193,19 +184,10 @@ def _sweep(
 ) -> tuple[Tensor, Tensor]:
     """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor, two if they have weights."""
     half = (total / 2).squeeze(2).to(factor)
-    if native.suits(factor, diagonal, half):
-        scaling, found = native.sweep(factor, diagonal, half, LARGEST)
-        if weights is not None:
-            return scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
-        return scaling, reduce_sum(found.unsqueeze(2), shard)
-    scaling, found = torch.empty_like(diagonal), torch.zeros_like(total)
-    row = total.to(factor)
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        columns = factor[:, :, block]
-        torch.clamp(scaling_from_moment(columns, diagonal[:, block], row), max=LARGEST, out=scaling[:, block])
-        part = None if weights is None else weights[:, block]
-        found += gather(weighted(scaling[:, None, block], part), columns).mT
-    return scaling, reduce_sum(found, shard)
+    scaling, found = sweep(factor, diagonal, half, LARGEST)
+    if weights is not None:
+        return scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
+    return scaling, reduce_sum(found.unsqueeze(2), shard)
 
 
 @dataclass(frozen=True)
@@ -235,13 +217,8 @@ def solve(
     On a processor the result has a residual of at most ``tolerance`` or of rounding, unless no scaling balances the
     kernel. On an accelerator a fixed number of sweeps is taken, as reading a residual would stall its queue.
     """
-    single = factor.detach().float() if factor.dtype == torch.float64 and native.level else factor
-    quick = single is not factor and native.suits(single)
-    found = (
-        _refined(factor, single, diagonal, tolerance, shard, weights)
-        if quick
-        else _quasi_newton(factor, diagonal, tolerance, shard, weights)
-    )
+    solver = _refined if factor.dtype == torch.float64 and factor.device.type == "cpu" else _quasi_newton
+    found = solver(factor, diagonal, tolerance, shard, weights)
     if factor.device.type != "cpu" or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
         return found
     return damped(factor, diagonal, found, tolerance, shard, weights)
@@ -298,15 +275,10 @@ def _quasi_newton(
 
 
 def _refined(
-    factor: Tensor,
-    single: Tensor,
-    diagonal: Tensor,
-    tolerance: float,
-    shard: Shard | None,
-    weights: Tensor | None,
+    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None, weights: Tensor | None
 ) -> Solution:
     """A solution in float64, by steps worked out from the factor in float32, for which there are kernels in C."""
-    each = None if weights is None else weights.float()
+    single, each = factor.float(), None if weights is None else weights.float()
     rough = _quasi_newton(single, diagonal.float(), max(tolerance, ROUGHLY), shard, each)
     total, sweeps = rough.moment, rough.sweeps
     for _ in range(MAX_SWEEPS):
@@ -410,14 +382,7 @@ def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None, weights: Te
 
 def weighted_moment(factor: Tensor, weight: Tensor, shard: Shard | None, total: Tensor) -> Tensor:
     """``factor @ (weight * (factor^T total))``, (B, M, 1) in float64."""
-    row = total.to(factor).mT
-    if native.suits(factor, weight, row):
-        return reduce_sum(native.weigh(factor, weight, row[:, 0]).unsqueeze(2), shard)
-    found = factor.new_zeros(*factor.shape[:2], 1, dtype=torch.float64)
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        columns = factor[:, :, block]
-        found += gather(weight[:, None, block] * spread(row, columns), columns).mT
-    return reduce_sum(found, shard)
+    return reduce_sum(weigh(factor, weight, total.to(factor).squeeze(2)).unsqueeze(2), shard)
 
 
 def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, shard: Shard | None) -> Tensor:

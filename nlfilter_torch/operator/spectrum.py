@@ -14,19 +14,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core import kernels as native
 from nlfilter_torch.core.autograd import once_differentiable
 from nlfilter_torch.core.blocks import (
     SWEPT,
     buffered_blocks,
     fold_batch,
     pixel_blocks,
-    strip_count,
-    strips,
     unfold_batch,
 )
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.core.communicator import Shard, reduce_sum
+from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
@@ -243,28 +241,6 @@ def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tens
     # G^(-1/2) G^2 G^(-1/2) is G where it is kept; as a product it would be rounding in its smallest eigenvalues.
     projected = gram.apply(lambda values: values, kept) + root @ grams[:, 1:].sum(1) @ root
     return root, (projected + projected.mT) / 2, kept.sum(1)
-
-
-def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
-    """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64, block by block.
-
-    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small. Of r
-    there is no need for one sum.
-    """
-    weights = scaling if remainder is None else remainder
-    if native.suits(factor, scaling, weights):
-        return native.grams(factor, scaling, weights, count)
-    batch, marks, pixels = factor.shape
-    parts = strip_count(batch, pixels, factor.device)
-    factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), weights.unsqueeze(1)))
-    total = factor.new_zeros(len(factor), count, marks, marks, dtype=torch.float64)
-    for block, (rows, weighted) in buffered_blocks(factor, 2):
-        left = torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
-        for j in range(count):
-            if j:
-                left = torch.mul(left, weights[:, :, block], out=weighted)
-            total[:, j] += left @ rows.mT
-    return total.sum(0, keepdim=True) if parts > 1 else total
 
 
 def compute_grams(

@@ -8,9 +8,9 @@ the same products run on all cores.
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core import kernels as native
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.core.communicator import Shard, reduce_sum
+from nlfilter_torch.core.kernels.library import by_rows, place, pointer, register_differentiable, run_on_factor
 
 FEW = range(1, 9)  # rows for which the kernels in C are the quickest
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
@@ -19,9 +19,11 @@ MOST_GATHERED = 24
 
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
     """``rows @ factor diag(scaling)``, (B, R, N), of rows (B, R, M), a factor (B, M, N), perhaps a scaling (B, N)."""
-    tensors = (rows, factor) if scaling is None else (rows, factor, scaling)
-    if native.suits(*tensors) and rows.shape[1] in FEW:
-        return native.spread(*tensors)
+    found: Tensor = _spread(rows, factor, scaling)
+    return found
+
+
+def _define_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
     if scaling is not None:
         return spread(rows, factor) * scaling.unsqueeze(1)
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
@@ -38,6 +40,22 @@ def _spread_one(row: Tensor, factor: Tensor) -> Tensor:
     """``row @ factor``, (1, 1, n), of a row (1, 1, M) and a factor (1, M, n), strip by strip."""
     parts = _parts(factor)  # (P, M, n / P)
     return torch.bmm(row.expand(len(parts), -1, -1), parts).view(1, 1, -1)
+
+
+def _compiled_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
+    if rows.shape[1] not in FEW:
+        return _define_spread(rows, factor, scaling)
+    factor = by_rows(factor)
+    batch, landmarks, pixels = factor.shape
+    rows = rows.expand(batch, -1, landmarks).contiguous()
+    scaling = None if scaling is None else scaling.expand(batch, pixels).contiguous()
+    out = factor.new_empty(batch, rows.shape[1], pixels)
+    run_on_factor("spread", factor, rows.shape[1], rows.data_ptr(), pointer(scaling), out.data_ptr())
+    return out
+
+
+def _fake_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
+    return factor.new_empty(factor.shape[0], rows.shape[1], factor.shape[2])
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
@@ -60,16 +78,34 @@ def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor
         shard: of the image, where other ranks have the rest of it.
 
     Returns:
-        (B, M, C) in float64. Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
+        (B, M, C) in float64.
     """
-    if native.suits(factor, images) and images.shape[1] in FEW:
-        return reduce_sum(native.gather(images, factor).mT, shard)
-    batch, marks, _ = factor.shape
+    return reduce_sum(_moment(factor, images), shard)
+
+
+def _define_moment(factor: Tensor, images: Tensor) -> Tensor:
+    batch, landmarks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
-    total = factor.new_zeros(batch, marks, images.shape[1], dtype=torch.float64)
+    total = factor.new_zeros(batch, landmarks, images.shape[1], dtype=torch.float64)
+    # Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
     for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
         total = total + gather(part, rows).mT
-    return reduce_sum(total, shard)
+    return total
+
+
+def _compiled_moment(factor: Tensor, images: Tensor) -> Tensor:
+    if images.shape[1] not in FEW:
+        return _define_moment(factor, images)
+    factor = by_rows(factor)
+    batch, landmarks, pixels = factor.shape
+    images = by_rows(images.expand(batch, -1, pixels))
+    out = factor.new_empty(batch, images.shape[1], landmarks, dtype=torch.float64)
+    run_on_factor("gather", factor, images.shape[1], *place(images), out.data_ptr())
+    return out.mT.contiguous()
+
+
+def _fake_moment(factor: Tensor, images: Tensor) -> Tensor:
+    return factor.new_empty(factor.shape[0], factor.shape[1], images.shape[1], dtype=torch.float64)
 
 
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:
@@ -83,3 +119,14 @@ def _is_parted(thin: Tensor, factor: Tensor) -> bool:
 def _parts(planes: Tensor) -> Tensor:
     """Planes (1, R, n) as a batch of strips."""
     return strips(planes, strip_count(1, planes.shape[2], planes.device))
+
+
+_spread = register_differentiable(
+    "spread(Tensor rows, Tensor factor, Tensor? scaling=None) -> Tensor",
+    _define_spread,
+    _compiled_spread,
+    _fake_spread,
+)
+_moment = register_differentiable(
+    "moment(Tensor factor, Tensor images) -> Tensor", _define_moment, _compiled_moment, _fake_moment
+)

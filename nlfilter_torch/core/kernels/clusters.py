@@ -1,0 +1,150 @@
+"""What k-means takes: the points to start from, pivots of a random Cholesky decomposition, and Lloyd's iteration."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.kernels.library import contiguous, register, run
+
+CACHED_SCORES = 1 << 20  # of points against centres; on a processor a batch goes in parts with no more
+
+
+def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
+    """Pivots (B, M) of a random Cholesky decomposition of the affinities of points (B, D, S).
+
+    Args:
+        points: (B, D, S).
+        draws: (M,) in [0, 1), what each pivot is drawn by.
+        captured: a residual of the unit diagonal that counts as none.
+    """
+    found: Tensor = _pivots(points, draws, captured)
+    return found
+
+
+def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M).
+
+    The first of those that are as near but for ``margin`` times the terms of which scores are the sums.
+    """
+    nearest: Tensor = _lloyd(points, start, iterations, margin)
+    return nearest
+
+
+def draw_pivots(
+    affinities: Callable[[Tensor], Tensor], residual: Tensor, divisor: Tensor, draws: Tensor, captured: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pivots (B, 1, M) of a random Cholesky decomposition, its rows (B, M, S), and what they were divided by, (B, M).
+
+    Args:
+        affinities: from pivots (B, 1, 1) to their rows (B, 1, S) of the matrix.
+        residual: its diagonal, (B, 1, S).
+        divisor: of the chances to be drawn, (B, 1, S).
+        draws: (M,) in [0, 1).
+        captured: a residual that counts as none.
+    """
+    rows = residual.new_zeros(residual.shape[0], len(draws), residual.shape[2])
+    found, scales = [], []
+    for step, draw in enumerate(draws.unbind()):
+        # Summed in float64, as in C: rounding must not decide which of thousands is drawn.
+        summed = (chance(residual, captured) / divisor).cumsum(2, dtype=torch.float64)
+        pivot = torch.searchsorted(summed, draw * summed[:, :, -1:]).clamp_(max=residual.shape[2] - 1)  # (B, 1, 1)
+        before = rows[:, :step]
+        row = torch.baddbmm(affinities(pivot), pick(before, pivot).mT, before, alpha=-1)
+        scale = row.gather(2, pivot).clamp(min=captured).sqrt()
+        row /= scale
+        residual = residual - row.square()
+        rows[:, step] = row.squeeze(1)
+        found.append(pivot)
+        scales.append(scale)
+    return torch.cat(found, dim=2), rows, torch.cat(scales, dim=2).squeeze(1)
+
+
+def chance(residual: Tensor, captured: float) -> Tensor:
+    """Relative probability of a pivot."""
+    return residual.clamp(min=captured).square().square()
+
+
+def affinities_between(points: Tensor, norms: Tensor, others: Tensor, lengths: Tensor) -> Tensor:
+    """Affinities (B, M, S) of points (B, D, S) and others (B, D, M), with their squared norms (B, 1, S), (B, 1, M)."""
+    return torch.baddbmm(norms + lengths.mT, others.mT, points, beta=-1, alpha=2).clamp_(-60.0, 0.0).exp_()
+
+
+def pick(planes: Tensor, at: Tensor) -> Tensor:
+    """Columns (B, R, M) of planes (B, R, S) at indices (B, 1, M)."""
+    return planes.gather(2, at.expand(-1, planes.shape[1], -1))
+
+
+def _define_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
+    norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
+    ones = torch.ones_like(norms)
+
+    def affinities(pivot: Tensor) -> Tensor:
+        return affinities_between(points, norms, pick(points, pivot), pick(norms, pivot))
+
+    return draw_pivots(affinities, ones, ones, draws, captured)[0].squeeze(1)
+
+
+def _compiled_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
+    points, draws = contiguous(points, draws)
+    batch, size, count = points.shape
+    found = torch.empty(batch, len(draws), dtype=torch.long)
+    arguments = (size, count, len(draws), captured, points.data_ptr(), draws.data_ptr(), found.data_ptr())
+    run("pivots", torch.get_num_threads(), batch, *arguments)
+    return found
+
+
+def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
+    return points.new_empty(points.shape[0], draws.shape[0], dtype=torch.long)
+
+
+def _define_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    together = max(1, CACHED_SCORES // (points.shape[2] * start.shape[2]))
+    if points.device.type == "cpu" and together < points.shape[0]:
+        parts = zip(points.split(together), start.split(together), strict=True)
+        return torch.cat([_define_lloyd(*part, iterations, margin) for part in parts])
+    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # distances, or sums and sizes, in a product
+    slack = margin * points.square().sum(1).unsqueeze(2)  # (B, S, 1)
+    centres = start
+    for step in range(iterations + 1):
+        score = _closeness(extended, centres)
+        best = score.amax(2, keepdim=True)
+        nearest = (score >= best - (slack + margin * best.abs())).byte().argmax(2)  # the first of those nearest
+        if step == iterations:
+            break
+        members = score.zero_().scatter_(2, nearest.unsqueeze(2), 1.0)
+        sums = extended @ members  # (B, D + 1, M)
+        sizes = sums[:, -1:]
+        centres = torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), start)
+    return nearest
+
+
+def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
+    """Half the squared length of points, (B, D + 1, S) with ones, less half their squared distance to centres."""
+    return extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)  # (B, S, M)
+
+
+def _compiled_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    points, start = contiguous(points, start)
+    batch, size, count = points.shape
+    nearest = torch.empty(batch, count, dtype=torch.int32)
+    run(
+        "lloyd", torch.get_num_threads(), batch, size, count, start.shape[2], iterations, margin, points.data_ptr(),
+        start.data_ptr(), nearest.data_ptr(),
+    )  # fmt: skip
+    return nearest.long()
+
+
+def _fake_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    return points.new_empty(points.shape[0], points.shape[2], dtype=torch.long)
+
+
+_pivots = register(
+    "pivots(Tensor points, Tensor draws, float captured) -> Tensor", _define_pivots, _compiled_pivots, _fake_pivots
+)
+_lloyd = register(
+    "lloyd(Tensor points, Tensor start, int iterations, float margin) -> Tensor",
+    _define_lloyd,
+    _compiled_lloyd,
+    _fake_lloyd,
+)

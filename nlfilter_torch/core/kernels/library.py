@@ -1,0 +1,172 @@
+"""The kernels in C, and how torch's dispatcher comes to call them.
+
+They are compiled when the package is installed (``hatch_build.py``), for Linux on x86-64, where there is GCC. Nothing
+is compiled or looked for later. Each belongs to an operator of ``torch.ops.nlfilter``, whose definition in torch
+computes the same everywhere else: on other devices, in other dtypes, under transforms and for derivatives.
+"""
+
+import ctypes
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from nlfilter_torch.core import instruction_sets
+from nlfilter_torch.core.checks import is_transformed
+
+SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
+OPERATORS = torch.library.Library("nlfilter", "DEF")
+
+_POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
+
+
+def _load() -> ctypes.CDLL | None:
+    """The compiled library, if the installation has one."""
+    library = instruction_sets.load_library()
+    if library is None:
+        return None
+    shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
+    share_threads(library, _openmp())
+    planes: list[Any] = [_POINTER, _LONG, _LONG]  # (B, R, N) and their strides
+    columns: list[Any] = [*shared, _LONG, _LONG, _LONG, *planes, *[_POINTER] * 3, _FLOAT, _INT, *planes, _POINTER]
+    library.nlfilter_columns.argtypes = columns
+    library.nlfilter_backward.argtypes = [*columns, _LONG, _POINTER, *planes, *[_POINTER] * 4]
+    factor: list[Any] = [_LONG, _LONG, *planes]  # images, landmarks, (B, M, N)
+    library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
+    library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, *planes, _POINTER]
+    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER]
+    library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, _FLOAT, *[_POINTER] * 3]
+    library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
+    library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
+    return library
+
+
+def _openmp() -> Any:
+    """The function by which torch's own OpenMP library runs another on its threads; None where it is not found."""
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    loaded = {line.split(maxsplit=5)[5] for line in maps if "omp" in line.rpartition("/")[2] and ".so" in line}
+    for path in sorted(loaded, key=lambda path: "torch" not in path):  # other packages may have brought their own
+        function = getattr(ctypes.CDLL(path), "GOMP_parallel", None)
+        if function is not None:
+            return function
+    return None
+
+
+def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
+    """Let kernels run on the threads of an OpenMP library, by its ``GOMP_parallel``; None has them start their own."""
+    library.nlfilter_share_threads(ctypes.cast(openmp, _POINTER) if openmp is not None else None)
+
+
+_library = _load()
+level = instruction_sets.level(_library)  # of instruction_sets.NAMES, what this processor and installation can do
+
+
+@contextmanager
+def definitions_only() -> Iterator[None]:
+    """Have torch do the work of the kernels in C, for tests and comparisons; in all threads."""
+    global level
+    before, level = level, 0
+    try:
+        yield
+    finally:
+        level = before
+
+
+def register(
+    schema: str, definition: Callable[..., Any], compiled: Callable[..., Any], fake: Callable[..., Any]
+) -> Any:
+    """Make an operator of ``torch.ops.nlfilter``.
+
+    Args:
+        schema: its name and signature.
+        definition: what it computes, for every dtype and device.
+        compiled: the same by a kernel in C, for tensors that are float32 and not empty, on processors.
+        fake: uninitialised results, from the shapes of the arguments.
+    """
+    name = schema.partition("(")[0]
+
+    def on_processors(*arguments: Any) -> Any:
+        return (compiled if level and all(map(_suits, arguments)) else definition)(*arguments)
+
+    OPERATORS.define(schema)
+    OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
+    OPERATORS.impl(name, on_processors, "CPU")
+    torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
+    return getattr(torch.ops.nlfilter, name).default
+
+
+def register_differentiable(
+    schema: str, definition: Callable[..., Any], compiled: Callable[..., Any], fake: Callable[..., Any]
+) -> Any:
+    """:func:`register` an operator whose definition is made of differentiable operations.
+
+    Autograd, in reverse and forward mode and of any order, and the transforms of ``torch.func`` see these operations.
+    """
+    operator = register(schema, definition, compiled, fake)
+
+    def under_autograd(keys: Any, *arguments: Any) -> Any:
+        if any(map(_is_derived, arguments)):
+            return definition(*arguments)
+        return operator.redispatch(keys & torch._C._after_autograd_keyset, *arguments)
+
+    name = schema.partition("(")[0]
+    OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
+    OPERATORS.impl(name, definition, "FuncTorchBatched")
+    return operator
+
+
+def _suits(argument: Any) -> bool:
+    """Whether the kernels can work on an argument: a number, or float32 and not empty."""
+    if isinstance(argument, Tensor):
+        return argument.dtype == torch.float32 and argument.numel() > 0
+    return not isinstance(argument, list) or all(map(_suits, argument))
+
+
+def _is_derived(argument: Any) -> bool:
+    """Whether an argument has derivatives to keep track of."""
+    return isinstance(argument, Tensor) and (
+        (argument.requires_grad and torch.is_grad_enabled())
+        or is_transformed(argument)
+        or forward_ad.unpack_dual(argument).tangent is not None
+    )
+
+
+def by_rows(planes: Tensor) -> Tensor:
+    """Planes (B, R, N) with each of their rows in one piece, however far they are apart."""
+    return planes if planes.stride(2) == 1 else planes.contiguous()
+
+
+def contiguous(*tensors: Tensor) -> Iterator[Tensor]:
+    """Each of the tensors in one piece."""
+    return (tensor.contiguous() for tensor in tensors)
+
+
+def place(planes: Tensor) -> tuple[int, int, int]:
+    """Where planes (B, R, N) with rows in one piece are, and how far images and rows are apart."""
+    return planes.data_ptr(), planes.stride(0), planes.stride(1)
+
+
+def pointer(tensor: Tensor | None) -> int | None:
+    """Where a tensor in one piece is."""
+    return None if tensor is None else tensor.data_ptr()
+
+
+def threads(factor: Tensor) -> int:
+    """As many as torch would use, but for small work."""
+    return 1 if factor.numel() < SMALL else torch.get_num_threads()
+
+
+def run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:
+    """Run a kernel on ``count`` pixels, or images."""
+    if getattr(_library, f"nlfilter_{name}")(level, threads, count, *arguments):
+        raise MemoryError("no memory is left for the buffers of a few rows; make the image smaller")
+
+
+def run_on_factor(name: str, factor: Tensor, *arguments: int | float | None) -> None:
+    """Run a kernel on all pixels of a factor (B, M, N) with rows in one piece."""
+    batch, landmarks, pixels = factor.shape
+    run(name, threads(factor), pixels, batch, landmarks, *place(factor), *arguments)

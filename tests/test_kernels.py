@@ -1,0 +1,89 @@
+"""The operators of ``torch.ops.nlfilter`` are what torch expects of an operator, by the kernels in C and without."""
+
+from contextlib import nullcontext
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.kernels import columns, definitions_only, grams, sweeps
+from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
+from nlfilter_torch.operator.nystrom import whitener
+
+BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
+DERIVED = ("spread", "moment")
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
+    """Arguments of every operator, by its name."""
+    features, landmarks = random(BATCH, SIZE, PIXELS).to(dtype), random(BATCH, SIZE, LANDMARKS, seed=1).to(dtype)
+    inputs = (features, landmarks, whitener(landmarks))
+    factor, norms = columns.columns(*inputs, limited=True)
+    vector, rows = random(BATCH, LANDMARKS, seed=2).to(dtype), random(BATCH, ROWS, LANDMARKS, seed=3).to(dtype)
+    images = random(BATCH, ROWS, PIXELS, seed=4).to(dtype)
+    weights = images[:, 0].exp()
+    backward = (*inputs, True, factor, norms.clamp(min=1.0).rsqrt())
+    return {
+        "columns": (*inputs, True),
+        "columns_backward": (*backward, [rows.mT.contiguous(), images], weights),
+        "spread": (rows, factor, weights),
+        "moment": (factor, images),
+        "sweep": (factor, weights, vector, 2.0, weights),
+        "weigh": (factor, weights, vector),
+        "grams": (factor, weights, weights, 2),
+        "gram": (factor, weights),
+        "pivots": (features, torch.linspace(0.1, 0.9, LANDMARKS, dtype=dtype), 1e-4),
+        "lloyd": (features, landmarks, 3, 1e-6),
+    }
+
+
+NAMES = sorted(arguments(torch.float32))
+
+
+def test_every_operator_is_checked() -> None:
+    registered = {
+        name.split("::")[1] for name in torch._C._dispatch_get_all_op_names() if name.startswith("nlfilter::")
+    }
+    assert registered == set(NAMES)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")
+@pytest.mark.parametrize("in_c", [True, False], ids=["C", "torch"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("name", NAMES)
+def test_opcheck(name: str, dtype: torch.dtype, in_c: bool) -> None:
+    operator, given = getattr(torch.ops.nlfilter, name).default, arguments(dtype)[name]
+    with nullcontext() if in_c else definitions_only():
+        torch.library.opcheck(operator, given)
+        if name in DERIVED:
+            torch.library.opcheck(operator, tuple(part.clone().requires_grad_() for part in given))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_accelerators_have_the_definitions(name: str) -> None:
+    assert torch._C._dispatch_has_computed_kernel_for_dispatch_key(f"nlfilter::{name}", "CUDA")
+
+
+def test_weights_count_pixels() -> None:
+    factor, diagonal = random(2, 6, 40).abs() / 10, random(2, 40).sigmoid()
+    half, copies = random(2, 6, seed=1).abs(), torch.arange(40) % 3 + 1
+    repeated = (part.repeat_interleave(copies, dim=-1) for part in (factor, diagonal))
+    for context in (nullcontext(), definitions_only()):
+        with context:
+            scaling, found = sweeps.sweep(factor, diagonal, half, 2.0, copies.expand(2, -1).float())
+    many, expected = sweeps.sweep(*repeated, half, 2.0)
+    torch.testing.assert_close(scaling.repeat_interleave(copies, dim=1), many)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+
+
+def test_a_gram_matrix_of_weighted_columns() -> None:
+    factor, weights = random(2, 6, 400), random(2, 400, seed=1).exp()
+    exact = (factor.double() * weights.double().unsqueeze(1)) @ factor.double().mT
+    torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)
+    with definitions_only():
+        torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)
