@@ -1,4 +1,4 @@
-"""How long the editor takes from a hand's move to a picture: python -m benchmarks.app [--side 1000] [--browser].
+"""Time of the editor from a pointer movement to the picture: python -m benchmarks.app [--side 1000] [--browser].
 
 Prints medians and quartiles of 20, in milliseconds, on a square preview; with ``--browser`` from the pointer's move to
 the picture in a headless Chromium as well, over the server and its pictures as JPEG.

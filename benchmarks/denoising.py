@@ -1,4 +1,4 @@
-"""Held-out photographs with noise, other denoisers, and a table of PSNRs: what a trained denoiser is judged by."""
+"""Evaluation of denoisers: noisy held-out photographs, other denoisers, and a table of PSNRs."""
 
 import math
 import statistics

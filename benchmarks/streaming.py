@@ -1,6 +1,6 @@
 """Time, memory and exactness of pictures that are worked out by rows: ``python -m benchmarks.streaming``.
 
-A mosaic of photographs, each piece turned, darkened or lightened and roughened in its own way, goes into a BigTIFF
+A mosaic of photographs, each piece randomly rotated, darkened or lightened and textured, goes into a BigTIFF
 file; a fresh process filters it into another. Time is that of the processor, summed over its cores, so that other work
 on the machine does little to it. Peaks are the kernel's own (VmHWM; Linux only), over what is resident when the program
 and its libraries have been read. ``--quick`` runs everything on a fraction of a megapixel.

@@ -1,8 +1,8 @@
 """Train a denoiser around the filter and judge it: ``python -m benchmarks.train_denoiser [--out FOLDER]``.
 
-A place to start from for a training of your own. A network of small convolutions looks at the noisy image and says two
-things of every pixel: a vector of features, the guide, so that W links pixels that the network finds alike, and the
-sliders. It never says what value a pixel should have: of ``y, W y, ..., W^k y`` every pixel takes shares that are
+A starting point for your own training. From the noisy image a small convolutional network computes two outputs per
+pixel: a feature vector, the guide, so that W links pixels with similar features, and the sliders. It computes no pixel
+values: the output is a convex combination of ``y, W y, ..., W^k y`` at every pixel, with weights that are
 positive and sum to one. The filter does the denoising, and everything learns end to end: network, bandwidths, sliders.
 
 It trains on crops of photographs that come with scikit-image, with fresh white noise of 25 grey levels. It is judged on

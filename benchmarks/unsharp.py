@@ -1,4 +1,4 @@
-"""What photographs are sharpened with elsewhere: detail images whose multiples are added to the photograph.
+"""Other sharpening methods: detail images whose multiples are added to the photograph.
 
 Adaptive unsharp masking after Polesel, Ramponi and Mathews, "Image Enhancement via Adaptive Unsharp Masking", IEEE
 Transactions on Image Processing 9(3), 2000, the paper's [12].

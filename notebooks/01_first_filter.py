@@ -43,10 +43,10 @@ show_images({"The photograph": image, "Its luminance": luminance}, side=280)
 # %% [markdown]
 # ## 2. Its filter
 #
-# The operator W links each of the 38,400 pixels to all others, by how alike the 5x5 patches around them are. A hundred
-# typical patches, the landmarks, stand for all, so that the matrix of more than a thousand million entries never exists. The diagnostics tell
-# how good a stand-in that is: look at `row_sum_residual` (W averages, so its rows sum to 1), and at beta, the part of the
-# picture that the filter's eigenvectors explain.
+# The operator W links each of the 38,400 pixels to all others, by the similarity of the 5x5 patches around them. A hundred
+# typical patches, the landmarks, represent all of them, so the matrix of more than a thousand million entries is never formed.
+# The diagnostics measure this approximation: look at `row_sum_residual` (W averages, so its rows sum to 1), and at beta, the
+# share of the picture that the filter's eigenvectors capture.
 
 # %%
 operator = nonlocal_operator(luminance)
@@ -55,7 +55,7 @@ print(f"beta = {captured_energy(spectrum, luminance).item():.4f}")
 operator.diagnostics()
 
 # %% [markdown]
-# ## 3. What it sees
+# ## 3. Its eigenvectors
 #
 # The eigenvectors are patterns of the picture itself. The first ones separate large areas of light and dark; later ones pick
 # out edges and texture. Note that each of them joins places far apart, wherever the picture is alike.
@@ -81,9 +81,9 @@ calm = edit_luminance(image, lambda y: polynomial_filter(operator, y, torch.tens
 show_images({"alpha = (3, 3, 4, 1.05)": crisp, "before": image, "alpha = (0, 0.3, 1, 1)": calm}, side=280)
 
 # %% [markdown]
-# ## 5. Move them
+# ## 5. Move the sliders
 #
-# Once the layers are there, an edit is their weighted sum, quick enough for sliders that are dragged. The curve below the
+# Given the layers, an edit is their weighted sum, fast enough for interactive sliders. The curve below the
 # picture is the gain of each eigenvalue: the four numbers are a polynomial. Fine detail is on its left, the smooth shading
 # on its right; the dots are the eigenvalues of this photograph. (The sliders move when the notebook runs, not on a page.)
 

@@ -12,10 +12,10 @@
 # ---
 
 # %% [markdown]
-# # Masks and strokes
+# # Masks and scribbles
 #
-# A spot or a stroke stands for everything that looks like it, near or far. From that come masks, edits of one thing only,
-# and colours that spread.
+# A region or a scribble selects all similar pixels, near or far. This gives masks, edits of a single object, and colours that
+# spread.
 
 # %%
 # %matplotlib inline
@@ -39,7 +39,7 @@ def spot(top: int, left: int, height: int = 8, width: int = 8) -> torch.Tensor:
 
 
 # %% [markdown]
-# ## 1. A spot, and all that looks like it
+# ## 1. A region and all similar pixels
 #
 # The filter compares colours here, so its guide is the whole RGB image. A few pixels of the suit select the suit: both
 # arms and the chest, and not the flag, the skin or the background.
@@ -52,10 +52,10 @@ mask = diffusion_mask(spectrum, suit, time=3.0, width=2.0)
 show_mask(image, suit, mask, side=300)
 
 # %% [markdown]
-# ## 2. How far it reaches
+# ## 2. Diffusion time
 #
-# Diffusion time is how far likeness is passed on from pixel to pixel. At 0.5 only cloth of the very same shade is like the
-# spot, at 3 the folds are too, at 20 the hair, the skin and the flag begin to be.
+# Diffusion time sets how far similarity spreads from pixel to pixel. At 0.5 only cloth of the same shade is similar to the
+# region, at 3 the folds are too, and at 20 the hair, the skin and the flag begin to be.
 
 # %%
 masks = {f"time {time:g}": diffusion_mask(spectrum, suit, time=time, width=2.0) for time in (0.5, 1.0, 3.0, 20.0)}
@@ -64,7 +64,7 @@ show_images(masks, side=220)
 # %% [markdown]
 # ## 3. Sliders for each region
 #
-# Two spots, two rows of sliders: the suit gets crisp, the background smooth. The face belongs to neither and stays as it is.
+# Two regions, two rows of sliders: the suit gets crisp, the background smooth. The face belongs to neither and is unchanged.
 
 # %%
 regions = torch.cat([spot(117, 24), spot(12, 100)], dim=1)
@@ -74,8 +74,8 @@ show_images({"before": image, "suit crisp, background smooth": enhance(image, al
 # %% [markdown]
 # ## 4. Another colour
 #
-# Green strokes on the suit. Alone they reach the red of the flag as well, which is not far from orange; spots that are to
-# stay as they are (black here) hold that back, all but a streak. The luminance stays, so folds and shadows do.
+# Green scribbles on the suit. Alone they change the red of the flag as well, which is not far from orange; background scribbles
+# (black here) prevent that, except for a streak. The luminance is unchanged, and so are folds and shadows.
 
 # %%
 strokes = torch.tensor([0.1, 0.6, 0.2]).view(1, 3, 1, 1).expand_as(image)
@@ -89,8 +89,8 @@ show_images({"strokes, and what stays": shown, "without what stays": alone, "rec
 # %% [markdown]
 # ## 5. Colours for a grey photograph
 #
-# Here the strokes carry the true colours at sixty spots drawn at random, and the rest is to be found. Look at the flag and at
-# the skin; where a thing has no stroke, it takes the colour of what is most like it nearby.
+# Here scribbles give the true colours at sixty random positions, and all others are computed. Look at the flag and at the skin:
+# an object without a scribble takes the colour of the most similar pixels nearby.
 
 # %%
 generator = torch.Generator().manual_seed(3)

@@ -12,10 +12,10 @@
 # ---
 
 # %% [markdown]
-# # Sliders that are found
+# # Fitting sliders
 #
-# Somebody edited a photograph, with whatever program. Which sliders do the same? They are found in one step, or by gradient
-# descent where one step is not enough, and kept for other photographs.
+# A photograph was edited in another program. Which sliders have the same effect? They are found by least squares, or by gradient
+# descent where that is not enough, and saved for other photographs.
 
 # %%
 # %matplotlib inline
@@ -43,7 +43,7 @@ luminance = rgb_to_grayscale(image)
 # %% [markdown]
 # ## 1. An edit from elsewhere
 #
-# An unsharp mask of scikit-image, radius 2, which knows nothing of this filter.
+# An unsharp mask of scikit-image, radius 2, unrelated to this filter.
 
 # %%
 sharpened = unsharp_mask(luminance[0, 0].numpy(), radius=2.0, amount=1.5)
@@ -54,8 +54,8 @@ show_images({"before": image, "the edit": edited}, side=380)
 # %% [markdown]
 # ## 2. Its sliders, in one step
 #
-# The filter is linear in its sliders, so the best ones solve a small least-squares problem. They do not hit it exactly: an
-# unsharp mask looks at what is near, this filter at what is alike. The number says how much of the change they explain.
+# The filter is linear in its sliders, so the best ones solve a small least-squares problem. The fit is not exact: an unsharp
+# mask depends on nearby pixels, this filter on similar ones. The number is the share of the change that the sliders reproduce.
 
 # %%
 operator = nonlocal_operator(luminance)
@@ -70,7 +70,7 @@ show_images({"the edit": edited, "by the sliders": edit_luminance(image, lambda 
 plot_response(alpha, operator.spectrum())
 
 # %% [markdown]
-# ## 3. Kept, and used on another photograph
+# ## 3. Saved, and used on another photograph
 #
 # A preset holds the sliders and the filter they belong to. Written to a file it is what
 # `nlfilter-torch detail photo.jpg out.jpg --preset look.json` reads.
@@ -81,7 +81,7 @@ print(look.to_json())
 show_images({"another photograph": other, "with the same look": look.apply(other)}, side=380)
 
 # %% [markdown]
-# Some looks have a name. Each of these is one line of code, or `--preset NAME`.
+# Some looks have names. Each of these is one line of code, or `--preset NAME`.
 
 # %%
 names = ("crisp", "dramatic", "glow", "soft skin", "calm", "smooth")
@@ -90,8 +90,8 @@ show_images({name: PRESETS[name].apply(other) for name in names}, columns=3, sid
 # %% [markdown]
 # ## 4. The filter itself, by gradient descent
 #
-# Least squares finds sliders. How different two spots may be and still count as alike, the bandwidth, it cannot find. But the
-# fit is differentiable, so the bandwidth goes down the gradient of what the best sliders leave unexplained.
+# Least squares finds sliders, but not the bandwidth, the difference up to which two patches count as similar. The fit is
+# differentiable, so the bandwidth follows the gradient of the residual that the best sliders leave.
 
 # %%
 logarithm = estimate_bandwidth(luminance).log().requires_grad_()

@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Inside a network
 #
-# The filter is a layer like any other. Here a small convolution looks at a noisy image and makes the guide; the filter links
-# pixels by what the guide says, and everything learns together: the convolution, the sliders, the bandwidths.
+# The filter is a layer like any other. Here a small convolution computes the guide from a noisy image, the filter links pixels
+# that are similar in the guide, and everything is trained together: the convolution, the sliders, the bandwidths.
 
 # %%
 # %matplotlib inline
@@ -33,7 +33,7 @@ NOISE = 25 / 255
 # %% [markdown]
 # ## 1. The network
 #
-# Nothing but a convolution and the filter. `learn=` names what of the filter trains; whatever must stay positive does.
+# A convolution and the filter. `learn=` names the parameters of the filter to train; bandwidths stay positive.
 
 
 # %%
@@ -44,7 +44,7 @@ class Denoiser(nn.Module):
         self.filter = NonlocalFilter(
             alpha=(0.2, 0.8, 1.0),
             learn=("alpha", "photometric_bandwidth", "spatial_bandwidth"),
-            patch_size=1,  # the convolutions see the surroundings
+            patch_size=1,  # the convolutions cover the surroundings
             photometric_bandwidth=0.2,
             spatial_bandwidth=10.0,
             num_landmarks=32,
@@ -89,8 +89,8 @@ def psnr(clean: torch.Tensor, found: torch.Tensor) -> float:
 # %% [markdown]
 # ## 3. Training
 #
-# A plain loop. Gradients pass through the balancing implicitly and never see a difference of eigenvalues, so nothing here
-# needs care: no clipping, no warm-up.
+# An ordinary loop. Gradients of the balancing are implicit and do not divide by differences of eigenvalues, so clipping and
+# warm-up are not needed.
 
 # %%
 test = torch.from_numpy(rgb2gray(skimage.data.chelsea())).float()[None, None, 60:180, 110:290]
@@ -120,10 +120,11 @@ axis.grid(alpha=0.3)
 figure
 
 # %% [markdown]
-# ## 4. On a picture that it never saw
+# ## 4. On a picture that was not used in training
 #
-# Look at the whiskers and at the skin between the eyes: noise goes where the guide finds many pixels alike. This is a few
-# seconds of training, with few landmarks; more of them when it is used help. `python -m benchmarks.train_denoiser` trains a network of this kind in earnest.
+# Look at the whiskers and at the skin between the eyes: noise disappears where the guide makes many pixels similar. This is the
+# result of a few seconds of training with few landmarks; more of them at test time help. `python -m benchmarks.train_denoiser`
+# trains such a network for longer.
 
 # %%
 network.filter.affinity.num_landmarks = 300
@@ -137,10 +138,10 @@ show_images(
 )
 
 # %% [markdown]
-# ## 5. What the network tells the filter
+# ## 5. The guide
 #
-# The guide has eight channels; these are three of them as red, green and blue. Places of one colour are one thing to the
-# filter.
+# The guide has eight channels; these are three of them as red, green and blue. The filter treats areas of the same colour as
+# similar.
 
 # %%
 with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Fig. 20 and Table I: how much of a photograph its eigenvectors hold."""
+"""Fig. 20 and Table I: how much of a photograph its eigenvectors capture."""
 
 import matplotlib
 from matplotlib.figure import Figure

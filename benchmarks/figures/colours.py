@@ -1,4 +1,4 @@
-"""Figs. 14 to 16: strokes of colour that reach everything alike."""
+"""Figs. 14 to 16: coloured scribbles that change all similar pixels."""
 
 import torch
 from kornia.color import rgb_to_lab

@@ -1,4 +1,4 @@
-"""Fig. 17: fake depth of field, beside what the true depth gives."""
+"""Fig. 17: fake depth of field, compared with blur from the true depth."""
 
 import numpy as np
 import skimage.data

@@ -1,4 +1,4 @@
-"""Fig. 11: masks that reach everything like a region, for several diffusion times."""
+"""Fig. 11: masks of all pixels similar to a region, for several diffusion times."""
 
 import torch
 from matplotlib.figure import Figure

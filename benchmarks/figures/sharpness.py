@@ -1,4 +1,4 @@
-"""Figs. 12 and 13: detail where a region is alike, beside editing everything and beside unsharp masks."""
+"""Figs. 12 and 13: detail in a region's mask, compared with editing everything and with unsharp masks."""
 
 from collections.abc import Callable
 

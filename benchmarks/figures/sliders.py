@@ -1,4 +1,4 @@
-"""Figs. 6 to 10: what the sliders do to eigenvalues and to photographs."""
+"""Figs. 6 to 10: the effect of the sliders on eigenvalues and photographs."""
 
 import torch
 from matplotlib.figure import Figure

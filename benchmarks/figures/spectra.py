@@ -1,4 +1,4 @@
-"""Figs. 1 and 3: what the eigenvectors of the filter look like, with and without the spatial term."""
+"""Figs. 1 and 3: eigenvectors of the filter, with and without the spatial term."""
 
 import matplotlib
 import torch

@@ -1,4 +1,4 @@
-"""What is true of an operator, in float64 from the numbers that it holds."""
+"""Properties of an operator in float64, from its tensors."""
 
 from dataclasses import dataclass
 

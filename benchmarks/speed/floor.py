@@ -1,9 +1,9 @@
 """The least that an operator's matrix products cost with torch on this machine, measured beside it.
 
 Three products cannot be avoided on the way from features (D, N) to a spectrum: landmarks (M, D) with features, the
-whitening (M, M) of the affinities, and the Gram matrix of the factor (M, N): N x D x M and twice N x M x M. Balancing
-adds reads of the factor, taken as ten. Each of the four is timed in several ways and the quickest counts, so that the
-floor is not slow by a clumsy choice:
+inverse Cholesky factor (M, M) with the affinities, and the Gram matrix of the factor (M, N): N x D x M and
+twice N x M x M. Balancing adds reads of the factor, taken as ten. Each of the four is timed in several ways and the
+fastest counts, so that the floor is not slow because of a poor choice:
 
 - a product as one call on the whole, into memory that was used before, and in blocks of 4080 and 16368 pixels whose
   results never leave the cache;

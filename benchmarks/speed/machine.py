@@ -1,4 +1,4 @@
-"""What a figure was measured on."""
+"""The machine and the versions of a measurement."""
 
 import importlib.metadata
 import os

@@ -1,8 +1,8 @@
 """Other filters on the same image, as their libraries offer them.
 
-They are different operators: what they share with this one is the user's errand, to smooth an image without its edges
-or to lift its detail. Each is called with the memory layout and the number type that it is quickest with, and with the
-parameters of its documentation's examples where those fit photographs.
+They are different operators for the same tasks: smoothing an image while keeping its edges, or enhancing its detail.
+Each is called with its fastest memory layout and number type, and with the parameters of its documentation's examples
+if those suit photographs.
 """
 
 from collections.abc import Callable

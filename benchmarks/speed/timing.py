@@ -1,4 +1,4 @@
-"""Medians and quartiles of calls that take turns, so that a slow minute of the machine slows all of them alike."""
+"""Medians and quartiles of calls that take turns, so that slow minutes of the machine affect all of them equally."""
 
 import math
 import time

@@ -235,9 +235,9 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
-    explained = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
+    captured = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
     energy = reduce_sum(image.to(spectrum.factor).square().sum((1, 2, 3)), spectrum.shard)
-    inner = reduce_sum((explained * image.to(spectrum.factor)).sum((1, 2, 3)), spectrum.shard)  # y^T V V^T y
+    inner = reduce_sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)), spectrum.shard)  # y^T V V^T y
     return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))
 
 

@@ -170,8 +170,8 @@ def fit_strokes(
 
     # The last column extends scribbles of ones: how much each pixel is determined by them. Generalised least squares
     # gets the mean from the residuals of both, and pixels that are not determined get their share of it.
-    unexplained = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
-    mean = unexplained[:, :-1] / unexplained[:, -1:]
+    residual = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
+    mean = residual[:, :-1] / residual[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
     return FittedStrokes((solution[:, :, :-1] - solution[:, :, -1:] * share).mT, share.mT)
 
