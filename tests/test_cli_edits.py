@@ -246,7 +246,7 @@ def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     )
     assert "text.png is not a PNG" in sentence("recolor", "in.png", "--strokes", tmp_path / "text.png")
     assert "none.png does not exist" in sentence("recolor", "in.png", "--strokes", tmp_path / "none.png")
-    assert "recolor needs a colour photograph, got a grey one; use nlfilter-torch colorize" in sentence(
+    assert "recolor needs a colour photograph, got a grey one; use colorize" in sentence(
         "recolor", "grey.png", "--region", "1,1,5,5:red"
     )
     assert not out.exists()

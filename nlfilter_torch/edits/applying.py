@@ -40,9 +40,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 def check_channels(edit: str, channels: int) -> None:
     """Raise if a grey photograph is to be recoloured."""
     if edit == "recolor" and channels < 3:
-        raise ValueError(
-            "recolor needs a colour photograph, got a grey one; use nlfilter-torch colorize, which colours grey ones"
-        )
+        raise ValueError("recolor needs a colour photograph, got a grey one; use colorize, which colours grey ones")
 
 
 def scribbles_of(step: Step, size: tuple[int, int]) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
