@@ -192,7 +192,8 @@ def test_an_operator_of_features_has_no_guide() -> None:
         ({"features": noise(3, 12)}, ValueError, r"features must have shape \(B, D, N\)"),
         ({"features": noise(1, 3, 12).round().int()}, TypeError, r"features must be of a floating-point dtype"),
         ({"features": noise(1, 3, 12) * torch.nan}, ValueError, r"features must be finite"),
-        ({"size": 12}, TypeError, r"size must be a pair of integers .* pass \(1, 12\)"),
+        ({"size": 12}, TypeError, r"size must be integers \(H, W\) or \(N,\), got 12; pass \(12,\)"),
+        ({"size": (3, 2, 2)}, TypeError, r"size must be integers \(H, W\) or \(N,\), got \(3, 2, 2\)"),
         ({"size": (3, 5)}, ValueError, r"size must have as many pixels as there are features, 12, got 3x5"),
         ({"size": (-3, -4)}, ValueError, r"size must have as many pixels"),
         ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
@@ -206,6 +207,12 @@ def test_wrong_arguments_are_refused_in_one_sentence(changes: dict[str, Any], er
     features = arguments.pop("features")
     with pytest.raises(error, match=sentence):
         operator_from_features(features, **arguments)
+
+
+def test_points_in_no_order_are_one_row() -> None:
+    operator = operator_from_features(noise(1, 3, 12), size=(12,), num_landmarks=4)
+    assert operator.size == (1, 12)
+    assert operator.row_sums().shape == (1, 1, 1, 12)
 
 
 def test_more_landmarks_than_points_are_reduced() -> None:

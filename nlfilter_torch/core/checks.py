@@ -364,17 +364,21 @@ def check_features(features: Tensor, name: str, size: int | None = None) -> None
 
 
 def check_size(size: object, points: int) -> tuple[int, int]:
-    """The ``size`` (H, W) of ``points`` pixels as two integers.
+    """The size (H, W) of ``points`` pixels as two integers, from (H, W) or (N,).
 
     Raises:
-        TypeError, ValueError: if it is no pair of positive integers with that product.
+        TypeError, ValueError: if ``size`` is no such tuple of positive integers with that product.
     """
-    if not isinstance(size, tuple | list) or len(size) != 2 or any(type(length) is not int for length in size):
-        raise TypeError(f"size must be a pair of integers (H, W), got {described(size)}; pass (1, {points}), say")
+    if not isinstance(size, tuple | list) or len(size) not in (1, 2) or any(type(length) is not int for length in size):
+        raise TypeError(
+            f"size must be integers (H, W) or (N,), got {size if isinstance(size, tuple) else described(size)}; "
+            f"pass ({points},), say"
+        )
+    size = (1, *size)[-2:]
     if size[0] < 1 or size[1] < 1 or size[0] * size[1] != points:
         raise ValueError(
             f"size must have as many pixels as there are features, {points}, got {size[0]}x{size[1]}; "
-            f"pass (1, {points}) for points in no order"
+            f"pass ({points},) for points in no order"
         )
     return (size[0], size[1])
 

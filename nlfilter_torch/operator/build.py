@@ -181,7 +181,7 @@ def nonlocal_operator(
 def operator_from_features(
     features: Tensor,
     *,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     weights: Tensor | None = None,
     num_landmarks: int = 100,
     landmarks: Sampling = "kmeans",
@@ -197,7 +197,8 @@ def operator_from_features(
 
     Args:
         features: (B, D, N), for which the affinity of two points is ``exp(-|x_i - x_j|^2)``: divide them by bandwidths.
-        size: (H, W) with H * W = N, the shape of images that are filtered; (1, N) for points in no order.
+        size: (H, W) with H * W = N, the shape of images that are filtered; (N,), which is (1, N), for points in no
+            order.
         weights: (N,) or (B, N), positive: how many equal pixels each point stands for. Landmarks are drawn in
             proportion to them. None is one each. Constant for gradients.
         num_landmarks: M; reduced with a warning where there are fewer points.
@@ -215,7 +216,7 @@ def operator_from_features(
 
     Example:
         >>> points = torch.rand(1, 3, 500, generator=torch.Generator().manual_seed(0))
-        >>> operator = operator_from_features(points / 0.3, size=(1, 500), num_landmarks=20)
+        >>> operator = operator_from_features(points / 0.3, size=(500,), num_landmarks=20)
         >>> smoothed = operator @ torch.ones(1, 1, 1, 500)
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
@@ -228,14 +229,14 @@ def operator_from_features(
         tolerance=tolerance,
         generator=generator,
     )
-    size = check_size(size, features.shape[2])
+    shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
-    shard = meet(features.unflatten(2, size), group)
+    shard = meet(features.unflatten(2, shape), group)
     return assemble(
         features,
-        size,
+        shape,
         weights=weights,
         num_landmarks=num_landmarks,
         landmarks=landmarks,
