@@ -333,7 +333,8 @@ def test_which_tensors_the_dispatcher_sends_to_the_kernels(monkeypatch: pytest.M
         assert not in_c(rows, factor)
     assert in_c(rows, factor)
     assert spread(rows.to("meta"), factor.to("meta")).is_meta
-    torch.vmap(lambda part: torch.testing.assert_close(spread(part, factor).shape, (1, 2, 8)))(rows.expand(4, 1, 2, 3))
+    mapped = torch.vmap(lambda part: spread(part, factor))(rows.expand(4, 1, 2, 3))
+    torch.testing.assert_close(mapped, (rows @ factor).expand(4, 1, 2, 8))
     with torch.autograd.forward_ad.dual_level():
         dual = torch.autograd.forward_ad.make_dual(rows, rows)
         tangent = torch.autograd.forward_ad.unpack_dual(spread(dual, factor)).tangent

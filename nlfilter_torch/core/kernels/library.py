@@ -6,7 +6,7 @@ computes the same everywhere else: on other devices, in other dtypes, under tran
 """
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from nlfilter_torch.core import instruction_sets
-from nlfilter_torch.core.checks import is_transformed
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
 OPERATORS = torch.library.Library("nlfilter", "DEF")
@@ -89,12 +88,9 @@ def register(
     """
     name = schema.partition("(")[0]
 
-    def on_processors(*arguments: Any) -> Any:
-        return (compiled if level and all(map(_suits, arguments)) else definition)(*arguments)
-
     OPERATORS.define(schema)
     OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
-    OPERATORS.impl(name, on_processors, "CPU")
+    OPERATORS.impl(name, _on_processors(definition, compiled), "CPU")
     torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
     return getattr(torch.ops.nlfilter, name).default
 
@@ -106,12 +102,16 @@ def register_differentiable(
 
     Autograd, in reverse and forward mode and of any order, and the transforms of ``torch.func`` see these operations.
     """
-    operator = register(schema, definition, compiled, fake)
+    operator, below = register(schema, definition, compiled, fake), torch._C._after_autograd_keyset
+    on_processors = _on_processors(definition, compiled)
 
     def under_autograd(keys: Any, *arguments: Any) -> Any:
-        if any(map(_is_derived, arguments)):
+        if _are_derived(arguments):
             return definition(*arguments)
-        return operator.redispatch(keys & torch._C._after_autograd_keyset, *arguments)
+        keys = keys & below
+        if keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU:  # what redispatching comes to, without its 4 us
+            return on_processors(*arguments)
+        return operator.redispatch(keys, *arguments)
 
     name = schema.partition("(")[0]
     OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
@@ -119,20 +119,38 @@ def register_differentiable(
     return operator
 
 
-def _suits(argument: Any) -> bool:
-    """Whether the kernels can work on an argument: a number, or float32 and not empty."""
-    if isinstance(argument, Tensor):
-        return argument.dtype == torch.float32 and argument.numel() > 0
-    return not isinstance(argument, list) or all(map(_suits, argument))
+def _on_processors(definition: Callable[..., Any], compiled: Callable[..., Any]) -> Callable[..., Any]:
+    """The kernel in C where it can work on the arguments, otherwise the definition."""
+
+    def on_processors(*arguments: Any) -> Any:
+        return (compiled if level and _suit(arguments) else definition)(*arguments)
+
+    return on_processors
 
 
-def _is_derived(argument: Any) -> bool:
-    """Whether an argument has derivatives to keep track of."""
-    return isinstance(argument, Tensor) and (
-        (argument.requires_grad and torch.is_grad_enabled())
-        or is_transformed(argument)
-        or forward_ad.unpack_dual(argument).tangent is not None
-    )
+# The two below run before every product; as loops they take half the time that generators would.
+
+
+def _suit(arguments: Sequence[Any]) -> bool:
+    """Whether the kernels can work on all arguments: numbers, and tensors that are float32 and not empty."""
+    for argument in arguments:
+        if isinstance(argument, Tensor):
+            if argument.dtype is not torch.float32 or argument.numel() == 0:
+                return False
+        elif isinstance(argument, list) and not _suit(argument):
+            return False
+    return True
+
+
+def _are_derived(arguments: Sequence[Any]) -> bool:
+    """Whether one of the arguments has derivatives to keep track of."""
+    if torch.is_grad_enabled():
+        for argument in arguments:
+            if isinstance(argument, Tensor) and argument.requires_grad:
+                return True
+    if forward_ad._current_level < 0:
+        return False
+    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
 
 def by_rows(planes: Tensor) -> Tensor:
@@ -143,6 +161,13 @@ def by_rows(planes: Tensor) -> Tensor:
 def contiguous(*tensors: Tensor) -> Iterator[Tensor]:
     """Each of the tensors in one piece."""
     return (tensor.contiguous() for tensor in tensors)
+
+
+def repeated(tensor: Tensor, batch: int, length: int) -> Tensor:
+    """A tensor (B, ..., N) or one that is expanded to it, in one piece."""
+    if tensor.shape[0] != batch or tensor.shape[-1] != length:
+        tensor = tensor.expand(batch, *tensor.shape[1:-1], length)
+    return tensor.contiguous()
 
 
 def place(planes: Tensor) -> tuple[int, int, int]:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
-from nlfilter_torch.core.kernels.library import by_rows, pointer, register, run_on_factor
+from nlfilter_torch.core.kernels.library import by_rows, pointer, register, repeated, run_on_factor
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
 
 
@@ -81,8 +81,8 @@ def _run(
     out, found = _empty(factor)
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
-    row = row.expand(batch, landmarks).contiguous()
-    scaling, diagonal = (t if t is None else t.expand(batch, pixels).contiguous() for t in (scaling, diagonal))
+    row = repeated(row, batch, landmarks)
+    scaling, diagonal = (t if t is None else repeated(t, batch, pixels) for t in (scaling, diagonal))
     run_on_factor(
         "sweep", factor, row.data_ptr(), pointer(scaling), pointer(diagonal), most, out.data_ptr(), found.data_ptr()
     )

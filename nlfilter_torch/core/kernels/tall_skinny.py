@@ -10,7 +10,14 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.core.communicator import Shard, reduce_sum
-from nlfilter_torch.core.kernels.library import by_rows, place, pointer, register_differentiable, run_on_factor
+from nlfilter_torch.core.kernels.library import (
+    by_rows,
+    place,
+    pointer,
+    register_differentiable,
+    repeated,
+    run_on_factor,
+)
 
 FEW = range(1, 9)  # rows for which the kernels in C are the quickest
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
@@ -47,8 +54,8 @@ def _compiled_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None
         return _define_spread(rows, factor, scaling)
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
-    rows = rows.expand(batch, -1, landmarks).contiguous()
-    scaling = None if scaling is None else scaling.expand(batch, pixels).contiguous()
+    rows = repeated(rows, batch, landmarks)
+    scaling = None if scaling is None else repeated(scaling, batch, pixels)
     out = factor.new_empty(batch, rows.shape[1], pixels)
     run_on_factor("spread", factor, rows.shape[1], rows.data_ptr(), pointer(scaling), out.data_ptr())
     return out
@@ -98,7 +105,9 @@ def _compiled_moment(factor: Tensor, images: Tensor) -> Tensor:
         return _define_moment(factor, images)
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
-    images = by_rows(images.expand(batch, -1, pixels))
+    if images.shape[0] != batch or images.shape[2] != pixels:
+        images = images.expand(batch, -1, pixels)
+    images = by_rows(images)
     out = factor.new_empty(batch, images.shape[1], landmarks, dtype=torch.float64)
     run_on_factor("gather", factor, images.shape[1], *place(images), out.data_ptr())
     return out.mT.contiguous()
