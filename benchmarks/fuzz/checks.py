@@ -200,8 +200,8 @@ def _check_residual(findings: Findings, promise: str, errors: Tensor, reported: 
 def _check_spectrum(findings: Findings, operator: NonlocalOperator, exact: Exact, most: Tensor) -> None:
     """Eigenvalues and eigenvectors, and the figures of :class:`Diagnostics`."""
     spectrum = operator.spectrum()
-    if not findings.finite(spectrum.eigenvalues, "eigenvalues"):
-        return
+    if not spectrum.eigenvalues.numel() or not findings.finite(spectrum.eigenvalues, "eigenvalues"):
+        return  # an image whose pixels all stand alone has none
     findings.note(REPORTED, -spectrum.eigenvalues.min(), 0.0, "smallest")
     findings.note(REPORTED, spectrum.eigenvalues.max(), 1.0, "largest")
     vectors = spectrum.eigenvectors.double().flatten(2)  # (B, R, N)

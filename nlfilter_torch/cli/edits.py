@@ -187,7 +187,7 @@ def edit_photograph(
         depth,
         work,
         landmarks=step["landmarks"],
-        patch_size=step["patch_size"],
+        patch_size=max(step["patch_size"], 5),  # 3x3 in three colours takes as much as 5x5 in grey
         factors=2 if name == "detail" and (given.get("region") or given.get("mask")) else 1,
         memory=memory,
         by_rows=by_rows if edit.tiled else None,

@@ -191,6 +191,7 @@ def _check_values(
         if not (inside(value) and _is_finite(value)):
             raise ValueError(f"{name} must be {wanted}, got {described(value)}; {remedy}")
         return
+    check_tensor(value, name)
     if value.dtype == torch.bool or value.dtype.is_complex:
         raise TypeError(f"{name} must be a number or a tensor of real numbers, got {value.dtype}; convert it")
     if value.numel() != 1 and (batch is None or tuple(value.shape) != (batch,)):

@@ -280,7 +280,7 @@ def assemble(
     balancing = balanced()
     before: list[Tensor] = []
     while completed and watched and len(before) < ROUNDS:
-        alone = isolated(balancing.scaling.detach())
+        alone = isolated(balancing.scaling.detach(), float(balancing.residual.max()))
         if not bool(reduce_max(alone.any().to(factor), shard)):
             break
         before.append(balancing.moment)
@@ -303,7 +303,9 @@ def assemble(
         size=size,
         kernel=kernel,
         remainder=remainder,
-        balancing=PixelScaling(balancing.moment, completed, tuple(before)),
+        balancing=PixelScaling(
+            balancing.moment, completed, float(balancing.residual.max()) if watched else 0.0, tuple(before)
+        ),
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,

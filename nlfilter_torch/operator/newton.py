@@ -51,12 +51,13 @@ def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tens
     return positive_root(spread((total / 2).mT, factor).squeeze(1), diagonal)
 
 
-def isolated(scaling: Tensor) -> Tensor:
+def isolated(scaling: Tensor, residual: float) -> Tensor:
     """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
 
-    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1.
+    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1 by more
+    than a row sum that is off by ``residual`` accounts for.
     """
-    return scaling > 1 + EXCESS[scaling.dtype]
+    return scaling > 1 + max(EXCESS[scaling.dtype], residual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +67,13 @@ class PixelScaling:
     Attributes:
         moment: t, (B, M, 1).
         completed: the kernel has a unit diagonal.
+        residual: largest deviation of a row sum from 1.
         before: moments that found pixels to be isolated, before these were taken out.
     """
 
     moment: Tensor
     completed: bool
+    residual: float = 0.0
     before: tuple[Tensor, ...] = ()
 
     def __call__(self, factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,9 +85,9 @@ class PixelScaling:
         remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
         if not self.completed:
             return scaling, remainder
-        alone = isolated(scaling)
+        alone = isolated(scaling, self.residual)
         for total in self.before:
-            alone = alone | isolated(scaling_from_moment(factor, diagonal, total.to(factor)))
+            alone = alone | isolated(scaling_from_moment(factor, diagonal, total.to(factor)), self.residual)
         return torch.where(alone, 0.0, scaling), torch.where(alone, 1.0, remainder)
 
 

@@ -217,6 +217,7 @@ class NonlocalOperator:
         """Measure whether W is what it promises to be, for the price of a spectrum's Gram matrix and three products.
 
         Example:
+            >>> from nlfilter_torch import nonlocal_operator
             >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
             >>> certificate = nonlocal_operator(guide, num_landmarks=20).certify()
             >>> certificate.row_sums[0] < 1e-4 and certificate.symmetry[0] < 1e-6

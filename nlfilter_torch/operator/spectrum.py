@@ -119,7 +119,7 @@ class Spectrum(RitzPairs):
 
     @property
     def mass(self) -> Tensor:
-        """The scaling (B, N) of values that are summed up over points: d times their weights."""
+        """D times the weights of the points, (B, N), by which values are summed up."""
         return self.scaling if self.weights is None else self.scaling * self.weights
 
     @property

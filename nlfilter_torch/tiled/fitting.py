@@ -19,7 +19,7 @@ from nlfilter_torch.operator.newton import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
 from nlfilter_torch.tiled.sources import Picture, RowSource, Tile
-from nlfilter_torch.tiled.statistics import Block, Sums, balance_by_passes, limiter_by_passes, sum_up
+from nlfilter_torch.tiled.statistics import CONVERGED, Block, Sums, balance_by_passes, limiter_by_passes, sum_up
 from nlfilter_torch.tiled.tiles import Passes, row_by_row
 
 
@@ -184,7 +184,7 @@ def _gather(
     part = some if drawn and passes.statistics == "sample" else every
     if part is every:
         total = balance_by_passes(lambda: every("Balancing"), total, completed=completed)
-    balancing = PixelScaling(total, completed)
+    balancing = PixelScaling(total, completed, CONVERGED[kernel.landmarks.dtype])
     if is_bounded(options.get("landmarks", "kmeans"), picture.pixels, total.shape[1]):
         kernel = replace(kernel, limiter=limiter_by_passes(lambda: part("Bounding"), balancing))
     return kernel, balancing, sum_up(lambda: part("Summing up"), balancing, order)
