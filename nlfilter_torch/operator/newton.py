@@ -54,8 +54,8 @@ def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tens
 def isolated(scaling: Tensor, residual: float) -> Tensor:
     """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
 
-    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1 by more
-    than a row sum that is off by ``residual`` accounts for.
+    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1, by
+    more than row sums that are off by ``residual`` do.
     """
     return scaling > 1 + max(EXCESS[scaling.dtype], residual)
 
