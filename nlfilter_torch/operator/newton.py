@@ -185,11 +185,9 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tenso
 def _sweep(
     factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor, two if they have weights."""
+    """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor."""
     half = (total / 2).squeeze(2).to(factor)
-    scaling, found = sweep(factor, diagonal, half, LARGEST)
-    if weights is not None:
-        return scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
+    scaling, found = sweep(factor, diagonal, half, LARGEST, weights)
     return scaling, reduce_sum(found.unsqueeze(2), shard)
 
 
