@@ -6,7 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import NonlocalOperator, detail_layers, fit_filter, nonlocal_operator, polynomial_filter
+from nlfilter_torch import (
+    NonlocalOperator,
+    detail_layers,
+    fit_filter,
+    nonlocal_operator,
+    operator_from_features,
+    polynomial_filter,
+)
 from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.newton import LARGEST, PixelScaling, Solution, damped, scaling_from_moment
 from nlfilter_torch.tiled import stream_detail
@@ -279,3 +286,27 @@ def test_tiny_bandwidths_are_right_in_float32(options: dict[str, float]) -> None
     )
     exact = reference.balanced(reference.affinity(rows, rows))
     torch.testing.assert_close(operator.to_dense()[0].double(), torch.from_numpy(exact), atol=1e-3, rtol=0)
+
+
+def test_landmarks_far_apart_for_their_bandwidth_have_a_cholesky_factor() -> None:
+    # 1e10 bandwidths apart, squared distances that are formed as products are off by 1e4 in float64.
+    points = 1e10 + torch.rand(1, 1, 60, generator=seeded(0), dtype=torch.float64).sort().values * 3
+    features = torch.cat([points, -points], dim=2)
+    operator = operator_from_features(features, size=(10, 12), num_landmarks=80)
+    assert_sound(operator)
+
+
+def test_a_loose_tolerance_bounds_the_eigenvalues_as_well() -> None:
+    ramp, tolerance = torch.linspace(0, 1, 49 * 34, dtype=torch.float64).view(1, 1, 49, 34), 0.01
+    for seed in range(2):
+        operator = nonlocal_operator(
+            ramp,
+            photometric_bandwidth=0.01,
+            num_landmarks=40,
+            landmarks="random",
+            completion="none",
+            tolerance=tolerance,
+            spatial_bandwidth=50.0,
+            generator=seeded(seed),
+        )
+        assert torch.linalg.eigvalsh(dense(operator)).max() < 1 + tolerance

@@ -52,7 +52,7 @@ def shift(at: Tensor, remainder: Tensor) -> Tensor:
 
 def slack(dtype: torch.dtype, residual: float) -> float:
     """By how much eigenvalues may exceed 1 where row sums are off by up to ``residual``."""
-    return max(SLACK[dtype], 3 * residual)
+    return max(SLACK[dtype], residual)
 
 
 @torch.no_grad()

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import factors_of, once_differentiable
+from nlfilter_torch.core.checks import is_hidden
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
 
 Completion = Literal["diagonal", "none"]
 
+CANCELLATION = 1e-7  # error of a squared distance between landmarks from which the products are avoided
 JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, which float32 can bear
 
 
@@ -22,13 +24,23 @@ def whitener(landmarks: Tensor) -> Tensor:
     """Inverse Cholesky factor (B, M, M) of the affinities between ``landmarks`` (B, D, M), worked out in float64."""
     points = landmarks.double()
     points = points - points.mean(dim=2, keepdim=True)
-    norms = points.square().sum(1)
-    squared = norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
+    squared = _squared_distances(points)
     identity = torch.eye(landmarks.shape[2], dtype=torch.float64, device=landmarks.device)
     # The distance of a landmark to itself is zero by definition, whatever the rounding of the three terms.
     affinity = torch.exp(-squared.clamp(min=0.0) * (1 - identity)) + JITTER * identity
     lower = torch.linalg.cholesky(affinity)
     return torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False).to(landmarks)
+
+
+def _squared_distances(points: Tensor) -> Tensor:
+    """Between points (B, D, M) in float64, (B, M, M)."""
+    norms = points.square().sum(1)
+    if not is_hidden(points):
+        # Products cancel where points lie far apart for the bandwidth, and the matrix of affinities may then have a
+        # negative eigenvalue.
+        if not float(norms.detach().max()) * torch.finfo(points.dtype).eps < CANCELLATION:
+            return torch.stack([(points - one.unsqueeze(2)).square().sum(1) for one in points.unbind(2)], dim=1)
+    return norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
 
 
 def nystrom_factor(
