@@ -133,6 +133,7 @@ def test_other_arguments_of_a_wrong_type() -> None:
     sentence(lambda: polynomial_filter(None, IMAGE, ONES), "operator")
     sentence(lambda: diffusion_map(OPERATOR, time=1.0), "spectrum")
     sentence(lambda: polynomial_response(None, ONES), "eigenvalues")
+    sentence(lambda: polynomial_response(torch.rand(2, 5), torch.rand(3, 4)), "alpha")
     sentence(lambda: nonlocal_operator(GREY, generator=3), "generator")
     sentence(lambda: fit_alpha(OPERATOR, IMAGE, IMAGE, loss="l1"), "loss")
     sentence(lambda: fit_alpha(OPERATOR, IMAGE, IMAGE, loss=lambda a, b: None), "loss")

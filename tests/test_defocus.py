@@ -5,7 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import defocus
-from nlfilter_torch.edits.defocus import Defocusing, largest_within
+from nlfilter_torch.edits.defocus import fit_defocus, focus_map, largest_within
+from nlfilter_torch.edits.source import InMemory
 from tests.problems import box, cat, colour, noise
 
 
@@ -77,9 +78,10 @@ def test_a_coarse_smoothing_of_the_focus_is_nearly_the_fine_one(monkeypatch: pyt
     image = cat(1)  # 300x450
     region = torch.zeros(1, 1, 300, 450)
     region[..., 130:160, 200:240] = 1
-    held = Defocusing(image, num_landmarks=50)
-    fine = held.focus(region)
+    source = InMemory(image)
+    likeness, painted = fit_defocus(source, region, num_landmarks=50).pixels(source).split(1, dim=1)
+    fine = focus_map(image, likeness, painted, 300)
     monkeypatch.setattr("nlfilter_torch.edits.defocus.GUIDED", 4)
-    coarse = held.focus(region)
+    coarse = focus_map(image, likeness, painted, 300)
     assert 0 < (coarse - fine).abs().mean() < 0.01
     assert 0.05 < fine.mean() < 0.95

@@ -5,8 +5,9 @@ import inspect
 
 import pytest
 
+import nlfilter_torch
 from benchmarks import parameters
-from nlfilter_torch.edits.applying import FUNCTIONS
+from nlfilter_torch.edits.applying import FITS
 from nlfilter_torch.edits.declaration import Edit, Parameter
 from nlfilter_torch.edits.parameters import EDITS, FILTER
 from tests.pages import ROOT
@@ -42,10 +43,15 @@ def test_defaults_are_valid(edit: Edit, parameter: Parameter) -> None:
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
 def test_functions_have_the_declared_defaults(edit: Edit) -> None:
-    function = inspect.signature(FUNCTIONS[edit.name]).parameters
+    public = {"detail": "enhance", "tone": "adjust_tone"}.get(edit.name, edit.name)
+    function = inspect.signature(getattr(nlfilter_torch, public)).parameters
     for parameter in edit:
         name = parameter.keyword
         if name in function and parameter.kind != "sliders" and name != "photometric_bandwidth":
             wanted = parameter.idle if edit.name == "tone" else edit.defaults[name]
             assert function[name].default == wanted
         assert name in function or name in FILTER or parameter.name == "inside"
+    fit = inspect.signature(FITS[edit.name]).parameters
+    for name, argument in fit.items():
+        if argument.default is not argument.empty:
+            assert function[name].default == argument.default

@@ -122,6 +122,16 @@ def test_gradcheck_with_weights() -> None:
     assert torch.autograd.gradcheck(loss, (features,), eps=1e-6, atol=1e-6)
 
 
+def test_points_may_stand_for_less_than_a_pixel() -> None:
+    features, image = noise(1, 3, 60, seed=1), noise(1, 1, 6, 10, seed=2)
+    few, many = (
+        operator_from_features(features, size=(6, 10), weights=torch.full((60,), weight), num_landmarks=20)
+        for weight in (1e-3, 1.0)
+    )
+    torch.testing.assert_close(few.row_sums(), many.row_sums(), atol=1e-6, rtol=0)
+    assert (few @ image).isfinite().all()
+
+
 def test_damped_steps_balance_weighted_points() -> None:
     factor = noise(1, 4, 30, seed=3) - 0.3
     factor = factor / factor.norm(dim=1, keepdim=True).clamp(min=1.0)
@@ -197,7 +207,9 @@ def test_an_operator_of_features_has_no_guide() -> None:
         ({"size": (3, 5)}, ValueError, r"size must have as many pixels as there are features, 12, got 3x5"),
         ({"size": (-3, -4)}, ValueError, r"size must have as many pixels"),
         ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
-        ({"weights": torch.zeros(12)}, ValueError, r"weights must be positive and finite"),
+        ({"weights": torch.zeros(12)}, ValueError, r"weights must be from 1e-06 to 1e\+06, got values from 0 to 0"),
+        ({"weights": torch.full((12,), 1e7)}, ValueError, r"weights must be from 1e-06 to 1e\+06"),
+        ({"weights": torch.ones(12, dtype=torch.complex64)}, TypeError, "weights must be of a floating-point dtype"),
         ({"weights": 4.0}, TypeError, r"weights must be a torch.Tensor"),
         ({"landmarks": 5}, ValueError, r"num_landmarks"),
     ],

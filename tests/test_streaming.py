@@ -13,14 +13,15 @@ from torch import Tensor
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import colour_masks
+from nlfilter_torch.edits.source import Guide
 from nlfilter_torch.filtering.filters import filter_regions
 from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.detail import rows_in_memory
 from nlfilter_torch.tiled.sampling import draw, sample_by_influence
-from nlfilter_torch.tiled.sources import Picture
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes
 
@@ -170,14 +171,10 @@ def test_regions_that_cannot_be_used_are_named(regions: Array, alpha: Tensor, me
 
 @pytest.mark.usefixtures("small_blocks")
 def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> None:
-    picture = Picture(cat(90, 120))
-
-    def image(colours: Tensor) -> Tensor:
-        return reduce_channels(colours, "luminance")
-
-    pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=30)
+    picture = GuidePicture(Picture(cat(90, 120)), Guide(lambda image: image, {}))
+    pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=30)
     for spectral in (False, True):
-        parts = sample_by_influence(picture, pilot, image, 3000, lambda *_: None, spectral=spectral)
+        parts = sample_by_influence(picture, pilot, 3000, lambda *_: None, spectral=spectral)
         assert len(parts) > 1
         weights = sampling.Sample.together(parts).weights
         assert 2500 < weights.numel() < 3500
@@ -240,8 +237,8 @@ def test_memory_gives_the_size_of_tiles() -> None:
     picture = Picture(np.zeros((20_000, 200, 3), np.uint8))
 
     def rows_within(memory: int, masked: bool = False) -> int:
-        passes = Passes("uint8", sample=1 << 16, memory=memory)
-        return rows_in_memory(picture, passes, 4, masked, num_landmarks=5)
+        tiled = Tiled(picture, Passes("uint8", sample=1 << 16, memory=memory))
+        return tiled.room(75 if masked else 25, num_landmarks=5)
 
     rows = [rows_within(memory) for memory in (5 * 10**7, 2 * 10**8, 10**10)]
     assert 200 * 85 * 4 * rows[0] < 5 * 10**7 < 200 * 85 * 4 * 4 * rows[0]
@@ -308,12 +305,8 @@ def test_more_landmarks_than_pixels_are_reduced() -> None:
 
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.tiled.statistics.MAX_PASSES", 1)
-    picture = Picture(cat(30, 40))
-
-    def image(colours: Tensor) -> Tensor:
-        return reduce_channels(colours, "luminance")
-
-    pilot = sampling.take_pilot(picture, image, lambda *_: None, num_landmarks=20)
+    picture = GuidePicture(Picture(cat(30, 40)), Guide(lambda image: image, {}))
+    pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
         balance_by_passes(lambda: pilot.sample.blocks(pilot.kernel), 9 * pilot.balancing, completed=True)
 

@@ -16,9 +16,8 @@ from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import split_luminance
 from nlfilter_torch.io.photographs import read_photograph
 from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor
-from nlfilter_torch.tiled.scribbles import read_strokes
+from nlfilter_torch.tiled.scribbles import read_scribbles
 from nlfilter_torch.tiled.sources import Picture
-from nlfilter_torch.tiled.tiles import Passes
 from tests.test_streaming import LEVEL, Rows, Shrinking, cat
 
 Array = NDArray[Any]
@@ -221,7 +220,15 @@ def test_report_tells_every_stage() -> None:
 def test_painted_pixels_need_memory() -> None:
     picture, (strokes, mask, _) = cat(90, 120), paint(90, 120)
     with pytest.raises(MemoryError, match=r"the strokes on source cover \d+ pixels or more .* paint less"):
-        read_strokes(Picture(picture), strokes, 0 * mask + 1, Passes("uint8", memory=500_000))
+        read_scribbles(
+            Picture(picture),
+            0 * mask + 1,
+            strokes,
+            name="stroke_mask",
+            strokes="strokes",
+            memory=500_000,
+            report=lambda *_: None,
+        )
     for edit in (recoloured, coloured):
         with pytest.raises(MemoryError, match="the strokes on source cover"):
             edit(picture, strokes, 0 * mask + 1, memory=3_000_000, num_landmarks=5)

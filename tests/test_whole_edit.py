@@ -62,6 +62,13 @@ def test_strokes_cover_the_same_by_rows(rows: slice) -> None:
         Recipe((COLORIZE,)),
         Recipe((RECOLOR,)),
         Recipe((RECOLOR.changed(strokes=(BLUE, replace(FAR, paint="keep"))),)),
+        Recipe((Step("denoise", landmarks=60),)),
+        Recipe((Step("denoise", noise_level=8.0, landmarks=60),)),
+        Recipe((Step("sharpen", landmarks=60),)),
+        Recipe((Step("tone", contrast=1.3, clarity=1.5, landmarks=60),)),
+        Recipe((Step("abstract", landmarks=60),)),
+        Recipe((Step("abstract", landmarks=60, edges=0.7, tones=6),)),
+        Recipe((Step("defocus", (IN,), landmarks=60, radius=3.0),)),
         Recipe((DETAIL, COLORIZE, RECOLOR)),
         Recipe((RECOLOR, Step("detail", alpha=(1.5, 1.0)))),
     ],
@@ -102,16 +109,6 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
 
 
-@pytest.mark.parametrize("name", ["defocus", "abstract", "sharpen"])
-def test_a_step_that_takes_the_whole_photograph_is_named_before_any_work(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(whole_edit, "rows_of", None)
-    recipe = Recipe((DETAIL, Step(name, (IN,))))
-    with pytest.raises(ValueError, match=f"{name} takes the whole photograph at once, and scan.tif is too large"):
-        by_rows(recipe, rows_of(cat()), tmp_path)
-
-
 def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Full:
         """A file on a full disk."""
@@ -124,7 +121,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
         def write(self, _: bytes) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(whole_edit, "TemporaryFile", lambda **_: Full())
+    monkeypatch.setattr("nlfilter_torch.tiled.intermediate.TemporaryFile", lambda **_: Full())
     sentence = "No space left on device, where one step of the edit leaves 0.0 GB to the next"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)

@@ -29,7 +29,7 @@ def apply(
 ) -> None:
     """Edit a photograph as another one was edited in the browser: sliders, strokes and all.
 
-    Photographs that fit no memory are worked out in tiles, if all steps are of detail, recolor or colorize.
+    Photographs larger than memory are edited in tiles.
 
     Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
     """

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
@@ -98,9 +99,9 @@ def signature(edit: Edit) -> inspect.Signature:
         *((p.name, option(p), option_value(p, p.default)) for p in edit if p.is_option),
         ("depth", options.OutputDepth, None),
         ("seed", options.Seed, 0),
+        ("memory", options.Memory, None),
+        ("full", options.Full, False),
     ]
-    if edit.tiled:
-        found += [("memory", options.Memory, None), ("full", options.Full, False)]
     kind = inspect.Parameter.KEYWORD_ONLY
     return inspect.Signature([inspect.Parameter(n, kind, default=d, annotation=a) for n, a, d in found])
 
@@ -166,10 +167,10 @@ def edit_photograph(
 
     from nlfilter_torch.cli import editing, scribble_rows, scribbles
     from nlfilter_torch.cli.tiled import Job
-    from nlfilter_torch.edits.applying import apply_to, check_channels, seeded
+    from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
     from nlfilter_torch.io.photographs import Photograph
-    from nlfilter_torch.tiled.recipe import ROWS
-    from nlfilter_torch.tiled.sources import Rows
+    from nlfilter_torch.tiled.source import Tiled
+    from nlfilter_torch.tiled.sources import Picture, Rows
 
     def work(photograph: Photograph) -> Tensor:
         check_channels(name, photograph.pixels.shape[1])
@@ -177,9 +178,9 @@ def edit_photograph(
 
     def by_rows(job: Job) -> Rows:
         check_channels(name, job.picture.shape[2])
-        painted = scribble_rows.of_edit(step, job, source, given)
-        arguments = {p.keyword: value for p, value in step.in_units(job.size) if p.is_option}
-        return ROWS[name](job.passes(full), job.picture.rows, **(arguments | painted), generator=seeded(seed))
+        tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
+        drawn = scribble_rows.of_edit(step, job, given)
+        yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
 
     editing.edit_file(
         source,
@@ -190,6 +191,6 @@ def edit_photograph(
         patch_size=max(step["patch_size"], 5),  # 3x3 in three colours takes as much as 5x5 in grey
         factors=2 if name == "detail" and (given.get("region") or given.get("mask")) else 1,
         memory=memory,
-        by_rows=by_rows if edit.tiled else None,
+        by_rows=by_rows,
         coloured=edit.coloured,
     )

@@ -17,6 +17,7 @@ from nlfilter_torch.cli.scribbles import (
     coloured_rectangles,
     opaque,
     plain_rectangles,
+    unfocused,
     with_sliders,
 )
 from nlfilter_torch.cli.tiled import Job
@@ -39,7 +40,7 @@ class RegionRows:
     Attributes:
         shape: (H, W, K).
         mask: the picture of the first region, or None.
-        rectangles: the other regions.
+        rectangles: the other regions; if there is one region in all, they are parts of it.
     """
 
     shape: tuple[int, int, int]
@@ -50,29 +51,40 @@ class RegionRows:
     def __getitem__(self, rows: slice) -> Floats:
         """The rows from ``rows.start`` to ``rows.stop``."""
         weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
-        regions = np.moveaxis(weights, 2, 0)
         if self.mask is not None:
-            regions[0] = self.mask.tile(rows.start, rows.stop, 0).pixels.mean(1)[0].clamp(0, 1)
-        first = len(regions) - len(self.rectangles)
-        for region, rectangle in zip(regions[first:], self.rectangles, strict=True):
-            region[_within(rectangle, rows)] = 1
+            weights[..., 0] = self.mask.tile(rows.start, rows.stop, 0).pixels.mean(1)[0].clamp(0, 1)
+        count = self.shape[2]
+        for region, rectangle in enumerate(self.rectangles, start=count - len(self.rectangles)):
+            weights[*_within(rectangle, rows), max(region, 0) if count > 1 else 0] = 1
         return weights
+
+
+def _mask(job: Job, path: Path | None) -> Picture | None:
+    """The picture of ``--mask``."""
+    if path is None:
+        return None
+    stored = job.open(path)
+    check_size(path, stored.shape[:2], job.size)
+    return Picture(stored.rows, str(path))
 
 
 def region_rows(
     job: Job, path: Path | None, regions: list[str] | None, alpha: Tensor
-) -> tuple[RegionRows | None, Tensor]:
-    """Regions and sliders (K, k+1), as :func:`slider_regions` has them; None and ``alpha`` where none is given."""
-    picture = None
-    if path is not None:
-        stored = job.open(path)
-        check_size(path, stored.shape[:2], job.size)
-        picture = Picture(stored.rows, str(path))
+) -> tuple[RegionRows, Tensor] | None:
+    """Regions and sliders (K, k+1), as :func:`slider_regions` has them; None where none is given."""
+    picture = _mask(job, path)
     parsed = [with_sliders(text, job.size, alpha) for text in regions or []]
     sliders = ([] if picture is None else [alpha]) + [own for _, own in parsed]
     if not sliders:
-        return None, alpha
+        return None
     return RegionRows((*job.size, len(sliders)), picture, [rectangle for rectangle, _ in parsed]), torch.stack(sliders)
+
+
+def selection_rows(job: Job, path: Path | None, regions: list[str] | None, option: str) -> RegionRows | None:
+    """What :func:`selection` gives, by rows."""
+    if path is None and not regions:
+        return None
+    return RegionRows((*job.size, 1), _mask(job, path), plain_rectangles(job.size, regions, option))
 
 
 @dataclass(frozen=True)
@@ -115,41 +127,18 @@ def stroke_rows(job: Job, path: Path | None, regions: list[str] | None) -> Strok
     return StrokeRows((*job.size, 4), picture, coloured_rectangles(job.size, regions))
 
 
-@dataclass(frozen=True)
-class MarkRows:
-    """Rectangles on a photograph: rows (h, W) that are True within them.
-
-    Attributes:
-        shape: (H, W).
-        rectangles: of any number.
-    """
-
-    shape: tuple[int, int]
-    rectangles: list[Rectangle]
-    dtype = np.dtype(bool)
-
-    def __getitem__(self, rows: slice) -> NDArray[np.bool_]:
-        """The rows from ``rows.start`` to ``rows.stop``."""
-        marks = np.zeros((rows.stop - rows.start, self.shape[1]), self.dtype)
-        for rectangle in self.rectangles:
-            marks[_within(rectangle, rows)] = True
-        return marks
-
-
-def mark_rows(job: Job, regions: list[str] | None, option: str) -> MarkRows | None:
-    """What :func:`selection` gives for rectangles alone, by rows."""
-    return MarkRows(job.size, plain_rectangles(job.size, regions, option)) if regions else None
-
-
-def of_edit(step: Step, job: Job, source: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """What :func:`nlfilter_torch.cli.scribbles.of_edit` gives, by rows, and what errors call the files."""
-    if step.edit == "detail":
-        regions, alpha = region_rows(job, given.get("mask"), given.get("region"), torch.tensor(step["alpha"]))
-        return {"regions": regions, "alpha": alpha, "name": source}
-    path = given.get("strokes")
-    found: dict[str, Any] = {
-        "strokes": stroke_rows(job, path, given.get("region")),
-        "names": (source, str(path or "--region")),
-    }
-    keep = mark_rows(job, given.get("keep"), "--keep")
-    return found if keep is None else found | {"keep": keep}
+def of_edit(step: Step, job: Job, given: Mapping[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """What :func:`nlfilter_torch.cli.scribbles.of_edit` gives, by rows."""
+    if step.edit in ("recolor", "colorize"):
+        keep = selection_rows(job, None, given.get("keep"), "--keep")
+        strokes = stroke_rows(job, given.get("strokes"), given.get("region"))
+        return (strokes, None), {} if keep is None else {"keep": keep}
+    if step.edit == "defocus":
+        focus = selection_rows(job, given.get("mask"), given.get("region"), "--region")
+        if focus is None:
+            raise unfocused()
+        return (focus,), {}
+    if step.edit != "detail":
+        return (), {}
+    found = region_rows(job, given.get("mask"), given.get("region"), torch.tensor(step["alpha"]))
+    return ((), {}) if found is None else (found[:1], {"alpha": found[1]})

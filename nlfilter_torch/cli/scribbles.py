@@ -57,14 +57,17 @@ def of_edit(
     if step.edit == "defocus":
         focus = selection(photograph, given.get("mask"), given.get("region"), option="--region")
         if focus is None:
-            raise ValueError(
-                "give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60"
-            )
+            raise unfocused()
         return (focus,), {}
     if step.edit != "detail":
         return (), {}
     found = slider_regions(photograph, given.get("mask"), given.get("region"), torch.tensor(step["alpha"]))
     return ((), {}) if found is None else (found[:1], {"alpha": found[1]})
+
+
+def unfocused() -> ValueError:
+    """What to raise where nothing is to stay sharp."""
+    return ValueError("give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60")
 
 
 def colour_strokes(photograph: Photograph, path: Path | None, regions: list[str] | None) -> tuple[Tensor, Tensor]:

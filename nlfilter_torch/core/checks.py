@@ -384,6 +384,9 @@ def check_size(size: object, points: int) -> tuple[int, int]:
     return (size[0], size[1])
 
 
+LEAST_WEIGHT = 1e-6  # of a point; its inverse is the largest, beyond which sums in float32 lose the others
+
+
 def check_weights(weights: Tensor, features: Tensor) -> Tensor:
     """Weights (B, N) in the dtype of the features (B, D, N), from (N,) or (B, N).
 
@@ -391,14 +394,18 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
         TypeError, ValueError: if they are not positive and finite, or of another shape.
     """
     check_tensor(weights, "weights")
+    check_dtype(weights, "weights", "convert it with weights.float()")
     batch, _, points = features.shape
     if tuple(weights.shape) not in ((points,), (1, points), (batch, points)):
         raise ValueError(
             f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; give one each"
         )
     weights = weights.detach().to(features).expand(batch, points).contiguous()
-    if not is_hidden(weights) and not bool(((weights > 0) & weights.isfinite()).all()):
-        raise ValueError("weights must be positive and finite, got others; leave out points that stand for no pixel")
+    if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
+        raise ValueError(
+            f"weights must be from {LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}, got values from {weights.min():g} to "
+            f"{weights.max():g}; leave out points that stand for no pixel"
+        )
     return weights
 
 

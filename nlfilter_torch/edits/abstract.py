@@ -4,23 +4,20 @@ Edges and tones after Winnemoeller, Olsen and Gooch, "Real-Time Video Abstractio
 """
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_photograph, check_reach
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
 from nlfilter_torch.edits.parameters import ABSTRACT
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.spectrum import Spectrum
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, synthesize
 
-# What the eigenvectors do not explain is filtered by W's diagonal part r, this many times as often: gone where a pixel
-# has likes, there where it is like no other, such as on a border, and back everywhere as the power goes to 0.
-TIMES_UNEXPLAINED = 10
+# The residual of the eigenvectors is multiplied by the power of W's diagonal part r, with this many times the exponent:
+# it vanishes where a pixel has similar ones, stays where it has none, such as on a border, and is whole at power 0.
+TIMES_RESIDUAL = 10
 LEAST = 1e-4  # of r
 # Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
@@ -73,103 +70,78 @@ def abstract(
         >>> bool((abstract(image, power=0.0, num_landmarks=50) - image).abs().max() < 1e-5)
         True
     """
-    held = Abstraction(
+    check_photograph(image, "image")
+    return edited(
         image,
+        fit_abstract,
+        power=power,
+        edges=edges,
+        edge_width=edge_width,
+        tones=tones,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         num_landmarks=num_landmarks,
         **options,
     )
-    return held(power=power, edges=edges, edge_width=edge_width, tones=tones)
 
 
-class Abstraction:
-    """An image, held with its filter, so that another power, other lines and other tones need no other filter.
+def fit_abstract(
+    source: Source,
+    *,
+    power: float | Tensor = ABSTRACT.defaults["power"],
+    edges: float = ABSTRACT.defaults["edges"],
+    edge_width: float | None = None,
+    tones: int | None = ABSTRACT.defaults["tones"],
+    spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = ABSTRACT.defaults["patch_size"],
+    num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
+    **options: Any,
+) -> Fitted:
+    """:func:`abstract` for any source."""
+    check_count(num_landmarks, "num_landmarks")
+    ABSTRACT["power"].check_argument(power, source.batch)
+    ABSTRACT["edges"].check_argument(edges)
+    ABSTRACT["edge_width"].check_argument(edge_width)
+    width = ABSTRACT["edge_width"].pixels(edge_width, source.size)
+    check_reach(width, "edge_width", source.size)
+    ABSTRACT["tones"].check_argument(tones)
+    if (edges > 0 or tones is not None) and source.channels not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select some")
+    options |= {
+        "patch_size": patch_size,
+        "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
+        "spatial_bandwidth": nearby(spatial_bandwidth, ABSTRACT["spatial_bandwidth"].share, source.size),
+        "guide_channels": "all",
+    }
+    operator = source.operator(Guide(lambda image: image, options, spectral=True))
+    # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
+    mean = source.mean(lambda pixels: pixels.image)
 
-    Args:
-        image: of :func:`abstract`.
-        **options: of its filter; those left out are its defaults.
+    def varying(pixels: Pixels) -> Tensor:
+        return pixels.image - mean
 
-    Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point tensor.
-    """
+    exponent = torch.as_tensor(power).to(operator.pairs.root).reshape(-1, 1)
+    coefficients = operator.coefficients(varying)
+    captured = synthesize(operator, torch.ones_like, coefficients)
+    smoothed = synthesize(operator, lambda eigenvalues: eigenvalues**exponent, coefficients)
+    times = TIMES_RESIDUAL * exponent.to(source.dtype).unsqueeze(2)
+    kept = operator.each(lambda columns: columns.remainder.clamp(LEAST, 1.0).unsqueeze(1) ** times)
 
-    def __init__(self, image: Tensor, **options: Any) -> None:
-        check_photograph(image, "image")
-        options = {name: ABSTRACT.defaults[name] for name in ("patch_size", "num_landmarks")} | options
-        check_count(options["num_landmarks"], "num_landmarks")
-        options["num_landmarks"] = min(options["num_landmarks"], image[0, 0].numel())
-        self._image = image
-        nearness = nearby(options.get("spatial_bandwidth"), ABSTRACT["spatial_bandwidth"].share, image.shape[-2:])
-        self._options = {**options, "spatial_bandwidth": nearness}
+    def flat(pixels: Pixels) -> Tensor:
+        return mean + smoothed(pixels) + kept(pixels) * (varying(pixels) - captured(pixels))
 
-    @cached_property
-    def _parted(self) -> "_Parted":
-        """What the filter makes of the image, worked out when the settings have passed their checks."""
-        pixels = self._image.to(working_dtype(self._image))
-        operator = nonlocal_operator(pixels, guide_channels="all", **self._options)
-        spectrum = operator.spectrum()
-        # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
-        mean = pixels.mean((2, 3), keepdim=True)
-        coefficients = spectrum.coefficients(pixels - mean)
-        unexplained = pixels - mean - spectrum.synthesize(torch.ones_like, coefficients)
-        return _Parted(spectrum, mean, coefficients, unexplained, operator.diagonal_share.clamp(LEAST, 1.0))
-
-    @full_precision
-    def __call__(
-        self,
-        *,
-        power: float | Tensor = ABSTRACT.defaults["power"],
-        edges: float = ABSTRACT.defaults["edges"],
-        edge_width: float | None = None,
-        tones: int | None = ABSTRACT.defaults["tones"],
-    ) -> Tensor:
-        """The abstract image (B, C, H, W); arguments and errors are those of :func:`abstract`."""
-        image = self._image
-        ABSTRACT["power"].check_argument(power, image.shape[0])
-        ABSTRACT["edges"].check_argument(edges)
-        ABSTRACT["edge_width"].check_argument(edge_width)
-        size = (image.shape[-2], image.shape[-1])
-        width = ABSTRACT["edge_width"].pixels(edge_width, size)
-        check_reach(width, "edge_width", size)
-        ABSTRACT["tones"].check_argument(tones)
-        if (edges > 0 or tones is not None) and image.shape[1] not in (1, 3):
-            raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {image.shape[1]}; select some")
-
-        flat = self._parted.flatten(power)
-        if edges == 0 and tones is None:
-            return flat.to(image.dtype)
-        luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
-        toned = luminance if tones is None else quantize(luminance, tones)
-        toned = toned * (1 - edges * (1 - edge_lines(luminance, width)))
-        return (merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned).to(image.dtype)
+    if edges == 0 and tones is None:
+        return Fitted(flat)
+    return Fitted(flat, lambda _, planes: draw(planes, edges, width, tones), margin=_gaussian_margin(WIDER * width) + 1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Parted:
-    """An image as its filter parts it.
-
-    Attributes:
-        spectrum: of the filter.
-        mean: of each channel, (B, C, 1, 1).
-        coefficients: of the image without it, (B, C, M).
-        unexplained: what the eigenvectors leave of that, (B, C, H, W).
-        alone: r, the filter's diagonal part, (B, 1, H, W), above 0.
-    """
-
-    spectrum: Spectrum
-    mean: Tensor
-    coefficients: Tensor
-    unexplained: Tensor
-    alone: Tensor
-
-    def flatten(self, power: float | Tensor) -> Tensor:
-        """``W^k y``, (B, C, H, W), for k = ``power``."""
-        exponent = torch.as_tensor(power).to(self.spectrum.root).reshape(-1, 1)
-        kept = self.alone ** (TIMES_UNEXPLAINED * exponent.to(self.alone)[..., None, None])  # (B, 1, H, W)
-        smoothed = self.spectrum.synthesize(lambda eigenvalues: eigenvalues**exponent, self.coefficients)
-        return self.mean + smoothed + kept * self.unexplained
+def draw(flat: Tensor, edges: float, width: float, tones: int | None) -> Tensor:
+    """An image (B, C, H, W) in a few tones, with lines along its edges."""
+    luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
+    toned = luminance if tones is None else quantize(luminance, tones)
+    toned = toned * (1 - edges * (1 - edge_lines(luminance, width)))
+    return merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned
 
 
 def edge_lines(luminance: Tensor, width: float) -> Tensor:
@@ -191,8 +163,12 @@ def quantize(luminance: Tensor, tones: int) -> Tensor:
     return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)
 
 
+def _gaussian_margin(sigma: float) -> int:
+    return math.ceil(3 * sigma)
+
+
 def _gaussian(image: Tensor, sigma: float) -> Tensor:
     from kornia.filters import gaussian_blur2d  # kornia takes half a second to import: only who needs it waits
 
-    size = 2 * math.ceil(3 * sigma) + 1
+    size = 2 * _gaussian_margin(sigma) + 1
     return gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="replicate")

@@ -1,34 +1,37 @@
 """What a step does to an image, and what of it can be kept for the next step of its kind."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.edits.abstract import Abstraction, abstract
-from nlfilter_torch.edits.colorize import Colorization, colorize
-from nlfilter_torch.edits.defocus import Defocusing, defocus
-from nlfilter_torch.edits.denoise import denoise
-from nlfilter_torch.edits.detail import enhance
+from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.edits.abstract import fit_abstract
+from nlfilter_torch.edits.colorize import fit_colorize
+from nlfilter_torch.edits.defocus import fit_defocus
+from nlfilter_torch.edits.denoise import fit_denoise
+from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.edits.parameters import FILTER
-from nlfilter_torch.edits.recolor import Recoloring, recolor
-from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
-from nlfilter_torch.edits.sharpen import sharpen
+from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.edits.scribbles import mask_of, paint
+from nlfilter_torch.edits.sharpen import fit_sharpen
+from nlfilter_torch.edits.source import Fitted, InMemory, Source, apply_fitted, edited
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.tone import adjust_tone
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.edits.tone import fit_tone
 
-#: The edits as functions of an image, the scribbles on it and parameters.
-FUNCTIONS: dict[str, Callable[..., Tensor]] = {
-    "denoise": denoise,
-    "detail": enhance,
-    "tone": adjust_tone,
-    "sharpen": sharpen,
-    "colorize": colorize,
-    "recolor": recolor,
-    "defocus": defocus,
-    "abstract": abstract,
+#: What each edit learns from a source, the scribbles on it and parameters.
+FITS: dict[str, Callable[..., Fitted]] = {
+    "denoise": fit_denoise,
+    "detail": fit_detail,
+    "tone": fit_tone,
+    "sharpen": fit_sharpen,
+    "colorize": fit_colorize,
+    "recolor": fit_recolor,
+    "defocus": fit_defocus,
+    "abstract": fit_abstract,
 }
 
 
@@ -53,73 +56,79 @@ def scribbles_of(step: Step, size: tuple[int, int]) -> tuple[tuple[Tensor, ...],
     if not step.has_region():
         return (), {}
     outer = mask_of(step.painted("out"), size)
-    sliders = {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
     negative = {"negative": outer} if bool(outer.any()) else {}
-    return (mask_of(step.painted("in"), size),), sliders | negative
+    return (mask_of(step.painted("in"), size),), sliders_of(step) | negative
 
 
+def sliders_of(step: Step) -> dict[str, Tensor]:
+    """The sliders of a step of detail with a region, inside and outside."""
+    return {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
+
+
+def fit_step(
+    step: Step,
+    source: Source,
+    scribbles: tuple[Any, ...],
+    named: dict[str, Any],
+    *,
+    stride: int = 1,
+    generator: torch.Generator | None = None,
+) -> Fitted:
+    """What a step does to a source, under scribbles in place of those of the step; see :func:`scribbles_of`.
+
+    Args:
+        step: of an edit.
+        source: the picture.
+        scribbles: in the form that the source has them, and so are those in ``named``.
+        named: further arguments of the edit.
+        stride: every how many pixels of the photograph the source has one.
+        generator: source of randomness; None is that of the command line.
+    """
+    check_channels(step.edit, source.channels)
+    arguments = step.arguments(source.size, stride) | named
+    if step.edit == "detail":
+        scribbles = (torch.as_tensor(arguments.pop("alpha")), *scribbles)
+    return FITS[step.edit](source, *scribbles, **arguments, generator=generator or seeded())
+
+
+@full_precision
 def apply_to(
     step: Step,
     image: Tensor,
     scribbles: tuple[Tensor, ...],
     named: dict[str, Tensor],
     *,
-    stride: int = 1,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """The edited image under scribbles, see :func:`scribbles_of`, in place of those of the step."""
-    check_channels(step.edit, image.shape[1])
-    arguments = step.arguments((image.shape[-2], image.shape[-1]), stride) | named
-    if step.edit == "detail":
-        scribbles = (torch.as_tensor(arguments.pop("alpha")), *scribbles)
-    if step.edit == "colorize":
-        image = reduce_channels(image, "luminance")
-    return FUNCTIONS[step.edit](image, *scribbles, **arguments, generator=generator or seeded())
+    check_photograph(image, "image")
+    return edited(image, partial(fit_step, step), scribbles, named, generator=generator)
 
 
-def apply_step(step: Step, image: Tensor, *, stride: int = 1, generator: torch.Generator | None = None) -> Tensor:
-    """The edited image, from (1, C, H, W) in [0, 1].
+def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    """The edited image, from (B, C, H, W) in [0, 1].
 
     Args:
         step: of an edit.
-        image: (1, C, H, W).
-        stride: every how many pixels of the photograph the image has one.
+        image: (B, C, H, W).
         generator: source of randomness; None is that of the command line.
     """
-    painted = scribbles_of(step, (image.shape[-2], image.shape[-1]))
-    return apply_to(step, image, *painted, stride=stride, generator=generator)
+    return apply_to(step, image, *scribbles_of(step, (image.shape[-2], image.shape[-1])), generator=generator)
 
 
 def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], Tensor]:
-    """What steps that agree in :func:`shared` make of an image; the filter is made once, for the first of them."""
-    size = (image.shape[-2], image.shape[-1])
-    options = {k: v for k, v in step.arguments(size, stride).items() if k in FILTER} | {"generator": seeded()}
-    if step.edit == "recolor" and image.shape[1] == 3:
-        cached: Any = Recoloring(image, **options)
-    elif step.edit == "colorize":
-        cached = Colorization(reduce_channels(image, "luminance"), **options)
-    elif step.edit == "abstract":
-        cached = Abstraction(image, **options)
-    elif step.edit == "defocus":
-        blurring = Defocusing(image, **options)
-        focused: dict[tuple[Stroke, ...], Tensor] = {}
+    """What steps that agree in :func:`shared` make of an image; the filter is made once, for the first of them.
 
-        def defocused(step: Step) -> Tensor:
-            if step.strokes not in focused:
-                focused.clear()
-                focused[step.strokes] = blurring.focus(*scribbles_of(step, size)[0])
-            given = step.arguments(size, stride)
-            return blurring.blur(focused[step.strokes], given["radius"], given["aperture"])
-
-        return defocused
-    else:
-        return lambda step: apply_step(step, image, stride=stride)
+    Args:
+        step: the first of them.
+        image: (1, C, H, W) in [0, 1].
+        stride: every how many pixels of the photograph the image has one.
+    """
+    source = InMemory(image.to(working_dtype(image)), {})
 
     def edit(step: Step) -> Tensor:
-        scribbles, named = scribbles_of(step, size)
-        own = {k: v for k, v in step.arguments(size, stride).items() if k not in FILTER}
-        result: Tensor = cached(*scribbles, **named, **own)
-        return result
+        fitted = fit_step(step, source, *scribbles_of(step, source.size), stride=stride)
+        return apply_fitted(fitted, source).to(image.dtype)
 
     return edit
 

@@ -1,27 +1,26 @@
 """A grey photograph and a few strokes of colour to a colour photograph. Paper: Sec. V-B, Fig. 16."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import (
     check_count,
-    check_image,
     check_patch_size,
     check_photograph,
     check_positive,
-    check_same_size,
 )
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance
 from nlfilter_torch.edits.parameters import COLORIZE
+from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Source, edited, luminance, luminance_guide
 from nlfilter_torch.filtering.masks import segment_mask
-from nlfilter_torch.filtering.scribbles import check_painted, propagate_strokes
-from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.spectrum import Spectrum
 
 Method = Literal["regression", "kmeans"]
@@ -104,82 +103,93 @@ def colorize(
         (True, True)
     """
     check_photograph(grey, "grey", channels=1)
-    COLORIZE["method"].check_argument(method)
-    check_positive(photometric_bandwidth, "photometric_bandwidth", grey.shape[0])
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth", grey.shape[0])
-    check_patch_size(patch_size)
-    check_count(num_landmarks, "num_landmarks")
-    once = Colorization(
+    return edited(
         grey,
+        fit_colorize,
+        strokes,
+        stroke_mask,
+        method=method,
+        strength=strength,
+        time=time,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         num_landmarks=num_landmarks,
         generator=generator,
-        hold=False,
     )
-    return once(strokes, stroke_mask, method=method, strength=strength, time=time)
 
 
-class Colorization:
-    """A grey image, held with the filters that find likes in it, so that more strokes need no other filters.
+def fit_colorize(
+    source: Source,
+    strokes: Any,
+    stroke_mask: Any,
+    *,
+    method: Method = COLORIZE.defaults["method"],
+    strength: float | Tensor = COLORIZE.defaults["strength"],
+    time: float | Tensor = 1.0,
+    photometric_bandwidth: float | Tensor = COLORIZE.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = COLORIZE.defaults["patch_size"],
+    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
+    **options: Any,
+) -> Fitted:
+    """:func:`colorize` for any source; of colours the luminance is taken."""
+    COLORIZE["method"].check_argument(method)
+    if method == "kmeans" and not source.whole:
+        raise ValueError(
+            "method must be regression where a picture is worked out by rows, got kmeans, which takes all pixels at "
+            "once; choose regression, or allow more memory"
+        )
+    COLORIZE["strength"].check_argument(strength, source.batch)
+    check_positive(time, "time", source.batch)
+    check_positive(photometric_bandwidth, "photometric_bandwidth", source.batch)
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
+    check_patch_size(patch_size)
+    check_count(num_landmarks, "num_landmarks")
+    pixels = source.size[0] * source.size[1]
+    options["num_landmarks"] = min(num_landmarks, pixels)
+    nearness = nearby(spatial_bandwidth, COLORIZE["spatial_bandwidth"].share, source.size)
+    scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
 
-    Args:
-        grey: of :func:`colorize`.
-        hold: both filters; without, one at a time takes memory, and each call makes them anew.
-        **options: of its filters; those left out are its defaults.
-    """
+    def operator_of(stage: Stage) -> Operator:
+        scaled = {
+            "patch_size": int(min(patch_size, stage.patch_size)),
+            "photometric_bandwidth": stage.photometric * photometric_bandwidth,
+            "spatial_bandwidth": stage.spatial * nearness,
+        }
+        return source.operator(Guide(luminance_guide, options | scaled, spectral=True))
 
-    def __init__(self, grey: Tensor, *, hold: bool = True, **options: Any) -> None:
-        self._grey = grey
-        own = ("photometric_bandwidth", "patch_size", "num_landmarks")
-        defaults = {name: COLORIZE.defaults[name] for name in own}
-        options = {**defaults, **options}
-        bandwidth = nearby(options.get("spatial_bandwidth"), COLORIZE["spatial_bandwidth"].share, grey.shape[-2:])
-        options["num_landmarks"] = min(options["num_landmarks"], grey[0].numel())
+    assert scribbles.colours is not None  # for mypy
+    wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
+    if method == "kmeans":
+        regions, colours, _ = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
+        planes = scribbles.weighted(regions.squeeze(2)).planes(source)
+        pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
+        chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
+        return Fitted(lambda some: merge_luminance(luminance(some), chroma))
+    parts = []
+    for stage in (FAR, NEAR):
+        operator = operator_of(stage)
+        columns = operator.at(scribbles.places)
+        fitted = fit_strokes(
+            partial(_scribbled, columns, scribbles.weights, wanted),
+            operator.pairs,
+            pixels,
+            strength=strength if stage is FAR else 0.0,
+            reach=stage.reach,
+            smoothness=stage.smoothness,
+        )
+        wanted = wanted - torch.cat([fitted(block) for block in columns()], dim=2)
+        parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
+    far, near = parts
+    return Fitted(lambda some: merge_luminance(luminance(some), far(some) + near(some)))
 
-        def spectrum(stage: Stage) -> Spectrum:
-            scaled = {
-                "patch_size": int(min(options["patch_size"], stage.patch_size)),
-                "photometric_bandwidth": stage.photometric * options["photometric_bandwidth"],
-                "spatial_bandwidth": stage.spatial * bandwidth,
-            }
-            return nonlocal_operator(grey.to(working_dtype(grey)), **(options | scaled)).spectrum()
 
-        self._spectrum = cache(spectrum) if hold else spectrum
-
-    @full_precision
-    def __call__(
-        self,
-        strokes: Tensor,
-        stroke_mask: Tensor,
-        *,
-        method: Method = COLORIZE.defaults["method"],
-        strength: float | Tensor = COLORIZE.defaults["strength"],
-        time: float | Tensor = 1.0,
-    ) -> Tensor:
-        """The image in colour, (B, 3, H, W); arguments and errors are those of :func:`colorize`."""
-        grey = self._grey
-        batch, size = grey.shape[0], (grey.shape[-2], grey.shape[-1])
-        for tensor, name, channels in ((strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)):
-            check_image(tensor, name, channels=channels, batch=batch)
-            check_same_size(tensor, size, name, "grey image")
-        check_painted(stroke_mask)
-        COLORIZE["strength"].check_argument(strength, batch)
-        check_positive(time, "time", batch)
-
-        luminance = grey.to(working_dtype(grey))
-        painted = stroke_mask.to(luminance).expand(batch, -1, -1, -1)
-        wanted = split_luminance(strokes.to(luminance).expand(batch, -1, -1, -1))[1]
-        if method == "kmeans":
-            regions, colours, _ = group_colours(wanted, painted)
-            pieces = segment_mask(self._spectrum(FAR), regions, time=time)
-            chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
-        else:
-            chroma = torch.zeros_like(wanted)
-            for stage in (FAR, NEAR):
-                part = strength if stage is FAR else 0.0
-                given = {"strength": part, "reach": stage.reach, "smoothness": stage.smoothness}
-                chroma = chroma + propagate_strokes(self._spectrum(stage), wanted - chroma, painted, **given)
-        return merge_luminance(luminance, chroma).to(grey.dtype)
+def _scribbled(columns: Blocks, weights: Tensor, values: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Columns, weights and values of scribbled pixels, block by block."""
+    first = 0
+    for block in columns():
+        part = slice(first, first + block.shape[2])
+        yield block, weights[:, :, part], values[:, :, part]
+        first = part.stop

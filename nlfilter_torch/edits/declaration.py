@@ -221,7 +221,6 @@ class Edit:
         brushes: what strokes may say, and how the editor calls it; ``colour`` is any colour.
         needs: that without strokes it changes nothing.
         coloured: that it gives colours to a grey photograph.
-        tiled: that it can be done to a photograph that fits no memory.
     """
 
     name: str
@@ -231,7 +230,6 @@ class Edit:
     brushes: tuple[tuple[str, str], ...] = ()
     needs: bool = False
     coloured: bool = False
-    tiled: bool = False
 
     def __iter__(self) -> Iterator[Parameter]:
         """Its parameters."""

@@ -1,26 +1,19 @@
 """A photograph as if taken with a wide aperture: sharp where one chooses, blurred elsewhere. Paper: Sec. V-C."""
 
 import math
-from functools import cached_property
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import (
-    check_image,
-    check_photograph,
-    check_reach,
-    check_same_size,
-)
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.checks import check_photograph, check_reach
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby
-from nlfilter_torch.edits.components import Pixels, Spots, find_spots
+from nlfilter_torch.edits.components import Components, correlations, find_components
 from nlfilter_torch.edits.parameters import DEFOCUS
-from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.spectrum import Spectrum
+from nlfilter_torch.edits.source import Fitted, Guide, Source, edited
+from nlfilter_torch.filtering.scribbles import walk_basis
 
 Aperture = Literal["disc", "gaussian"]
 
@@ -50,8 +43,8 @@ def defocus(
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp; several spots may differ
-            in colour, and each stands for what most of it covers.
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp; connected components
+            may differ in colour, and each stands for what most of it covers.
         radius: of the strongest blur, in pixels, at most half the short side; None is 2.5 % of it.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
             variance.
@@ -79,80 +72,90 @@ def defocus(
         True
     """
     check_photograph(image, "image")
-    if image.shape[1] not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {image.shape[1]}; select some")
-    DEFOCUS["aperture"].check_argument(aperture)
-    DEFOCUS["radius"].check_argument(radius)
-    size = (image.shape[-2], image.shape[-1])
-    reach = DEFOCUS["radius"].pixels(radius, size)
-    check_reach(reach, "radius", size)
-    held = Defocusing(
+    return edited(
         image,
+        fit_defocus,
+        focus_region,
+        radius=radius,
+        aperture=aperture,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         **options,
     )
-    return held.blur(held.focus(focus_region), float(reach), aperture)
 
 
-class Defocusing:
-    """An image, held with the filter that finds likes in it, so that another region or blur needs no other filter.
+def fit_defocus(
+    source: Source,
+    focus_region: Any,
+    *,
+    radius: float | None = None,
+    aperture: Aperture = DEFOCUS.defaults["aperture"],
+    spatial_bandwidth: float | Tensor | None = None,
+    **options: Any,
+) -> Fitted:
+    """:func:`defocus` for any source."""
+    if source.channels not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
+    DEFOCUS["aperture"].check_argument(aperture)
+    DEFOCUS["radius"].check_argument(radius)
+    reach = float(DEFOCUS["radius"].pixels(radius, source.size))
+    check_reach(reach, "radius", source.size)
+    scribbles = source.scribbles(focus_region, None, "focus_region")
+    options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
+    options |= {
+        "spatial_bandwidth": nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size),
+        "guide_channels": "all",
+    }
+    operator = source.operator(Guide(lambda image: image, options, spectral=True))
+    basis = walk_basis(operator.pairs, REACH).to(source.dtype)
+    found = find_components(scribbles, operator.at(scribbles.places), basis, source.size)
+    likeness = operator.each(
+        lambda columns: torch.stack([_best(*of) for of in zip(basis, found, columns.factor, strict=True)]).unsqueeze(1)
+    )
+    short = min(source.size)
+
+    def finish(image: Tensor, planes: Tensor) -> Tensor:
+        return blur_by(image, 1 - focus_map(image, planes[:, :1], planes[:, 1:], short), reach, aperture)
+
+    margin = focus_margin(short) + _kernel_radius(reach, aperture)
+    return Fitted(lambda pixels: torch.cat([likeness(pixels), scribbles.planes(pixels)], dim=1), finish, margin)
+
+
+def focus_margin(short: int) -> int:
+    """How many pixels around a pixel its focus depends on, in a picture whose short side has so many."""
+    closing, smoothing = math.ceil(CLOSING * short), math.ceil(SMOOTHING * short)
+    return 2 * closing - 1 + (2 * (smoothing + _every(smoothing)) if smoothing < short else 0)
+
+
+def _every(radius: int) -> int:
+    """Every how many pixels a smoothing of that radius takes one."""
+    return max(1, radius // GUIDED)
+
+
+def focus_map(image: Tensor, likeness: Tensor, focus_region: Tensor, short: int) -> Tensor:
+    """How much every pixel belongs to what is in focus, (B, 1, H, W) in [0, 1]; the paper's mask, for many components.
+
+    A pixel is in focus if it correlates with any component of the region. Gaps are closed, and borders follow the
+    image's.
 
     Args:
-        image: of :func:`defocus`.
-        **options: of its filter; those left out are its defaults.
-    """
-
-    def __init__(self, image: Tensor, **options: Any) -> None:
-        self._image = image
-        options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
-        nearness = nearby(options.get("spatial_bandwidth"), DEFOCUS["spatial_bandwidth"].share, image.shape[-2:])
-        self._options = {**options, "spatial_bandwidth": nearness}
-
-    @cached_property
-    def _spectrum(self) -> Spectrum:
-        """Of the filter, which is made when a region has passed its checks."""
-        guide = self._image.to(working_dtype(self._image))
-        return nonlocal_operator(guide, guide_channels="all", **self._options).spectrum()
-
-    @full_precision
-    def focus(self, focus_region: Tensor) -> Tensor:
-        """How much every pixel is in focus, (B, 1, H, W) in [0, 1]; errors are those of :func:`defocus`."""
-        image = self._image
-        check_image(focus_region, "focus_region", channels=1, batch=image.shape[0])
-        check_same_size(focus_region, (image.shape[-2], image.shape[-1]), "focus_region", "image")
-        check_painted(focus_region, "focus_region")
-        pixels = image.to(working_dtype(image))
-        return focus_map(self._spectrum, pixels, focus_region.to(pixels))
-
-    @full_precision
-    def blur(self, focus: Tensor, radius: float, aperture: Aperture = DEFOCUS.defaults["aperture"]) -> Tensor:
-        """The image (B, C, H, W), blurred by ``radius`` where it is not in ``focus``."""
-        pixels = self._image.to(working_dtype(self._image))
-        return blur_by(pixels, 1 - focus, radius, aperture).to(self._image.dtype)
-
-
-def focus_map(spectrum: Spectrum, image: Tensor, focus_region: Tensor) -> Tensor:
-    """How much every pixel belongs to what is in focus, (B, 1, H, W) in [0, 1]; the paper's mask, for many spots.
-
-    A pixel is in focus if it correlates with any spot of the region. Gaps are closed, and borders follow the image's.
+        image: (B, C, H, W).
+        likeness: largest correlation with a component of the region, (B, 1, H, W).
+        focus_region: weights of the region, (B, 1, H, W).
+        short: pixels of the short side of the whole picture.
     """
     from kornia.filters import guided_blur  # kornia takes half a second to import: only who needs it waits
 
-    painted = focus_region.to(spectrum.factor).expand(image.shape[0], -1, -1, -1)
-    best = [_best(*found) for found in find_spots(spectrum, painted, REACH)]  # B times (N,)
-    likeness = torch.stack(best).unflatten(1, spectrum.size).unsqueeze(1).to(focus_region)
     share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
     focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
-    short = min(image.shape[-2:])
-    reach = math.ceil(CLOSING * short)
+    radius = math.ceil(CLOSING * short)
     # One pixel less back than forth: a patch across a border is like neither side, and would cost the subject its rim.
-    closed = -largest_within(-largest_within(focus, reach), reach - 1)
-    reach = math.ceil(SMOOTHING * short)
-    if reach < short:  # reflection needs as many pixels
-        every = max(1, reach // GUIDED)
-        window = 2 * (reach // every) * every + 1
+    closed = -largest_within(-largest_within(focus, radius), radius - 1)
+    radius = math.ceil(SMOOTHING * short)
+    if radius < short:  # reflection needs as many pixels
+        every = _every(radius)
+        window = 2 * (radius // every) * every + 1
         closed = guided_blur(image, closed, window, eps=1e-4, subsample=every, separable=True)
     return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
 
@@ -163,9 +166,9 @@ def largest_within(planes: Tensor, reach: int) -> Tensor:
     return F.max_pool2d(rows, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
 
 
-def _best(spots: Spots, pixels: Pixels) -> Tensor:
-    """Largest correlation (N,) of every pixel with a spot, few spots at a time."""
-    return torch.stack([pixels.along(few).amax(0) for few in spots.means.split(8)]).amax(0)
+def _best(basis: Tensor, components: Components, factor: Tensor) -> Tensor:
+    """Largest correlation (n,) of the columns (M, n) with a component, a few components at a time."""
+    return torch.stack([correlations(basis, few, factor).amax(0) for few in components.means.split(8)]).amax(0)
 
 
 def blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:
@@ -183,9 +186,14 @@ def blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) ->
     return result
 
 
+def _kernel_radius(radius: float, aperture: Aperture) -> int:
+    """Pixels from the middle of the kernel to its border; of a Gaussian, three standard deviations."""
+    return math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)
+
+
 def _kernel(radius: float, aperture: Aperture) -> Tensor:
     """A square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
-    reach = math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)  # three standard deviations
+    reach = _kernel_radius(radius, aperture)
     axis = torch.arange(-reach, reach + 1, dtype=torch.float64)
     squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
     if aperture == "disc":

@@ -1,6 +1,5 @@
 """Less noise, with sliders that every pixel sets from the noise level. Paper: Sec. III, Fig. 6(c), (d); Sec. V."""
 
-import math
 from typing import Any
 
 import torch
@@ -11,10 +10,8 @@ from nlfilter_torch.core.checks import check_count, check_image, check_photograp
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.parameters import DENOISE
-from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import pad_border
-from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Operator, Pixels, Source, edited
+from nlfilter_torch.filtering.filters import weigh_layers
 
 GUIDE_BLUR = 0.7  # pixels; the guide's own noise would link pixels by it
 ORDER = 2
@@ -63,27 +60,50 @@ def denoise(
         (0.1, True)
     """
     check_photograph(image, "image")
-    check_count(num_landmarks, "num_landmarks")
-    DENOISE["noise_level"].check_argument(noise_level, image.shape[0])
-    pixels = image.to(working_dtype(image))
-    level = estimate_noise(pixels) if noise_level is None else torch.as_tensor(noise_level).to(pixels).reshape(-1)
-
-    heard = level.clamp(min=QUIET)
-    operator = nonlocal_operator(
-        soften(pixels, GUIDE_BLUR),
-        photometric_bandwidth=heard if photometric_bandwidth is None else photometric_bandwidth,
-        spatial_bandwidth=nearby(spatial_bandwidth, DENOISE["spatial_bandwidth"].share, pixels.shape[-2:]),
+    return edited(
+        image,
+        fit_denoise,
+        noise_level=noise_level,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
-        num_landmarks=min(num_landmarks, pixels.shape[-2] * pixels.shape[-1]),
-        guide_channels="all",
+        num_landmarks=num_landmarks,
         **options,
     )
-    layers = detail_layers(operator, pixels, order=ORDER)  # (B, ORDER+1, C, H, W)
-    energy = operator @ layers[:, :-1].square().mean(2)  # (B, ORDER, H, W)
-    noise = heard.square().reshape(-1, 1) * _passed_noise(operator)  # (B, ORDER)
-    kept = (1 - noise[..., None, None] / energy.clamp(min=1e-12)).clamp(0.0, 1.0)
-    cleaned = weigh_layers(layers, torch.cat([kept, torch.ones_like(kept[:, :1])], dim=1))
-    return torch.where((level < QUIET).reshape(-1, 1, 1, 1), pixels, cleaned).to(image.dtype)
+
+
+def fit_denoise(
+    source: Source,
+    *,
+    noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
+    photometric_bandwidth: float | Tensor | None = None,
+    spatial_bandwidth: float | Tensor | None = None,
+    num_landmarks: int = DENOISE.defaults["num_landmarks"],
+    **options: Any,
+) -> Fitted:
+    """:func:`denoise` for any source."""
+    check_count(num_landmarks, "num_landmarks")
+    DENOISE["noise_level"].check_argument(noise_level, source.batch)
+    level = _noise_of(source) if noise_level is None else torch.as_tensor(noise_level, dtype=source.dtype).reshape(-1)
+    heard = level.clamp(min=QUIET)
+    options = {"patch_size": DENOISE.defaults["patch_size"]} | options
+    options |= {
+        "photometric_bandwidth": heard if photometric_bandwidth is None else photometric_bandwidth,
+        "spatial_bandwidth": nearby(spatial_bandwidth, DENOISE["spatial_bandwidth"].share, source.size),
+        "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
+        "guide_channels": "all",
+    }
+    operator = source.operator(Guide(lambda image: image, options, blur=GUIDE_BLUR))
+    layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
+    energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of (B, ORDER, H, W)
+    noise = heard.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)
+
+    def cleaned(pixels: Pixels) -> Tensor:
+        kept = (1 - noise[..., None, None].to(pixels.image) / energy(pixels)[:, -1].clamp(min=1e-12)).clamp(0.0, 1.0)
+        weighed = weigh_layers(layers(pixels), torch.cat([kept, torch.ones_like(kept[:, :1])], dim=1))
+        return torch.where((level < QUIET).reshape(-1, 1, 1, 1), pixels.image, weighed)
+
+    return Fitted(cleaned)
 
 
 @full_precision
@@ -109,39 +129,38 @@ def estimate_noise(image: Tensor) -> Tensor:
         tensor([0.1000])
     """
     check_image(image, "image")
-    if min(image.shape[-2:]) < 3:
-        return image.new_zeros(image.shape[0])
-    second = torch.tensor([1.0, -2.0, 1.0], device=image.device, dtype=working_dtype(image))
+    return _noise_of(InMemory(image.detach().to(working_dtype(image))))
+
+
+def _noise_of(source: Source) -> Tensor:
+    """:func:`estimate_noise` for any source."""
+    if min(source.size) < 3:
+        return torch.zeros(source.batch, dtype=source.dtype)
+    return source.medians(_response, 1).mean(1) / MEDIAN
+
+
+@torch.no_grad()
+def _response(image: Tensor) -> Tensor:
+    """Absolute response (B, C, H-2, W-2) to Immerkaer's mask."""
+    second = torch.tensor([1.0, -2.0, 1.0], device=image.device, dtype=image.dtype)
     mask = torch.outer(second, second)[None, None] / 6  # of unit norm
-    planes = image.detach().to(mask.dtype).flatten(0, 1).unsqueeze(1)
-    response = F.conv2d(planes, mask).flatten(1).abs()
-    return (response.median(1).values / MEDIAN).unflatten(0, image.shape[:2]).mean(1)
+    return (
+        F.conv2d(image.flatten(0, 1).unsqueeze(1), mask).abs().view(*image.shape[:2], *(n - 2 for n in image.shape[2:]))
+    )
 
 
-def soften(image: Tensor, sigma: float) -> Tensor:
-    """Blur an image (B, C, H, W) of any size by a Gaussian."""
-    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import: only who needs it waits
-
-    reach = math.ceil(2.5 * sigma)
-    size = 2 * reach + 1
-    padded = pad_border(image, reach)
-    return gaussian_blur2d(padded, (size, size), (sigma, sigma))[..., reach:-reach, reach:-reach]
-
-
-def _passed_noise(operator: NonlocalOperator) -> Tensor:
+def _passed_noise(operator: Operator, pixels: int) -> Tensor:
     """Variance (B, ORDER) that unit white noise has in each detail layer ``W^i (I - W)``, mean over pixels.
 
     Off the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.
     """
-    spectrum = operator.spectrum()
-    inside = spectrum.eigenvalues  # (B, R)
-    counted = spectrum.support[:, : inside.shape[1]]  # the others are padding, in a batch of different ranks
-    outside = operator.diagonal_share.flatten(1)  # (B, N)
-    pixels = outside.shape[1]
-    share = 1 - counted.sum(1) / pixels  # (B,)
 
     def gain(eigenvalues: Tensor, order: int) -> Tensor:
         return (eigenvalues**order * (1 - eigenvalues)).square()
 
-    traces = [(gain(inside, i) * counted).sum(1) / pixels + share * gain(outside, i).mean(1) for i in range(ORDER)]
-    return torch.stack(traces, dim=1)
+    ritz, support = operator.pairs.ritz, operator.pairs.support
+    inside = [ritz.apply(lambda s, i=i: gain(s.clamp(0.0, 1.0), i), support) for i in range(ORDER)]  # type: ignore[misc]
+    traces = torch.stack([matrix.diagonal(dim1=1, dim2=2).sum(1) for matrix in inside], dim=1) / pixels
+    share = operator.each(lambda columns: columns.remainder.unsqueeze(1))
+    outside = operator.mean(lambda some: torch.cat([gain(share(some), i) for i in range(ORDER)], dim=1))
+    return traces.to(outside) + (1 - support.sum(1, keepdim=True) / pixels) * outside

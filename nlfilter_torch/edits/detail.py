@@ -5,14 +5,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_photograph, check_positive, check_tensor
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.checks import (
+    check_alpha,
+    check_image,
+    check_photograph,
+    check_positive,
+    check_tensor,
+    check_weight,
+)
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.parameters import DETAIL
-from nlfilter_torch.filtering.filters import blend_sliders, filter_regions, polynomial_filter
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
+from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import reduce_channels
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
 SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter
@@ -68,32 +75,74 @@ def enhance(
     """
     check_photograph(image, "image")
     check_tensor(alpha, "alpha")
-    DETAIL["channels"].check_argument(channels)
-    check_positive(mask_bandwidth, "mask_bandwidth", image.shape[0])
-    pixels = image.to(working_dtype(image))
     if regions is not None:
         check_image(regions, "regions", batch=image.shape[0])
+    return edited(
+        image,
+        fit_detail,
+        alpha,
+        regions,
+        negative=negative,
+        outside=outside,
+        residual=residual,
+        channels=channels,
+        time=time,
+        width=width,
+        mask_bandwidth=mask_bandwidth,
+        **options,
+    )
+
+
+def fit_detail(
+    source: Source,
+    alpha: Tensor,
+    regions: Any = None,
+    *,
+    negative: Any = None,
+    outside: Tensor | None = None,
+    residual: float | Tensor | None = DETAIL.defaults["residual"],
+    channels: str = DETAIL.defaults["channels"],
+    time: float | Tensor = DETAIL.defaults["time"],
+    width: float | Tensor = 4.0,
+    mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    **options: Any,
+) -> Fitted:
+    """:func:`enhance` for any source."""
+    check_alpha(alpha)
+    DETAIL["channels"].check_argument(channels)
+    check_positive(time, "time", source.batch)
+    check_positive(width, "width", source.batch)
+    check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
+    if residual is not None:
+        check_weight(residual, "residual", source.batch)
+    masks = None
+    if regions is not None:
         shared = {name: value for name, value in options.items() if name in SHARED}
-        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
-            shared["generator"] = torch.Generator(options["generator"].device)
-            shared["generator"].set_state(options["generator"].get_state())
-        masks = colour_masks(
-            pixels, regions, negative=negative, time=time, width=width, mask_bandwidth=mask_bandwidth, **shared
-        )
-        sliders = alpha.expand(masks.shape[1], -1) if alpha.ndim == 1 else alpha
+        if isinstance(shared.get("generator"), torch.Generator):  # both filters draw from the same state
+            shared["generator"] = shared["generator"].clone_state()
+        shared |= {"photometric_bandwidth": mask_bandwidth, "guide_channels": "all"}
+        seen = Guide(lambda image: image, shared, spectral=True)
+        masks = source.masks(seen, regions, negative, time=time, width=width)
     elif negative is not None or outside is not None:
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
-    operator = nonlocal_operator(reduce_channels(pixels, "luminance"), **options)
+    planes = (lambda pixels: pixels.image) if channels == "all" else luminance
+    operator = source.operator(Guide(lambda image: image, options, exact=residual is not None))
+    order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
+    filtered = polynomial(operator, planes, order, residual)
 
-    def edit(planes: Tensor) -> Tensor:
-        if regions is None:
-            return polynomial_filter(operator, planes, alpha, residual=residual)
-        if outside is None:
-            return filter_regions(operator, planes, masks, sliders, residual=residual)
-        return polynomial_filter(operator, planes, blend_sliders(masks, sliders, outside), residual=residual)
+    def edit(pixels: Pixels) -> Tensor:
+        if masks is None:
+            return filtered(pixels, alpha)
+        found = masks(pixels)
+        sliders = alpha.expand(found.shape[1], -1) if alpha.ndim == 1 else alpha
+        if outside is not None:
+            return filtered(pixels, blend_sliders(found, sliders, outside))
+        return blend_regions(planes(pixels), found, sliders, lambda inside: filtered(pixels, inside))
 
-    return (edit(pixels) if channels == "all" else edit_luminance(pixels, edit)).to(image.dtype)
+    if channels == "all":
+        return Fitted(edit)
+    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: edit(pixels)))
 
 
 def colour_masks(

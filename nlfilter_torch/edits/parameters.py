@@ -159,7 +159,6 @@ DETAIL = Edit(
     ),
     hint="Paint on what is to have sliders of its own; all that looks like it follows.",
     brushes=(("in", "Edit this"), ("out", "Not this")),
-    tiled=True,
 )
 
 SHARPEN = Edit(
@@ -299,7 +298,6 @@ RECOLOR = Edit(
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
     needs=True,
-    tiled=True,
 )
 
 COLORIZE = Edit(
@@ -339,7 +337,6 @@ COLORIZE = Edit(
     brushes=(("colour", "Paint"),),
     needs=True,
     coloured=True,
-    tiled=True,
 )
 
 DEFOCUS = Edit(

@@ -1,25 +1,23 @@
 """Strokes of colour that reach everything of the same colour. Paper: Sec. V-A, Figs. 14, 15."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_unit_range
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance
-from nlfilter_torch.edits.components import Spots, find_spots
+from nlfilter_torch.edits.components import Components, Scribbles, correlations, find_components
 from nlfilter_torch.edits.parameters import RECOLOR
-from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.spectrum import Spectrum
+from nlfilter_torch.edits.source import Fitted, Guide, Source, edited
+from nlfilter_torch.filtering.scribbles import walk_basis
 
 LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
-DOUBT = 0.05  # variance of what a spot tells, in units of a pixel's own: two colours on one thing are no error
+DOUBT = 0.05  # variance of what a component tells, in units of a pixel's own: two colours on one thing are no error
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
 
@@ -76,66 +74,61 @@ def recolor(
         (True, True)
     """
     check_photograph(image, "image", channels=3)
-    held = Recoloring(image, photometric_bandwidth=photometric_bandwidth, patch_size=patch_size, **options)
-    return held(strokes, stroke_mask, keep=keep, reach=reach)
+    return edited(
+        image,
+        fit_recolor,
+        strokes,
+        stroke_mask,
+        keep=keep,
+        reach=reach,
+        photometric_bandwidth=photometric_bandwidth,
+        patch_size=patch_size,
+        **options,
+    )
 
 
-class Recoloring:
-    """An image, held with the filter that finds likes in it, so that more strokes need no other filter.
+def fit_recolor(
+    source: Source,
+    strokes: Any,
+    stroke_mask: Any,
+    *,
+    keep: Any = None,
+    reach: float | Tensor = RECOLOR.defaults["reach"],
+    **options: Any,
+) -> Fitted:
+    """:func:`recolor` for any source."""
+    RECOLOR["reach"].check_argument(reach, source.batch)
+    scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
+    kept = None if keep is None else source.scribbles(keep, None, "keep", needed=False)
 
-    Args:
-        image: of :func:`recolor`.
-        **options: of its filter; those left out are its defaults.
-    """
+    colours, regions, counts = _grouped(scribbles)
+    old = region_means(split_luminance(scribbles.image.unsqueeze(2))[1], regions.unsqueeze(2))
+    marked = scribbles.weighted(regions * counts.unsqueeze(2))
+    marked = marked if kept is None else marked.joined(kept)
 
-    def __init__(self, image: Tensor, **options: Any) -> None:
-        self._image = image
-        defaults = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")}
-        self._options = {**defaults, **options}
+    options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
+    operator = source.operator(Guide(colour_guide, {**options, "guide_channels": "all"}, spectral=True))
+    basis = walk_basis(operator.pairs, reach).to(source.dtype)
+    found = find_components(marked, operator.at(marked.places), basis, source.size)
+    directions = [divide(components) for components in found]
+    likeness = operator.each(
+        lambda columns: torch.stack([correlations(*of) for of in zip(basis, directions, columns.factor, strict=True)])
+    )
+    change = Recoloring(colours, old)
+    return Fitted(lambda pixels: change(pixels.image, likeness(pixels), marked.planes(pixels)))
 
-    @cached_property
-    def _spectrum(self) -> Spectrum:
-        """Of the filter, which is made when strokes have passed their checks."""
-        guide = colour_guide(self._image.to(working_dtype(self._image)))
-        return nonlocal_operator(guide, guide_channels="all", **self._options).spectrum()
 
-    @full_precision
-    def __call__(
-        self,
-        strokes: Tensor,
-        stroke_mask: Tensor,
-        *,
-        keep: Tensor | None = None,
-        reach: float | Tensor = RECOLOR.defaults["reach"],
-    ) -> Tensor:
-        """The image (B, 3, H, W) under strokes; arguments and errors are those of :func:`recolor`."""
-        image = self._image
-        batch, size = image.shape[0], (image.shape[-2], image.shape[-1])
-        named = [(strokes, "strokes", 3), (stroke_mask, "stroke_mask", 1)]
-        for tensor, name, channels in [*named, *([(keep, "keep", 1)] if keep is not None else [])]:
-            check_image(tensor, name, channels=channels, batch=batch)
-            check_same_size(tensor, size, name, "image")
-        check_painted(stroke_mask)
-        if keep is not None:
-            check_unit_range(keep, "keep")
-        RECOLOR["reach"].check_argument(reach, batch)
-
-        pixels = image.to(working_dtype(image))
-        painted = stroke_mask.to(pixels).expand(batch, -1, -1, -1)
-        wanted = split_luminance(strokes.to(pixels).expand(batch, -1, -1, -1))[1]
-        regions, colours, counts = group_colours(wanted, painted)  # (B, K, H, W), (B, K, 3), (B, K)
-        own = regions * counts[..., None, None]
-        held = None if keep is None else keep.to(pixels).expand(batch, -1, -1, -1) * (painted == 0)
-        marked = own if held is None else torch.cat([own, held], dim=1)
-        found = [pixels.along(divide(spots)) for spots, pixels in find_spots(self._spectrum, marked, reach)]
-        likeness = torch.stack(found).unflatten(2, size)
-        old = region_means(split_luminance(pixels)[1], regions)
-        return Dye(colours, old)(pixels, likeness, marked).to(image.dtype)
+def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
+    """The chroma (B, K, 3) of scribbles, their regions (B, K, n), and which of these an image has, (B, K)."""
+    assert scribbles.colours is not None  # for mypy
+    chroma = split_luminance(scribbles.colours.unsqueeze(2))[1]
+    regions, colours, counts = group_colours(chroma, scribbles.weights.unsqueeze(2))
+    return colours, regions.squeeze(2), counts
 
 
 @dataclass(frozen=True, eq=False)
-class Dye:
-    """What K strokes make of any pixel, given how much it resembles the spots they are painted on.
+class Recoloring:
+    """What scribbles of K colours make of any pixel, given how similar it is to what they cover.
 
     Attributes:
         colours: chroma of the strokes, (B, K, 3).
@@ -157,7 +150,7 @@ class Dye:
         shares = ((likeness[:, :count] - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
         shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
         shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
-        # What someone painted on is theirs, odd or not.
+        # Scribbled pixels take the colour of the scribble, whatever they look like.
         shares = shares * (1 - marked.sum(1, keepdim=True)) + marked[:, :count]
 
         # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
@@ -172,15 +165,15 @@ class Dye:
         return torch.where(untouched, pixels, merge_luminance(luminance, chroma))
 
 
-def divide(spots: Spots) -> Tensor:
+def divide(components: Components) -> Tensor:
     """The vectors (K, M) whose products with a pixel's say how much it resembles one region rather than the others.
 
-    The spots share a pixel, about 0 to 1, by the best linear estimate of its region from its correlations with them, so
-    that a region painted on what resembles another one takes from it what is its own.
+    The components share a pixel, about 0 to 1, by the best linear estimate of its region from its correlations with
+    them, so that regions that resemble each other are told apart by what they do not share.
     """
-    doubtful = spots.between.double() + DOUBT * torch.eye(len(spots.between)).to(spots.between)
-    solved = torch.cholesky_solve(spots.owners.double(), torch.linalg.cholesky_ex(doubtful).L)
-    return solved.mT.to(spots.means) @ spots.means
+    doubtful = components.between.double() + DOUBT * torch.eye(len(components.means)).to(components.means)
+    solved = torch.cholesky_solve(components.owners.double(), torch.linalg.cholesky_ex(doubtful).L)
+    return solved.mT.to(components.means) @ components.means
 
 
 def colour_guide(image: Tensor) -> Tensor:

@@ -6,13 +6,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_reach
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.denoise import soften
 from nlfilter_torch.edits.parameters import SHARPEN
-from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, luminance_guide, polynomial
 
 
 @full_precision
@@ -51,16 +48,29 @@ def sharpen(
         (torch.Size([1, 3, 32, 32]), True)
     """
     check_photograph(image, "image")
-    SHARPEN["amount"].check_argument(amount, image.shape[0])
-    SHARPEN["guide_blur"].check_argument(guide_blur)
-    check_reach(guide_blur, "guide_blur", (image.shape[-2], image.shape[-1]))
-    pixels = image.to(working_dtype(image))
-    guide = reduce_channels(pixels, "luminance")
-    operator = nonlocal_operator(
-        soften(guide, guide_blur) if guide_blur > 0 else guide,
-        photometric_bandwidth=photometric_bandwidth,  # type: ignore[arg-type]  # checked there
+    return edited(
+        image,
+        fit_sharpen,
+        amount=amount,
+        guide_blur=guide_blur,
+        photometric_bandwidth=photometric_bandwidth,
         **options,
     )
-    middle = torch.as_tensor(amount).to(pixels).reshape(-1).expand(pixels.shape[0])
+
+
+def fit_sharpen(
+    source: Source,
+    *,
+    amount: float | Tensor = SHARPEN.defaults["amount"],
+    guide_blur: float = SHARPEN.defaults["guide_blur"],
+    **options: Any,
+) -> Fitted:
+    """:func:`sharpen` for any source."""
+    SHARPEN["amount"].check_argument(amount, source.batch)
+    SHARPEN["guide_blur"].check_argument(guide_blur)
+    check_reach(guide_blur, "guide_blur", source.size)
+    operator = source.operator(Guide(luminance_guide, options, blur=guide_blur))
+    filtered = polynomial(operator, luminance, 3, None)
+    middle = torch.as_tensor(amount, dtype=torch.float32).reshape(-1).expand(source.batch)
     alpha = torch.stack([torch.ones_like(middle), middle, middle, torch.ones_like(middle)], dim=1)
-    return edit_luminance(pixels, lambda planes: polynomial_filter(operator, planes, alpha)).to(image.dtype)
+    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: filtered(pixels, alpha)))

@@ -9,9 +9,7 @@ from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.parameters import TONE
-from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
 
 
 @full_precision
@@ -49,19 +47,27 @@ def adjust_tone(
         (True, True)
     """
     check_photograph(image, "image")
+    return edited(image, fit_tone, contrast=contrast, clarity=clarity, order=order, **options)
+
+
+def fit_tone(
+    source: Source,
+    *,
+    contrast: float | Tensor = TONE["contrast"].idle,
+    clarity: float | Tensor = TONE["clarity"].idle,
+    order: int = 3,
+    **options: Any,
+) -> Fitted:
+    """:func:`adjust_tone` for any source."""
     check_order(order)
-    TONE["contrast"].check_argument(contrast, image.shape[0])
-    TONE["clarity"].check_argument(clarity, image.shape[0])
-    operator = nonlocal_operator(reduce_channels(image, "luminance"), **options)
+    TONE["contrast"].check_argument(contrast, source.batch)
+    TONE["clarity"].check_argument(clarity, source.batch)
+    operator, mean = source.operator(Guide(lambda image: image, options)), source.mean(luminance)
 
     def slider(value: float | Tensor) -> Tensor:
-        return torch.as_tensor(value).to(operator.factor).reshape(-1).expand(image.shape[0])
+        return torch.as_tensor(value).to(mean).reshape(-1).expand(source.batch)
 
     fine = [torch.ones_like(slider(1.0))] * (order - 1)
     alpha = torch.stack([*fine, slider(clarity), slider(contrast)], dim=1)
-
-    def edit(luminance: Tensor) -> Tensor:
-        mean = luminance.mean((2, 3), keepdim=True)
-        return mean + polynomial_filter(operator, luminance - mean, alpha)
-
-    return edit_luminance(image, edit)
+    filtered = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
+    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: mean + filtered(pixels, alpha)))

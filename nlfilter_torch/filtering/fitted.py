@@ -25,7 +25,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.newton import PixelScaling, weighted
-from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,16 +135,27 @@ class FittedFilter:
     def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
         """The same (B, k+1 or k+3, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
-        scaling, remainder = self.balancing(factor, diagonal)
-        remainder = remainder.unsqueeze(1)
-        smoothed = [image]
-        for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
-            smoothed.append(torch.addcmul(spread(coefficients.mT, factor, scaling), remainder, smoothed[-1]))
-        layers = layers_between(torch.stack(smoothed, dim=1))
+        columns = Columns(factor, *self.balancing(factor, diagonal))
+        layers = layers_of_columns(columns, self.moments, image)
         if not missed:
             return layers
-        explained = spread(self.explained.to(factor).mT, factor, scaling)
-        return torch.cat([layers, torch.stack([image - explained, remainder.expand_as(image)], dim=1)], dim=1)
+        captured = spread(self.explained.to(factor).mT, factor, columns.scaling)
+        share = columns.remainder.unsqueeze(1).expand_as(image)
+        return torch.cat([layers, torch.stack([image - captured, share], dim=1)], dim=1)
+
+
+def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:
+    """Detail layers (B, k+1, C, n) of some pixels.
+
+    Args:
+        columns: of the pixels.
+        coefficients: of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
+        image: their y, (B, C, n).
+    """
+    smoothed, remainder = [image], columns.remainder.unsqueeze(1)
+    for each in coefficients.to(columns.factor).unbind(1):  # one for each power of W
+        smoothed.append(torch.addcmul(spread(each.mT, columns.factor, columns.scaling), remainder, smoothed[-1]))
+    return layers_between(torch.stack(smoothed, dim=1))
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:

@@ -85,6 +85,7 @@ def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, gene
 def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Candidates of k-means among points with weights (N,): what :func:`stratified` picks of the pixels in order."""
     summed = weights.double().cumsum(0).cpu()
+    summed = summed * (len(summed) / summed[-1]).clamp(min=1.0)  # a point may stand for less than a pixel
     pixels = round(float(summed[-1]))
     wanted = min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count))
     return torch.searchsorted(summed, stratified(pixels, wanted, generator).double(), right=True).clamp_(

@@ -35,11 +35,10 @@ def whitener(landmarks: Tensor) -> Tensor:
 def _squared_distances(points: Tensor) -> Tensor:
     """Between points (B, D, M) in float64, (B, M, M)."""
     norms = points.square().sum(1)
-    if not is_hidden(points):
-        # Products cancel where points lie far apart for the bandwidth, and the matrix of affinities may then have a
-        # negative eigenvalue.
-        if not float(norms.detach().max()) * torch.finfo(points.dtype).eps < CANCELLATION:
-            return torch.stack([(points - one.unsqueeze(2)).square().sum(1) for one in points.unbind(2)], dim=1)
+    # Products cancel where points lie far apart for the bandwidth, and the matrix of affinities may then have a
+    # negative eigenvalue.
+    if not is_hidden(points) and not float(norms.detach().max()) * torch.finfo(points.dtype).eps < CANCELLATION:
+        return torch.stack([(points - one.unsqueeze(2)).square().sum(1) for one in points.unbind(2)], dim=1)
     return norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
 
 

@@ -1,22 +1,20 @@
 """A whole edit, as the editor saves it, on a picture larger than memory: its steps in turn, in tiles of rows."""
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryFile
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.edits.applying import seeded
+from nlfilter_torch.edits.applying import fit_step, sliders_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.tiled.colorize import colorize_rows
-from nlfilter_torch.tiled.detail import detail_rows
-from nlfilter_torch.tiled.recolor import recolor_rows
+from nlfilter_torch.tiled.intermediate import intermediate
+from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import Picture, Rows, RowSource
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
 
@@ -74,7 +72,7 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
     Args:
         passes: over the rows, of every step.
         source: as of :func:`stream_detail`.
-        recipe: of steps that support tiles.
+        recipe: the edit.
         name: of the source, for error messages.
         folder: with room for the intermediate picture between two steps.
 
@@ -84,58 +82,35 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
     """
     picture = Picture(source, name)
     steps = recipe.acting
-    for step in steps:
-        if step.edit not in ROWS:
-            raise ValueError(
-                f"{step.edit} takes the whole photograph at once, and {name} is too large for that; "
-                "allow more memory, or leave that step out"
-            )
     with ExitStack() as stack:
         for step in steps[:-1]:
-            rows = rows_of(step, replace(passes, kind="float32"), source, name)
-            source = stack.enter_context(_kept(rows, picture.size, folder))
+            rows = step_rows(step, replace(passes, kind="float32"), source, name, folder)
+            clipped = ((part, values.clip(0, 1)) for part, values in rows)
+            source = stack.enter_context(intermediate(clipped, picture.size, folder))
         if steps:
-            yield from rows_of(steps[-1], passes, source, name)
+            yield from step_rows(steps[-1], passes, source, name, folder)
         else:
             yield from passes.work_out(picture, lambda tile: tile.inner, 0, max(1, TILE_PIXELS // picture.size[1]))
 
 
-@contextmanager
-def _kept(rows: Rows, size: tuple[int, int], folder: Path) -> Iterator[RowSource]:
-    """Rows as a source of rows, in a temporary file in a folder."""
-    with TemporaryFile(dir=folder) as file:
-        samples = 0
-        for _, values in rows:
-            samples = values.shape[2]
-            try:
-                file.write(values.clip(0, 1).astype(np.float32).tobytes())
-            except OSError as error:
-                reason = f"{error.strerror}, where one step of the edit leaves {4e-9 * np.prod(size) * samples:.1f} GB"
-                raise OSError(error.errno, f"{reason} to the next", str(folder)) from error
-        file.flush()
-        yield np.memmap(file, np.float32, "r", shape=(*size, samples))
-
-
-def rows_of(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
+def step_rows(step: Step, passes: Passes, source: RowSource, name: str, folder: Path) -> Rows:
     """The rows that a step makes of a picture."""
-    size = Picture(source).size
-    arguments = step.arguments(size) | {"generator": seeded()}
-    if step.edit != "detail":
-        arguments |= {"strokes": ColouredRows(step.painted("colour"), size), "names": (name, "strokes")}
-        keep = CoveredRows(step.painted("keep"), size)
-        arguments |= {"keep": keep} if keep.any() else {}
-        return ROWS[step.edit](passes, source, **arguments)
-    arguments |= {"alpha": torch.tensor(step["alpha"]), "name": name}
-    if step.has_region():
-        outer = CoveredRows(step.painted("out"), size)
-        arguments |= {
-            "alpha": torch.tensor(step.sliders_inside),
-            "outside": torch.tensor(step["alpha"]),
-            "regions": CoveredRows(step.painted("in"), size),
-            "negative": outer if outer.any() else None,
-        }
-    return ROWS[step.edit](passes, source, **arguments)
+    tiled = Tiled(Picture(source, name), passes)
+    yield from tiled.rows(fit_step(step, tiled, *scribbled_rows(step, tiled.size)), folder)
 
 
-#: The edits that can be done by rows; the others take the whole picture at once.
-ROWS: dict[str, Callable[..., Rows]] = {"detail": detail_rows, "colorize": colorize_rows, "recolor": recolor_rows}
+def scribbled_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[RowSource | None, ...], dict[str, Any]]:
+    """What :func:`scribbles_of` gives, as rows."""
+
+    def covered(word: str) -> CoveredRows | None:
+        rows = CoveredRows(step.painted(word), size)
+        return rows if rows.any() else None
+
+    if step.edit in ("recolor", "colorize"):
+        keep = covered("keep")
+        return (ColouredRows(step.painted("colour"), size), None), {"keep": keep} if keep is not None else {}
+    if step.edit == "defocus":
+        return (CoveredRows(step.painted("in"), size),), {}
+    if not step.has_region():
+        return (), {}
+    return (CoveredRows(step.painted("in"), size),), sliders_of(step) | {"negative": covered("out")}

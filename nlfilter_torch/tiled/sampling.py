@@ -27,16 +27,16 @@ from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.newton import PixelScaling, scaling_from_moment
 from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.spectrum import CUT
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.sources import Picture, Tile
+from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, start_balancing, sum_up
 
 PILOT = 1 << 17  # pixels of the first sample: their factor, 52 MB at m = 100, is balanced in memory
 CHUNK = 1 << 16  # pixels of a sample whose factor is there at once
 
 Report = Callable[[str, int, int], None]
-Image = Callable[[Tensor], Tensor]  # colours (1, C, H, W) to what is filtered
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Sample:
 
     Attributes:
         features: (1, D, n).
-        image: (1, C, n), what is filtered.
+        image: their colours, (1, C, n).
         weights: (1, n), how many pixels each of them stands for.
     """
 
@@ -70,13 +70,14 @@ class Sample:
             yield Block(*kernel.factor(features), image, weights)
 
 
-def all_blocks(picture: Picture, kernel: Kernel, image: Image, report: Report, stage: str) -> Iterator[Block]:
+def all_blocks(picture: GuidePicture, kernel: Kernel, report: Report, stage: str) -> Iterator[Block]:
     """Factor and diagonal of every pixel of a picture."""
-    margin = kernel.recipe.patch_weights.shape[0] // 2
-    for tile in picture.tiles(margin, picture.statistics_rows):
-        columns = kernel.columns(tile.pixels, origin=tile.origin, halo=tile.halo)
+    size = kernel.recipe.patch_weights.shape[0] // 2
+    for tile in picture.picture.tiles(size + picture.guide.margin, picture.statistics_rows):
+        guide = picture.seen(tile, size)
+        columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
         report(stage, tile.start, picture.size[0])
-        yield Block(*columns, image(tile.inner).flatten(2), torch.ones_like(columns[1]))
+        yield Block(*columns, tile.inner.flatten(2), torch.ones_like(columns[1]))
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,14 @@ class Pilot:
     balancing: Tensor
     seed: int
 
+    @property
+    def completed(self) -> bool:
+        """Whether the kernel has a unit diagonal."""
+        return self.kernel.completion == "diagonal"
+
 
 def take_pilot(
-    picture: Picture,
-    image: Image,
+    picture: GuidePicture,
     report: Report,
     *,
     patch_size: int = 5,
@@ -139,12 +144,14 @@ def take_pilot(
     wanted = torch.cat([candidates, even])
     patches, values = [], []
     slope = 0.0
-    for tile, chosen in _visit(picture, max(patch_size // 2, 1), wanted.sort().values, report, "Looking"):
-        guide = reduce_channels(tile.pixels, guide_channels)
-        patches.append(patches_at(guide, tile, chosen, patch_size))
-        values.append(image(tile.inner).flatten(2)[:, :, chosen])
+    margin = max(patch_size // 2, 1)
+    for tile, chosen in visit(picture.picture, margin + picture.guide.margin, wanted.sort().values, report, "Looking"):
+        seen = picture.seen(tile, margin)
+        guide = reduce_channels(seen.pixels, guide_channels)
+        patches.append(patches_at(guide, seen, chosen, patch_size))
+        values.append(tile.inner.flatten(2)[:, :, chosen])
         if photometric_bandwidth == "auto":
-            slope += float(gradients(guide, tile.halo).double().mean((0, 1)).sum())
+            slope += float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
     if isinstance(photometric_bandwidth, str):
         photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels, dtype=torch.float64)))
     order = torch.empty_like(wanted)
@@ -162,7 +169,7 @@ def take_pilot(
     return Pilot(kernel, sample, start_balancing(*kernel.factor(sample.features), weight), rest.initial_seed())
 
 
-def _visit(picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str) -> Iterator[tuple[Tile, Tensor]]:
+def visit(picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str) -> Iterator[tuple[Tile, Tensor]]:
     """All tiles of a pass, each with those of the sorted ``pixels`` that lie in it, as counted from its first one."""
     width, rows = picture.size[1], picture.statistics_rows
     for tile in picture.tiles(margin, rows):
@@ -205,7 +212,7 @@ EVEN = 0.1  # share of a sample that is spread evenly over the picture
 
 
 def sample_by_influence(
-    picture: Picture, pilot: Pilot, image: Image, count: int, report: Report, *, spectral: bool
+    picture: GuidePicture, pilot: Pilot, count: int, report: Report, *, spectral: bool
 ) -> list[Sample]:
     """About ``count`` pixels in several parts, rare ones more likely than common ones.
 
@@ -222,14 +229,15 @@ def sample_by_influence(
     recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
     done: list[Sample] = []
     waiting: list[Sample] = []  # of single tiles, much smaller than a chunk
-    for tile in picture.tiles(size // 2, picture.statistics_rows):
+    for tile in picture.picture.tiles(size // 2 + picture.guide.margin, picture.statistics_rows):
         report("Sampling", tile.start, picture.size[0])
-        guide = reduce_channels(tile.pixels, kernel.recipe.guide_channels)
-        features = kernel.recipe(tile.pixels, origin=tile.origin, halo=tile.halo)
+        seen = picture.seen(tile, size // 2)
+        guide = reduce_channels(seen.pixels, kernel.recipe.guide_channels)
+        features = kernel.recipe(seen.pixels, origin=seen.origin, halo=seen.halo)
         likely = (even + rate * influence(features)).clamp(max=1.0)
         chosen, counts = draw(likely, generator)
-        patches, places = patches_at(guide, tile, chosen, size), chosen + tile.start * picture.size[1]
-        values = image(tile.inner).flatten(2)[:, :, chosen]
+        patches, places = patches_at(guide, seen, chosen, size), chosen + tile.start * picture.size[1]
+        values = tile.inner.flatten(2)[:, :, chosen]
         weights = (counts / likely[chosen]).to(picture.dtype)[None]
         waiting.append(Sample(scaled_patches(patches, places, picture, *recipe), values, weights))
         if sum(part.weights.numel() for part in waiting) >= sampling.CHUNK:
@@ -290,8 +298,10 @@ class Influence:
         marks = kernel.landmarks.shape[2]
         measures = [torch.eye(marks, dtype=torch.float64)]
         if spectral:
-            balancing = PixelScaling(pilot.balancing, kernel.completion == "diagonal")
-            gram = sum_up(lambda: pilot.sample.blocks(kernel), balancing, 1).grams[0, 0]
+            balancing = PixelScaling(pilot.balancing, pilot.completed)
+            blocks = pilot.sample.blocks(kernel)
+            columns = ((Columns(b.factor, *balancing(b.factor, b.diagonal)), b) for b in blocks)
+            gram = sum_up(((b.image, found, b.weights) for found, b in columns), 1).grams[0, 0]
             values, vectors = torch.linalg.eigh(gram)
             values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
             measures.append(values.rsqrt()[:, None] * vectors.mT)

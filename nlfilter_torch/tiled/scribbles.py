@@ -1,100 +1,88 @@
-"""The scribbled pixels of a picture that is read by rows: their colours and features."""
+"""The scribbled pixels of a picture that is read by rows."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.tiled.sampling import Report, Sample, patches_at, scaled_patches
-from nlfilter_torch.tiled.sources import Picture, RowSource, Tile, transparency
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.tiled.sources import Picture, RowSource, transparency
 
-Look = Callable[[Tensor], Tensor]  # colours (1, C, H, W) to the guide that is compared
-Planes = Callable[[int, int], Tensor]  # of the rows from the first to before the second
+FLOATS_OF_SCRIBBLED = 200  # that a scribbled pixel takes: features of a patch in colour, twice while they are joined
+
+Rows = Callable[[int, int], Tensor]  # planes of the rows from the first to before the second
 
 
-class Guide(Picture):
-    """The guide of a picture, which ``look`` computes from its colours."""
-
-    def __init__(self, source: RowSource, name: str, look: Look) -> None:
-        """Check ``source``; ``look`` maps the colours of each pixel independently."""
-        super().__init__(source, name)
-        self.look = look
-
-    def tile(self, start: int, stop: int, margin: int) -> Tile:
-        """A tile of the guide, as :meth:`Picture.tile`."""
-        return self.seen(super().tile(start, stop, margin))
-
-    def seen(self, tile: Tile) -> Tile:
-        """The guide of a tile of the picture."""
-        return Tile(tile.start, self.look(tile.pixels), tile.halo, tile.stored)
-
-
-@dataclass(frozen=True)
-class Painted:
-    """Scribbled pixels.
-
-    Attributes:
-        places: their indices (n,) in row-major order, ascending.
-        weights: (n,) in (0, 1].
-        colours: (3, n), or none of them (0, n).
-    """
-
-    places: Tensor
-    weights: Tensor
-    colours: Tensor
-
-
-def read_strokes(
-    picture: Picture, strokes: RowSource, mask: RowSource | None, passes: Passes, *, name: str = "strokes"
-) -> Painted:
-    """Read the scribbles on a picture and their colours.
+def read_scribbles(
+    picture: Picture,
+    mask: RowSource | None,
+    colours: RowSource | None,
+    *,
+    name: str,
+    strokes: str,
+    memory: int,
+    report: Callable[[str, int, int], None],
+) -> Scribbles:
+    """Read scribbles, their colours and what they cover.
 
     Args:
         picture: below the scribbles.
-        strokes: rows (H, W, 3), read under the mask only; or (H, W, 4), whose last channel is the mask.
-        mask: rows (H, W) or (H, W, 1), or None.
-        passes: with the memory that scribbled pixels may take.
-        name: of the strokes, for messages.
+        mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, or None.
+        colours: rows (H, W, 3), read under the mask only; (H, W, 4) without one; or None.
+        name: of the mask, for messages.
+        strokes: of the colours, likewise.
+        memory: bytes that scribbled pixels may take.
+        report: told of the progress.
 
     Raises:
-        ValueError: if one of them has another size or another number of channels, a weight exceeds [0, 1], or all of
-            them are 0.
+        ValueError: if one of them has another size or another number of channels, or a weight exceeds [0, 1].
         MemoryError: if there are too many scribbled pixels.
     """
-    over = _overlay(picture, strokes, name)
-    if over.samples != (4 if mask is None else 3):
+    over = None if colours is None else _overlay(picture, colours, strokes)
+    if over is not None and over.samples != (4 if mask is None else 3):
         raise ValueError(
-            f"{name} must have 3 channels and a stroke_mask, or 4 channels and none, got {over.samples} "
+            f"{strokes} must have 3 channels and a stroke_mask, or 4 channels and none, got {over.samples} "
             f"{'without' if mask is None else 'with'} one; add or drop it"
         )
-
-    def colours(start: int, stop: int) -> Tensor:
-        return over.tile(start, stop, 0).pixels[0]
-
-    def opacity(start: int, stop: int) -> Tensor:
-        return torch.from_numpy(transparency(over.tile(start, stop, 0), "float32"))[..., 0]
-
-    if mask is None:
-        painted = _read(picture, opacity, colours, name, passes)
+    called, weights = name, _transparency(over) if mask is None and over is not None else None
+    if weights is None:
+        assert mask is not None  # for mypy
+        weights = _plane(picture, mask, name)
     else:
-        painted = _read(picture, _weights(picture, mask, "stroke_mask"), colours, "stroke_mask", passes)
-    if len(painted.places) == 0:
-        raise ValueError(
-            f"{name if mask is None else 'stroke_mask'} must hold a painted pixel, got none; paint at least one"
-        )
-    return painted
+        called = strokes
+    (height, width), step = picture.size, picture.statistics_rows
+    places, values, below, above, count = [], [], [], [], 0
+    for start in range(0, height, step):
+        report("Reading strokes", start, height)
+        stop = min(start + step, height)
+        plane = weights(start, stop).flatten()
+        if not bool(((plane >= 0) & (plane <= 1)).all()):
+            raise ValueError(
+                f"{called} must be in [0, 1], got values from {plane.min():g} to {plane.max():g}; clamp or scale it"
+            )
+        chosen = plane.nonzero().squeeze(1)
+        count += len(chosen)
+        check_room(picture, count, memory)
+        if len(chosen):
+            places.append(chosen + start * width)
+            values.append(plane[chosen].to(picture.dtype))
+            below.append(picture.tile(start, stop, 0).inner.flatten(2)[:, :, chosen])
+            if over is not None:
+                above.append(over.tile(start, stop, 0).pixels.flatten(2)[:, :, chosen].to(picture.dtype))
+    if not places:
+        empty = torch.zeros(1, 1, 0, dtype=picture.dtype)
+        return Scribbles(torch.zeros(0, dtype=torch.long), empty, empty.expand(-1, picture.colours, -1))
+    shown = torch.cat(above, dim=2) if above else None
+    return Scribbles(torch.cat(places), torch.cat(values)[None, None], torch.cat(below, dim=2), shown)
 
 
-def read_mask(picture: Picture, mask: RowSource, name: str, passes: Passes) -> Painted:
-    """Find the pixels where a mask, rows (H, W) or (H, W, 1), is above 0; raises as :func:`read_strokes`."""
-    return _read(picture, _weights(picture, mask, name), None, name, passes)
+def _transparency(over: Picture) -> Rows:
+    """The transparency (h, W) of a picture."""
+    return lambda start, stop: torch.from_numpy(transparency(over.tile(start, stop, 0), "float32"))[..., 0]
 
 
-def _weights(picture: Picture, mask: RowSource, name: str) -> Planes:
+def _plane(picture: Picture, mask: RowSource, name: str) -> Rows:
+    """The rows (h, W) of a mask."""
     over = _overlay(picture, mask, name)
     if over.samples != 1:
         raise ValueError(f"{name} must have 1 channel, got {over.samples}; select one")
@@ -111,66 +99,11 @@ def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
     return Picture(rows, name)
 
 
-def _read(picture: Picture, weights: Planes, colours: Planes | None, name: str, passes: Passes) -> Painted:
-    """The pixels whose weights (h, W) are above 0, and their colours out of (3, h, W)."""
-    (height, width), step = picture.size, picture.statistics_rows
-    places, found, shown, count = [], [], [], 0
-    for start in range(0, height, step):
-        passes.report("Reading strokes", start, height)
-        stop = min(start + step, height)
-        plane = weights(start, stop).flatten()
-        if not bool(((plane >= 0) & (plane <= 1)).all()):
-            raise ValueError(
-                f"{name} must be in [0, 1], got values from {plane.min():g} to {plane.max():g}; clamp or scale it"
-            )
-        chosen = plane.nonzero().squeeze(1)
-        count += len(chosen)
-        check_room(picture, count, 0, passes.memory)
-        places.append(chosen + start * width)
-        found.append(plane[chosen].to(picture.dtype))
-        if colours is not None and len(chosen):
-            shown.append(colours(start, stop).flatten(1)[:, chosen].to(picture.dtype))
-    return Painted(torch.cat(places), torch.cat(found), torch.cat(shown, dim=1) if shown else torch.empty(0, count))
-
-
-def floats_of_painted(planes: int) -> int:
-    """Floats per scribbled pixel with that many features, which exist twice while they are concatenated."""
-    return 2 * planes + 40
-
-
-def check_room(picture: Picture, count: int, planes: int, memory: int) -> None:
+def check_room(picture: Picture, count: int, memory: int) -> None:
     """Raise MemoryError if that many scribbled pixels take more than ``memory`` bytes."""
-    needed = count * floats_of_painted(planes) * (8 if picture.dtype == torch.float64 else 4)
+    needed = count * FLOATS_OF_SCRIBBLED * (8 if picture.dtype == torch.float64 else 4)
     if needed > memory:
         raise MemoryError(
             f"the strokes on {picture.name} cover {count} pixels or more and need {needed / 1e6:.0f} MB of memory, but "
             f"{memory / 1e6:.0f} MB may be used; paint less, or allow more"
         )
-
-
-def gather(
-    picture: Picture,
-    guide: Guide,
-    kernel: Kernel,
-    places: Tensor,
-    weights: Tensor,
-    image: Callable[[Tensor], Tensor],
-    report: Report,
-) -> Sample:
-    """Scribbled pixels (n,), ascending, with their features and ``image`` of their colours, read from their rows."""
-    size, (height, width), step = kernel.recipe.patch_weights.shape[0], picture.size, picture.statistics_rows
-    patches, values = [], []
-    for start in range(0, height, step):
-        report("Comparing strokes", start, height)
-        stop = min(start + step, height)
-        first, last = torch.searchsorted(places, torch.tensor([start, stop]) * width).tolist()
-        if first == last:
-            continue
-        chosen = places[first:last] - start * width
-        tile = picture.tile(start, stop, size // 2)
-        seen = guide.seen(tile)
-        patches.append(patches_at(reduce_channels(seen.pixels, kernel.recipe.guide_channels), seen, chosen, size))
-        values.append(image(tile.inner).flatten(2)[:, :, chosen])
-    recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
-    features = scaled_patches(torch.cat(patches, dim=2), places, picture, *recipe)
-    return Sample(features, torch.cat(values, dim=2), weights[None])

@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.edits.source import Guide
+
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
@@ -81,11 +83,14 @@ class Picture:
         dtype: in which to compute.
     """
 
-    def __init__(self, source: RowSource, name: str = "source") -> None:
-        """Check the shape and type of ``source``, called ``name`` in error messages."""
+    def __init__(self, source: RowSource, name: str = "source", *, planes: int | None = None) -> None:
+        """Check the shape and type of ``source``, called ``name`` in error messages.
+
+        ``planes`` is the number of channels of something other than a picture; all are read, and none is transparency.
+        """
         self.source, self.name = source, name
         shape, kind = tuple(source.shape), np.dtype(source.dtype).name
-        if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] > 4):
+        if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] > (planes or 4)):
             raise ValueError(
                 f"{name} must have the shape (H, W) or (H, W, S) with one to four channels, got {shape}; "
                 "move the channels to the end"
@@ -94,7 +99,7 @@ class Picture:
             raise TypeError(f"{name} must hold one of {', '.join(KINDS)}, got {kind}; convert it")
         self.size = (int(shape[0]), int(shape[1]))
         self.samples = int(shape[2]) if len(shape) == 3 else 1
-        self.colours = 3 if self.samples >= 3 else 1
+        self.colours = planes or (3 if self.samples >= 3 else 1)
         self.kind = kind
         self.dtype = torch.float64 if kind == "float64" else torch.float32
 
@@ -138,6 +143,33 @@ class Picture:
     def statistics_rows(self) -> int:
         """Rows in a block of a pass that computes statistics."""
         return max(1, STATISTICS_PIXELS // self.size[1])
+
+
+class GuidePicture(Picture):
+    """The guide of a picture.
+
+    Attributes:
+        picture: what it is the guide of.
+        guide: makes it.
+    """
+
+    def __init__(self, picture: Picture, guide: Guide) -> None:
+        super().__init__(picture.source, picture.name)
+        self.picture, self.guide = picture, guide
+
+    def tile(self, start: int, stop: int, margin: int) -> Tile:
+        """A tile of the guide, as :meth:`Picture.tile`."""
+        return self.seen(super().tile(start, stop, margin + self.guide.margin), margin)
+
+    def seen(self, tile: Tile, margin: int) -> Tile:
+        """The guide of a tile of the picture that has at least as large a margin as that takes."""
+        stop = tile.start + tile.stored.shape[0]
+        halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
+        around = tuple(min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
+        rows = tile.pixels.shape[2]
+        image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]
+        seen = self.guide(image)[:, :, around[0] - halo[0] : image.shape[2] - around[1] + halo[1]]
+        return Tile(tile.start, seen, halo, tile.stored)
 
 
 def stored_as(values: Tensor, kind: str) -> NDArray[Any]:

@@ -8,7 +8,7 @@ F r^i y``, and from them all coefficients of ``W^i y = F^T c_i + r W^(i-1) y``: 
 c_(i-j) + b_i``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +20,7 @@ from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.newton import LARGEST, PixelScaling, scaling_from_moment
-from nlfilter_torch.operator.spectrum import whiten_gram
+from nlfilter_torch.operator.operator import Columns
 
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
 MAX_PASSES = 12
@@ -29,7 +29,7 @@ ALARM = 1e-3
 
 @dataclass(frozen=True)
 class Block:
-    """Some pixels: factor (1, M, n), diagonal (1, n), image (1, C, n), and how many pixels each stands for, (1, n)."""
+    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), and how many each stands for, (1, n)."""
 
     factor: Tensor
     diagonal: Tensor
@@ -116,22 +116,22 @@ class Sums:
             found.append(self.moments[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
         return torch.stack(found, dim=1)
 
-    def explained(self) -> Tensor:
-        """The coefficients (1, M, C) of ``V V^T y``."""
-        root = whiten_gram(self.grams[:, :2], self.dtype)[0]
-        return root @ root @ self.moments[:, 0]
 
+def sum_up(pixels: Iterable[tuple[Tensor, Columns, Tensor]], order: int) -> Sums:
+    """One pass over pixels, for the first ``order`` powers of W.
 
-def sum_up(blocks: Pass, balancing: PixelScaling, order: int) -> Sums:
-    """One pass over the pixels of a balanced image, for the first ``order`` powers of W."""
-    grams, moments, dtype = torch.zeros(()), torch.zeros(()), balancing.moment.dtype
-    for block in blocks():
-        scaling, remainder = balancing(block.factor, block.diagonal)
-        grams = grams + sum_grams(block.factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
-        powers = [(scaling * block.weights).unsqueeze(1) * block.image]
+    Args:
+        pixels: values y (1, C, n) to filter, columns, and how many pixels each stands for, (1, n).
+        order: k, at least 1.
+    """
+    grams, moments, dtype = torch.zeros(()), torch.zeros(()), torch.float64
+    for values, columns, weights in pixels:
+        factor, scaling, remainder = columns.factor, columns.scaling, columns.remainder
+        grams = grams + sum_grams(factor, scaling * weights.sqrt(), remainder, max(order - 1, 2))
+        powers = [(scaling * weights).unsqueeze(1) * values]
         for _ in range(order - 1):
             powers.append(remainder.unsqueeze(1) * powers[-1])
-        sums = moment(block.factor, torch.cat(powers, dim=1))  # (1, M, k C)
+        sums = moment(factor, torch.cat(powers, dim=1))  # (1, M, k C)
         moments = moments + sums.unflatten(2, (order, -1)).transpose(1, 2)
-        dtype = block.factor.dtype
+        dtype = factor.dtype
     return Sums(grams, moments, dtype)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
-from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
@@ -44,6 +43,18 @@ class Passes:
     memory: int = 1 << 30
     report: Report = in_silence
 
+    @staticmethod
+    def of(
+        target: RowTarget,
+        statistics: Statistics,
+        sample: int,
+        tile_rows: int | None,
+        memory: int,
+        report: Report | None,
+    ) -> "Passes":
+        """The options of an edit that writes to a target."""
+        return Passes(np.dtype(target.dtype).name, statistics, sample, tile_rows, memory, report or in_silence)
+
     def __post_init__(self) -> None:
         """Raise unless all options are valid."""
         check_choice(self.statistics, "statistics", ("sample", "full"))
@@ -52,15 +63,25 @@ class Passes:
         if self.tile_rows is not None:
             check_count(self.tile_rows, "tile_rows")
 
-    def work_out(self, picture: Picture, edit: Edit, margin: int, rows: int) -> Rows:
-        """The edited rows with their transparency, in tiles of ``rows`` unless ``tile_rows`` is given."""
+    def work_out(
+        self,
+        picture: Picture,
+        edit: Edit,
+        margin: int,
+        rows: int,
+        *,
+        transparent: bool = True,
+        stage: str = "Filtering",
+    ) -> Rows:
+        """The edited rows, with their transparency if asked for, in tiles of ``rows`` unless ``tile_rows`` is given."""
         for tile in picture.tiles(margin, self.tile_rows or rows):
-            self.report("Filtering", tile.start, picture.size[0])
+            self.report(stage, tile.start, picture.size[0])
             with torch.no_grad():
                 values = stored_as(edit(tile), self.kind)
-            whole = np.concatenate([values, transparency(tile, self.kind)], axis=2)
-            yield slice(tile.start, tile.start + len(values)), whole
-        self.report("Filtering", picture.size[0], picture.size[0])
+            if transparent:
+                values = np.concatenate([values, transparency(tile, self.kind)], axis=2)
+            yield slice(tile.start, tile.start + len(values)), values
+        self.report(stage, picture.size[0], picture.size[0])
 
 
 def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False) -> None:
@@ -77,15 +98,6 @@ def fill(target: RowTarget, rows: Rows) -> None:
     """Assign the rows (h, W, S) to their positions."""
     for part, values in rows:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
-
-
-def row_by_row(kernel: Kernel, tile: Tile, work: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply ``work``, from features (1, D, W) to (1, C, W), to every row of a tile; (1, C, h, W).
-
-    The rounding of a product depends on its shape. Row by row it is the same in tiles of any height.
-    """
-    features = kernel.recipe(tile.pixels, origin=tile.origin, halo=tile.halo)
-    return torch.stack([work(row) for row in features.split(tile.inner.shape[-1], dim=2)], dim=2)
 
 
 def rows_that_fit(

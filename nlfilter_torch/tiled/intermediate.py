@@ -1,0 +1,36 @@
+"""Rows between two steps of an edit, in a temporary file."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryFile
+
+import numpy as np
+
+from nlfilter_torch.tiled.sources import Rows, RowSource
+
+
+@contextmanager
+def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iterator[RowSource]:
+    """Rows (h, W, S) of floats as a source of rows.
+
+    Args:
+        rows: of a picture, in order.
+        size: (H, W) of the picture.
+        folder: with room for it; None is that of the system for temporary files.
+
+    Raises:
+        OSError: if the folder has no room.
+    """
+    with TemporaryFile(dir=folder) as file:
+        shape, kind = (*size, 0), np.dtype(np.float32)
+        for _, values in rows:
+            shape, kind = (*size, values.shape[2]), values.dtype
+            try:
+                file.write(np.ascontiguousarray(values).tobytes())
+            except OSError as error:
+                gigabytes = kind.itemsize * np.prod(shape) / 1e9
+                reason = f"{error.strerror}, where one step of the edit leaves {gigabytes:.1f} GB to the next"
+                raise OSError(error.errno, reason, str(folder)) from error
+        file.flush()
+        yield np.memmap(file, kind, "r", shape=shape)

@@ -1,0 +1,239 @@
+"""Edits of pictures whose factor exceeds memory: statistics from passes or a sample, then tile by tile."""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_alpha
+from nlfilter_torch.edits.colorize import fit_colorize
+from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.parameters import COLORIZE, DETAIL, RECOLOR
+from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import Picture, RowSource, RowTarget
+from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
+
+
+def stream_detail(
+    source: RowSource,
+    target: RowTarget,
+    alpha: Tensor,
+    regions: RowSource | None = None,
+    *,
+    negative: RowSource | None = None,
+    residual: float | None = None,
+    time: float = DETAIL.defaults["time"],
+    width: float = 4.0,
+    channels: Literal["luminance", "all"] = DETAIL.defaults["channels"],
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+    **options: Any,
+) -> None:
+    """Filter a picture of any size, with only some of its rows in memory at once.
+
+    The whole picture shares landmarks, balancing and coefficients. Given these, the result at a pixel depends only on
+    its own patch, so tiles are exact: there are no seams, and the size of the tiles does not matter.
+
+    Args:
+        source: rows (H, W) or (H, W, S) of 8 or 16 bits or floats: a numpy array or memory map, an array of zarr,
+            anything that returns rows for a slice. One or three channels are colours; one more is transparency, which
+            is copied. Integers are scaled to [0, 1].
+        target: receives the rows in order, by assignment to a slice; of the source's shape and any dtype.
+        alpha: sliders (k+1,), as of :func:`~nlfilter_torch.polynomial_filter`; with regions (K, k+1), a row for each,
+            or (k+1,) for all.
+        regions: rows (H, W, K), non-negative weights of the pixels of K regions; similar pixels are edited, as by
+            :func:`~nlfilter_torch.enhance`. None edits the whole picture.
+        negative: rows (H, W, 1 or K), weights of pixels whose similar pixels are left out, likewise.
+        residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since the part that
+            the eigenvectors capture depends on rare pixels that a sample lacks.
+        time: diffusion time of the regions' masks; larger extends them further.
+        width: squared diffusion distance at which a mask has fallen to 1/e.
+        channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
+        statistics: ``"sample"`` balances the filter and computes its coefficients on a sample of the pixels that
+            favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
+            or four passes that each cost more than the output.
+        sample: approximate number of pixels of that sample; with as many as the picture has, statistics are full.
+        tile_rows: rows that are computed at once; None is as many as fit in ``memory``.
+        memory: bytes that may be used, besides those of source and target.
+        report: called with the name of a stage, the part done and the total.
+        **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are
+            numbers.
+
+    Raises:
+        TypeError, ValueError: if an argument does not fit, or the source changes its size during the work.
+        MemoryError: if the samples or a single row take more than ``memory``.
+
+    Example:
+        >>> import torch
+        >>> picture = np.random.default_rng(0).integers(0, 256, (60, 40, 3), np.uint8)
+        >>> edited = np.empty_like(picture)
+        >>> stream_detail(picture, edited, torch.ones(4), num_landmarks=20, tile_rows=16)
+        >>> np.array_equal(edited, picture)
+        True
+    """
+    check_target(target, source)
+    tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
+    check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
+    if regions is not None and alpha.ndim == 2 and len(alpha) != regions.shape[-1]:
+        raise ValueError(
+            f"alpha must have a row for each of the {regions.shape[-1]} regions, got {len(alpha)}; add or drop some"
+        )
+    fitted = fit_detail(
+        tiled,
+        alpha,
+        regions,
+        negative=negative,
+        residual=residual,
+        time=time,
+        width=width,
+        channels=channels,
+        **options,
+    )
+    fill(target, tiled.rows(fitted))
+
+
+def stream_recolor(
+    source: RowSource,
+    target: RowTarget,
+    strokes: RowSource,
+    stroke_mask: RowSource | None = None,
+    *,
+    keep: RowSource | None = None,
+    reach: float = RECOLOR.defaults["reach"],
+    photometric_bandwidth: float = RECOLOR.defaults["photometric_bandwidth"],
+    patch_size: int = RECOLOR.defaults["patch_size"],
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+    **options: Any,
+) -> None:
+    """Recolour a picture of any size, as :func:`~nlfilter_torch.recolor` does in memory.
+
+    Given the sums over all pixels and over the scribbled ones, the colour of a pixel depends only on its own patch, so
+    there are no seams, and the size of the tiles does not matter.
+
+    Args:
+        source: rows (H, W, 3) in RGB or (H, W, 4) with transparency, as of :func:`stream_detail`.
+        target: receives the rows; of the source's shape.
+        strokes: scribbles as rows (H, W, 3), RGB, read under ``stroke_mask`` only; or (H, W, 4), whose last channel is
+            the mask. Integers are scaled to [0, 1].
+        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
+            channels.
+        keep: likewise, above 0 on background scribbles, whose similar pixels keep their colours; None is none.
+        reach: as of :func:`~nlfilter_torch.recolor`, and so are ``photometric_bandwidth`` and ``patch_size``.
+        photometric_bandwidth: in hundredths of Lab.
+        patch_size: of the patches that are compared.
+        statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
+        sample: number of pixels.
+        tile_rows: rows that are computed at once.
+        memory: in bytes, besides that of the sources and the target.
+        report: called with the name of a stage and its progress.
+        **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``guide_channels``, ``tolerance`` and
+            ``patch_weights``.
+
+    Raises:
+        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size.
+        MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
+
+    Example:
+        >>> picture = np.full((60, 40, 3), 100, np.uint8)
+        >>> picture[:, 20:, 0] = 220  # the right half is reddish
+        >>> strokes, recoloured = np.zeros((60, 40, 4), np.uint8), np.empty_like(picture)
+        >>> strokes[20:26, 28:34] = 0, 0, 255, 255  # blue, in its midst
+        >>> stream_recolor(picture, recoloured, strokes, num_landmarks=20, tile_rows=16)
+        >>> bool((recoloured[:, 22:, 2] > recoloured[:, 22:, 0]).all())
+        True
+        >>> np.array_equal(recoloured[:, :18], picture[:, :18])
+        True
+    """
+    check_target(target, source)
+    tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
+    if tiled.channels != 3:
+        raise ValueError(
+            f"source must have 3 or 4 channels to be recoloured, got {tiled.picture.samples}; colourise it instead"
+        )
+    options |= {"photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
+    fill(target, tiled.rows(fit_recolor(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)))
+
+
+def stream_colorize(
+    source: RowSource,
+    target: RowTarget,
+    strokes: RowSource,
+    stroke_mask: RowSource | None = None,
+    *,
+    method: Literal["regression"] = COLORIZE.defaults["method"],
+    strength: float = COLORIZE.defaults["strength"],
+    photometric_bandwidth: float = COLORIZE.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | None = None,
+    patch_size: int = COLORIZE.defaults["patch_size"],
+    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
+    generator: torch.Generator | None = None,
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+) -> None:
+    """Colourise a picture of any size, as :func:`~nlfilter_torch.colorize` does in memory.
+
+    Given the sums over all pixels and over the scribbled ones, the colour of a pixel depends only on its own patch and
+    position, so there are no seams, and the size of the tiles does not matter.
+
+    Args:
+        source: rows (H, W) or (H, W, S), as of :func:`stream_detail`; of colours the luminance is taken.
+        target: receives the rows; (H, W, 3), or (H, W, 4) if the source has transparency.
+        strokes: scribbles as rows (H, W, 3), RGB, read under ``stroke_mask`` only; or (H, W, 4), whose last channel is
+            the mask. Integers are scaled to [0, 1].
+        stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
+            channels.
+        method: ``"regression"``; k-means takes all pixels at once.
+        strength: as of :func:`~nlfilter_torch.colorize`, and so are bandwidths, ``patch_size``, ``num_landmarks`` and
+            ``generator``.
+        photometric_bandwidth: in units of the image.
+        spatial_bandwidth: in pixels; None is 0.5625 of the short side.
+        patch_size: of the patches that are compared.
+        num_landmarks: M of the operators.
+        generator: source of randomness for the landmarks.
+        statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
+        sample: number of pixels.
+        tile_rows: rows that are computed at once.
+        memory: in bytes, besides that of the sources and the target.
+        report: called with the name of a stage and its progress.
+
+    Raises:
+        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size.
+        MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
+
+    Example:
+        >>> grey = np.full((60, 40), 60, np.uint8)
+        >>> grey[:, 20:] = 200
+        >>> strokes, coloured = np.zeros((60, 40, 4), np.uint8), np.empty((60, 40, 3), np.uint8)
+        >>> strokes[4:8, 4:8], strokes[4:8, -8:-4] = (0, 0, 200, 255), (200, 0, 0, 255)  # dark is blue, bright is red
+        >>> stream_colorize(grey, coloured, strokes, num_landmarks=20, tile_rows=16)
+        >>> red, blue = coloured[..., 0].astype(int), coloured[..., 2].astype(int)
+        >>> bool((blue > red)[:, :17].all()), bool((red > blue)[:, 23:].all())
+        (True, True)
+    """
+    check_target(target, source, coloured=True)
+    tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
+    fitted = fit_colorize(
+        tiled,
+        strokes,
+        stroke_mask,
+        method=method,
+        strength=strength,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        generator=generator,
+    )
+    fill(target, tiled.rows(fitted))
