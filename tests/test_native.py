@@ -14,6 +14,7 @@ from hatch_build import FOLDER, CompiledKernels
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core import instruction_sets
 from nlfilter_torch.core.autograd import OuterProduct
+from nlfilter_torch.core.communicator import ALONE
 from nlfilter_torch.core.kernels import definitions_only, library
 from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.core.kernels.grams import sum_grams
@@ -141,8 +142,8 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
     diagonal = 1 - factor.square().sum(1).clamp(max=1)
     total = random(2, marks, 1, seed=1).abs().double() * pixels**0.5
-    arguments = (factor, diagonal, total, None)
-    exact = newton._sweep(*(part.double() for part in arguments[:3]), None)
+    arguments = (factor, diagonal, total, ALONE)
+    exact = newton._sweep(*(part.double() for part in arguments[:3]), ALONE)
     found = newton._sweep(*arguments)
     plain = by_torch(newton._sweep, *arguments)
     torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
@@ -216,8 +217,8 @@ def test_ties_are_broken_by_one_rule(level: int, image: torch.Tensor, spatial_ba
 @pytest.mark.parametrize("pixels", [1, 300, 40_000])
 @pytest.mark.parametrize("marks", [1, 3, 50, 900])
 def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
-    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), None, random(2, marks, 1).double()
-    factor, weights, total = (t.double() for t in arguments if t is not None)
+    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
+    factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
     exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
     found = weighted_moment(*arguments)
     plain = by_torch(weighted_moment, *arguments)
@@ -249,7 +250,7 @@ def test_tensors_of_any_layout(level: int) -> None:
     z, x, diagonal = random(1, 7, 4).mT, random(1, 300, 4).mT, random(1, 600)[:, ::2].sigmoid()
     arguments = (x, z, whitener(z), "diagonal")
     torch.testing.assert_close(nystrom_factor(*arguments), by_torch(nystrom_factor, *arguments))
-    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, None)
+    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, ALONE)
     found, expected = newton._sweep(*arguments), by_torch(newton._sweep, *arguments)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
@@ -272,7 +273,7 @@ def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
 
     def results() -> list[Tensor]:
         factor, diagonal = nystrom_factor(features, marks, whitener(marks), "diagonal")
-        scaling, found = newton._sweep(factor, diagonal, factor.double().sum(2, keepdim=True), None)
+        scaling, found = newton._sweep(factor, diagonal, factor.double().sum(2, keepdim=True), ALONE)
         return [factor, scaling, found, sum_grams(factor, scaling, diagonal, 2)]
 
     threads(1)

@@ -130,7 +130,7 @@ def test_damped_steps_balance_weighted_points() -> None:
     start = Solution(
         scaling, factor @ scaling.unsqueeze(2), torch.full((1,), torch.inf).double(), 0, torch.eye(4).double()
     )
-    found = damped(factor, diagonal, start, 1e-12, None, weights)
+    found = damped(factor, diagonal, start, 1e-12, weights=weights)
     sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     total = factor @ (weights * found.scaling).unsqueeze(2)

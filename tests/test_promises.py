@@ -102,7 +102,7 @@ def test_the_damped_method_converges_from_any_start(start: float) -> None:
     scaling = torch.full((2, 60), start, dtype=torch.float64)
     infinite = torch.full((2,), torch.inf, dtype=torch.float64)
     begun = Solution(scaling, factor @ scaling.unsqueeze(2), infinite, 0, torch.eye(5).double().expand(2, -1, -1))
-    found = damped(factor, diagonal, begun, 1e-12, None)
+    found = damped(factor, diagonal, begun, 1e-12)
     sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     assert found.residual.max() < 1e-11

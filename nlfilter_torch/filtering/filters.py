@@ -19,7 +19,6 @@ from nlfilter_torch.core.checks import (
     check_weight,
     checked_response,
 )
-from nlfilter_torch.core.communicator import reduce_sum, replicate
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, Spectrum
@@ -131,11 +130,11 @@ def polynomial_filter(
         batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
         check_weight(residual, "residual", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
-    alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
+    alpha = alpha if alpha.ndim == 4 else operator.among.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None:
         captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
-        weight = replicate(residual, operator.shard)
+        weight = operator.among.copy_to_group(residual)
         filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
     return filtered.to(image.dtype)
 
@@ -211,7 +210,7 @@ def spectral_filter(
         check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
     if isinstance(residual, int | float) and residual == 0:
         return spectrum.synthesize(response, coefficients).to(image.dtype)
-    rho = torch.as_tensor(replicate(residual, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
+    rho = torch.as_tensor(spectrum.among.copy_to_group(residual)).to(spectrum.root).reshape(-1, 1)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
     return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered)).to(image.dtype)
@@ -236,8 +235,8 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
     captured = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
-    energy = reduce_sum(image.to(spectrum.factor).square().sum((1, 2, 3)), spectrum.shard)
-    inner = reduce_sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)), spectrum.shard)  # y^T V V^T y
+    energy = spectrum.among.sum(image.to(spectrum.factor).square().sum((1, 2, 3)))
+    inner = spectrum.among.sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)))  # y^T V V^T y
     return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))
 
 
@@ -319,7 +318,7 @@ def filter_regions(
     check_image(image, "image")
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_same_size(masks, operator.size, "masks", "operator")
-    alpha = replicate(alpha, operator.shard)
+    alpha = operator.among.copy_to_group(alpha)
     return blend_regions(
         image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)
     )

@@ -186,8 +186,9 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = weighted(operator.scaling, operator.weights).unsqueeze(1)  # (1, 1, N)
+    factor, among = operator.factor, operator.among
     # The moment of the factor itself has a gradient.
-    balancing = replace(operator.balancing, moment=moment(operator.factor, scaling, operator.shard))
-    moments = torch.stack([moment(operator.factor, scaling * y, operator.shard) for y in before.unsqueeze(1)], dim=1)
+    balancing = replace(operator.balancing, moment=among.sum(moment(factor, scaling)))
+    moments = torch.stack([among.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
     explained = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
     return FittedFilter(operator.kernel, balancing, moments, explained)

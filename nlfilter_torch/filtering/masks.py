@@ -5,7 +5,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED, block_length
 from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, is_hidden, warn
-from nlfilter_torch.core.communicator import reduce_max, reduce_sum, replicate
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.newton import weighted
@@ -85,7 +84,7 @@ def diffusion_mask(
     check_positive(time, "time", spectrum.factor.shape[0])
     check_positive(width, "width", max(spectrum.factor.shape[0], weights.shape[0]))
     _warn_of_unlike(spectrum, weights)
-    exponent = torch.as_tensor(replicate(time, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
+    exponent = torch.as_tensor(spectrum.among.copy_to_group(time)).to(spectrum.root).reshape(-1, 1)
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
     if others is not None:
         check_negative(others.shape[1], weights.shape[1])
@@ -93,7 +92,7 @@ def diffusion_mask(
         weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
     # The constant eigenvector adds nothing to distances, so it may stay, and no eigenvectors need to be chosen.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
-    scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
+    scale = spectrum.pixels / torch.as_tensor(spectrum.among.copy_to_group(width)).to(distances).reshape(-1, 1, 1)
     exponents = scale.clamp(max=STEEPEST) * distances
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = mask_of_exponents(inner, None if negative is None else outer)
@@ -159,7 +158,7 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     flat = region.to(spectrum.factor).flatten(2)
     if bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
-    total = reduce_sum(weighted(flat, spectrum.weights).sum(2, keepdim=True), spectrum.shard)
+    total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
     if bool((total <= 0).any()):
         raise ValueError(
             f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
@@ -197,12 +196,12 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         for _ in range(ITERATIONS):
             members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
             counts = weighted(members, spectrum.weights).sum(2, dtype=torch.float64)
-            sizes = reduce_sum(counts, spectrum.shard).unsqueeze(1)  # (B, 1, K)
+            sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
             centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
             if members.device.type != "cpu":  # comparing would synchronise with the device
                 continue
-            if not reduce_max((previous != assignment).any().to(members), spectrum.shard):
+            if not spectrum.among.max((previous != assignment).any().to(members)):
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
     return mask.unflatten(2, spectrum.size).to(regions.dtype)
@@ -210,7 +209,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
 
 def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     """Weighted sums (B, M, K) of the coordinates ``basis @ F`` of all pixels, with weights (B, K, N); float64."""
-    return basis @ moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights, spectrum.shard)
+    return basis @ spectrum.among.sum(moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights))
 
 
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:

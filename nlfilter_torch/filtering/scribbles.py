@@ -23,7 +23,7 @@ from nlfilter_torch.core.checks import (
     check_tensor,
     check_unit_range,
 )
-from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum, replicate
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.newton import weighted
@@ -77,7 +77,7 @@ def propagate_strokes(
         tensor([0., 0., 1., 1.])
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
-    shard = spectrum.shard
+    among = spectrum.among
     batch = spectrum.factor.shape[0]
     check_tensor(strokes, "strokes")
     check_tensor(stroke_mask, "stroke_mask")
@@ -85,12 +85,12 @@ def propagate_strokes(
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum")
-    check_painted(stroke_mask, shard=shard)
+    check_painted(stroke_mask, among=among)
     check_share(strength, "strength", images)
     check_share(reach, "reach", batch, below=True)
     check_positive(smoothness, "smoothness", images)
 
-    strength, reach, smoothness = (replicate(value, shard) for value in (strength, reach, smoothness))
+    strength, reach, smoothness = (among.copy_to_group(value) for value in (strength, reach, smoothness))
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
@@ -104,7 +104,7 @@ def propagate_strokes(
         strength=strength,
         reach=reach,
         smoothness=smoothness,
-        shard=shard,
+        among=among,
     )
     return fitted(spectrum.factor).unflatten(2, spectrum.size).to(strokes.dtype)
 
@@ -134,7 +134,7 @@ def fit_strokes(
     strength: float | Tensor,
     reach: float | Tensor,
     smoothness: float | Tensor,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
 ) -> FittedStrokes:
     """The regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
@@ -146,10 +146,10 @@ def fit_strokes(
         strength: as of :func:`propagate_strokes`, and so are ``reach`` and ``smoothness``.
         reach: s of the walks.
         smoothness: scales the noise.
-        shard: of the image, if other ranks have the remaining rows.
+        among: ranks that the rows of the image are spread over.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T
-    heed = Heed.of(painted, half, SPOT * pixels, shard)
+    heed = Heed.of(painted, half, SPOT * pixels, among)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for factor, weights, values in painted():
@@ -159,7 +159,7 @@ def fit_strokes(
         gram = gram + moment(factor * heeded, factor)  # (B, M, M)
         target = target + moment(factor.expand(images, -1, -1), heeded * known)  # (B, M, C+1)
         sums = sums + (heeded * known).double().sum(2)  # (B, C+1)
-    gram, target, sums = (reduce_sum(total, shard) for total in (gram, target, sums))
+    gram, target, sums = (among.sum(total) for total in (gram, target, sums))
 
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
     inner = half.mT @ gram @ half
@@ -208,14 +208,14 @@ class Heed:
     noise: Tensor
 
     @staticmethod
-    def of(painted: Painted, half: Tensor, spot: float, shard: Shard | None) -> "Heed":
+    def of(painted: Painted, half: Tensor, spot: float, among: Communicator) -> "Heed":
         """From a pass over the scribbled pixels."""
         gram, missed, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
             missed = missed + (weights * unexplained(factor)).double().sum((1, 2))
             total = total + weights.double().sum((1, 2))
-        gram, missed, total = (reduce_sum(part, shard) for part in (gram, missed, total))
+        gram, missed, total = (among.sum(part) for part in (gram, missed, total))
         core = half @ half.mT
         variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
         noise = NOISE * (variance + missed / total).reshape(-1, 1, 1)
@@ -238,10 +238,10 @@ def unexplained(factor: Tensor) -> Tensor:
     return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 
 
-def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shard | None = None) -> None:
+def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, among: Communicator = ALONE) -> None:
     """Raise unless every image of ``stroke_mask`` (B, 1, H, W) has a scribbled pixel and all values are in [0, 1]."""
     check_unit_range(stroke_mask, name)
-    empty = reduce_max(stroke_mask.detach().amax((1, 2, 3)), shard) <= 0
+    empty = among.max(stroke_mask.detach().amax((1, 2, 3))) <= 0
     if bool(empty.any()):
         raise ValueError(
             f"{name} must hold a painted pixel in every image, got none in image(s) "

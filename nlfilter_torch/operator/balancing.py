@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable, outer_product
 from nlfilter_torch.core.checks import warn
-from nlfilter_torch.core.communicator import Shard
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator import chebyshev, newton
 
@@ -43,7 +43,7 @@ def balance(
     *,
     tolerance: float | None = None,
     completed: bool = False,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Balancing:
     """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
@@ -54,11 +54,11 @@ def balance(
         tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a residual
             that ends above it and above 1e-4 (1e-9 in float64) raises a warning.
         completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
-        shard: of the image, where other ranks have the rest of it.
+        among: ranks that the rows of the image are spread over.
         weights: how many equal pixels each point stands for, (B, N), a constant; None is one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard, weights)  # type: ignore[no-untyped-call]
+    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, among, weights)  # type: ignore[no-untyped-call]
     warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return Balancing(scaling, total, residual, int(steps))
 
@@ -90,13 +90,13 @@ class _Balance(torch.autograd.Function):
         diagonal: Tensor,
         tolerance: float,
         completed: bool,
-        shard: Shard | None,
+        among: Communicator,
         weights: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, int]:
         solve = newton.solve if completed else chebyshev.solve
-        found = solve(factor, diagonal, tolerance, shard, weights)
+        found = solve(factor, diagonal, tolerance, among, weights)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
-        ctx.shard, ctx.completed = shard, completed
+        ctx.among, ctx.completed = among, completed
         ctx.mark_non_differentiable(found.moment, found.residual)
         return found.scaling, found.moment, found.residual, found.sweeps
 
@@ -109,8 +109,8 @@ class _Balance(torch.autograd.Function):
             factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
-        right = moment(factor, (weight * grad).unsqueeze(1), ctx.shard)
-        solution = newton.conjugate_gradients(factor, newton.weighted(weight, weights), right, inverse, ctx.shard)
+        right = ctx.among.sum(moment(factor, (weight * grad).unsqueeze(1)))
+        solution = newton.conjugate_gradients(factor, newton.weighted(weight, weights), right, inverse, ctx.among)
         affinity = newton.weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)

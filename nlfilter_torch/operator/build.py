@@ -23,7 +23,7 @@ from nlfilter_torch.core.checks import (
     warn,
     warn_of_scale,
 )
-from nlfilter_torch.core.communicator import Shard, meet, reduce_max, replicate, with_halo
+from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.compilation import uncompiled
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision, working_dtype
@@ -147,24 +147,24 @@ def nonlocal_operator(
     if _is_small(photometric_bandwidth) and not called_by_edit():
         warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-    shard = meet(guide, group)
+    among = all_gather_shapes(guide, group)
     size = (guide.shape[2], guide.shape[3])  # here
-    height, width = size if shard is None else (shard.height, shard.width)
-    weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
-    guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
+    height, width = among.whole(size)
+    weights = unit_window(patch_size, among.copy_to_group(patch_weights)).to(guide)
+    guide, halo = among.with_halo(guide, max(weights.shape[0] // 2, 1))
     if isinstance(photometric_bandwidth, str):
-        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
+        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, among)
     else:
-        bandwidth = replicate(photometric_bandwidth, shard)
+        bandwidth = among.copy_to_group(photometric_bandwidth)
     largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
         farthest = torch.full_like(largest, max(height, width))
         check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
-        spatial_bandwidth = replicate(spatial_bandwidth, shard)
+        spatial_bandwidth = among.copy_to_group(spatial_bandwidth)
     recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
     return assemble(
-        recipe(guide, origin=(0 if shard is None else shard.first - halo[0], 0), halo=halo),
+        recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo),
         size,
         recipe=recipe,
         num_landmarks=num_landmarks,
@@ -172,7 +172,7 @@ def nonlocal_operator(
         completion=completion,
         tolerance=tolerance,
         generator=generator,
-        shard=shard,
+        among=among,
     )
 
 
@@ -233,7 +233,7 @@ def operator_from_features(
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
-    shard = meet(features.unflatten(2, shape), group)
+    among = all_gather_shapes(features.unflatten(2, shape), group)
     return assemble(
         features,
         shape,
@@ -243,7 +243,7 @@ def operator_from_features(
         completion=completion,
         tolerance=tolerance,
         generator=generator,
-        shard=shard,
+        among=among,
     )
 
 
@@ -258,10 +258,10 @@ def assemble(
     generator: torch.Generator | None,
     recipe: GuideFeatures | None = None,
     weights: Tensor | None = None,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
 ) -> NonlocalOperator:
     """The one way from features (B, D, N) to an operator; ``recipe`` is how they came from a guide, if they did."""
-    whole = size if shard is None else (shard.height, shard.width)
+    whole = among.whole(size)
     points = whole[0] * whole[1]
     if num_landmarks > points:
         warn(
@@ -269,32 +269,32 @@ def assemble(
             "using every pixel"
         )
         num_landmarks = points
-    chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, shard, weights)
+    chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, among, weights)
     kernel = Kernel(chosen, whitener(chosen), completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = completion == "diagonal", factor.device.type == "cpu"
 
     def balanced() -> Balancing:
-        return balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard, weights=weights)
+        return balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
 
     balancing = balanced()
     before: list[Tensor] = []
     while completed and watched and len(before) < ROUNDS:
         alone = isolated(balancing.scaling.detach(), float(balancing.residual.max()))
-        if not bool(reduce_max(alone.any().to(factor), shard)):
+        if not bool(among.max(alone.any().to(factor))):
             break
         before.append(balancing.moment)
         factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
         balancing = balanced()
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = shifted_gram(factor, root_mass(scaling, weights), remainder, shard)
+    gram = shifted_gram(factor, root_mass(scaling, weights), remainder, among)
     allowed = slack(factor.dtype, float(residual.max())) if watched else 0.0
     if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, moment(factor, weighted(scaling, weights).unsqueeze(1), shard), allowed)
+        limit = limiter(gram, among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1))), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
-        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard, weights)
+        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), among, weights)
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return NonlocalOperator(
         factor=factor,
@@ -309,11 +309,11 @@ def assemble(
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,
-        shard=shard,
+        among=among,
     )
 
 
-def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
+def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """Largest deviation of a row sum from 1, (B,)."""
-    sums = row_sums(factor, diagonal, scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard))
-    return reduce_max((sums - 1).abs().amax(1), shard)
+    sums = row_sums(factor, diagonal, scaling, among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1))))
+    return among.max((sums - 1).abs().amax(1))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
-from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
 from nlfilter_torch.operator.newton import Solution, accepted, damped, weighted
 
@@ -36,18 +36,18 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
         yield rho * previous, 2 * rho / radius
 
 
-def _start(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
+def _start(factor: Tensor, diagonal: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
-    total = moment(factor, weighted(torch.ones_like(diagonal), weights).unsqueeze(1), shard).to(factor)
+    total = among.sum(moment(factor, weighted(torch.ones_like(diagonal), weights).unsqueeze(1))).to(factor)
     return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_SUM).rsqrt()
 
 
 def solve(
-    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None, weights: Tensor | None = None
+    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator = ALONE, weights: Tensor | None = None
 ) -> Solution:
     """Balance any kernel: by Chebyshev's method where it converges, otherwise on processors by damped Newton steps."""
-    scaling = _start(factor, diagonal, shard, weights)
-    total = moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
+    scaling = _start(factor, diagonal, among, weights)
+    total = among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1)))
     move = torch.zeros_like(scaling)
     watched = factor.device.type == "cpu"
     worst, slow = float("inf"), 0
@@ -64,7 +64,7 @@ def solve(
             torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
             part = None if weights is None else weights[:, block]
             next_total += gather(weighted(following[:, None, block], part), rows).mT
-        residual, next_total = reduce_max(residual, shard), reduce_sum(next_total, shard)
+        residual, next_total = among.max(residual), among.sum(next_total)
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0
         stalled = worst < STALL and slow > 1  # at the level of rounding; a single slow step is no sign of it
@@ -73,6 +73,6 @@ def solve(
         scaling, total = following, next_total
     identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
     found = Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
-    if not watched or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
+    if not watched or bool((found.residual <= accepted(factor, tolerance, among)).all()):
         return found
-    return damped(factor, diagonal, found, tolerance, shard, weights)
+    return damped(factor, diagonal, found, tolerance, among, weights)

@@ -21,7 +21,7 @@ from nlfilter_torch.core.checks import (
     check_patch_size,
     check_tensor,
 )
-from nlfilter_torch.core.communicator import Shard, meet, reduce_sum, with_halo
+from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, working_dtype
 
 GuideChannels = Literal["luminance", "all"]
@@ -205,16 +205,16 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-        shard = meet(rows, group)
-        return bandwidth_of_rows(*with_halo(rows, 1, shard), shard)
+        among = all_gather_shapes(rows, group)
+        return bandwidth_of_rows(*among.with_halo(rows, 1), among)
 
 
-def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None) -> Tensor:
+def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], among: Communicator) -> Tensor:
     """:func:`estimate_bandwidth` from some rows of an image, and as many of their neighbours as ``halo`` tells."""
     with torch.no_grad():
         magnitude = gradients(guide, halo)
-        count = magnitude[0].numel() if shard is None else guide.shape[1] * shard.pixels
-        mean = reduce_sum(magnitude.sum((1, 2, 3), dtype=torch.float64), shard) / count
+        count = magnitude.shape[1] * among.pixels(magnitude[0, 0].numel())
+        mean = among.sum(magnitude.sum((1, 2, 3), dtype=torch.float64)) / count
         return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.communicator import Shard, from_first, gather_columns
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
 
 Sampling = Literal["kmeans", "uniform", "random"]
@@ -36,7 +36,7 @@ def choose_landmarks(
     count: int,
     sampling: Sampling,
     generator: torch.Generator | None,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
     """Choose or compute ``count`` landmarks.
@@ -48,7 +48,8 @@ def choose_landmarks(
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
         generator: source of randomness; None seeds a new one with 0, so that equal calls give equal landmarks.
-        shard: of the image; N is then the pixels here, and the first rank's choices hold.
+        among: ranks that the rows of the image are spread over; N is then the pixels here, and all ranks use what the
+            first one draws.
         weights: (B, N), how many pixels each point stands for: candidates of k-means are drawn in proportion to them.
 
     Returns:
@@ -56,15 +57,15 @@ def choose_landmarks(
         same pixels, so that a batch gives what single calls give.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    if count == features.shape[-1] and shard is None:
+    if count == features.shape[-1] and among.size == 1:
         return features
     pixels = (
         _candidates_by_weight(weights.mean(0), count, generator)
         if weights is not None and sampling == "kmeans"
         else candidate_pixels(size, count, sampling, generator)
     )
-    pixels = from_first(pixels.to(features.device), shard)
-    return condense(gather_columns(features, pixels, shard), count, generator, shard)
+    pixels = among.broadcast(pixels.to(features.device))
+    return condense(among.columns(features, pixels), count, generator, among)
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
@@ -92,7 +93,7 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
     )
 
 
-def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shard | None = None) -> Tensor:
+def condense(subset: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE) -> Tensor:
     """Landmarks (B, D, M) from the features (B, D, S) of the candidates: centroids where there are more than M."""
     if subset.shape[2] == count:
         return subset
@@ -102,9 +103,9 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shar
     # Half of them start the clusters, drawn at random.
     few = torch.randperm(points.shape[2], generator=generator, device=generator.device)
     few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)].to(points.device)
-    chosen = _pivots(gather_columns(points, few, None), count, generator)
-    start = from_first(few[chosen], shard).unsqueeze(1)  # (B, 1, M)
-    assignment = from_first(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps), shard)
+    chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
+    start = among.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
+    assignment = among.broadcast(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps))
     return _cluster_means(subset, assignment, pick(subset, start))
 
 
@@ -175,9 +176,9 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
         ticks = (torch.arange(PROPOSED * len(block), device=points.device) + offset) / (PROPOSED * len(block))
         proposed = torch.searchsorted(summed, summed[:, :, -1:] * ticks).clamp_(max=size - 1)  # (B, 1, P)
         few, lengths, known = (pick(planes, proposed) for planes in (points, norms, before))
-        among = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
+        shared = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
         chosen, rows, scales = draw_pivots(
-            partial(_row, among), pick(residual, proposed), pick(odds, proposed), block, EXPLAINED
+            partial(_row, shared), pick(residual, proposed), pick(odds, proposed), block, EXPLAINED
         )
         found.append(proposed.gather(2, chosen))  # (B, 1, n)
         few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.grams import gram, sum_grams
 from nlfilter_torch.core.kernels.sweeps import positive_root, sweep, weigh
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
@@ -99,13 +99,13 @@ class Sample:
         factor: their columns, (B, M, n).
         diagonal: (B, n).
         weight: how many pixels each stands for, (B, n).
-        shard: of the image, where other ranks have samples of the rest of it.
+        among: ranks, each with a sample of its rows.
     """
 
     factor: Tensor
     diagonal: Tensor
     weight: Tensor
-    shard: Shard | None
+    among: Communicator
 
     def scaling(self, total: Tensor) -> Tensor:
         """Their d (B, n), given t (B, M, 1) in float64."""
@@ -113,20 +113,20 @@ class Sample:
 
     def moment(self, scaling: Tensor) -> Tensor:
         """The sample's estimate of ``factor @ d``, (B, M, 1) in float64."""
-        return reduce_sum(gather((self.weight * scaling).unsqueeze(1), self.factor).mT.double(), self.shard)
+        return self.among.sum(gather((self.weight * scaling).unsqueeze(1), self.factor).mT.double())
 
     def jacobian(self, scaling: Tensor) -> Tensor:
         """J, (B, M, M) in float64."""
         slope = scaling.square()
         slope = self.weight * slope / (1 + self.diagonal * slope)
-        total = reduce_sum(gram(self.factor, slope), self.shard)
+        total = self.among.sum(gram(self.factor, slope))
         return total.double() + torch.eye(total.shape[1], dtype=torch.float64, device=total.device)
 
     def residual(self, total: Tensor, found: Tensor) -> Tensor:
         """Largest deviation of a row sum from 1 among the sample, (B,), where d(total) has the moment ``found``."""
         # Where d is the root for the total, row sums lack d u . (total - found).
         lacking = spread((total - found).to(self.factor).mT, self.factor, self.scaling(total))
-        return reduce_max(lacking.abs().amax((1, 2)), self.shard)
+        return self.among.max(lacking.abs().amax((1, 2)))
 
 
 def weighted(values: Tensor, weights: Tensor | None) -> Tensor:
@@ -147,11 +147,11 @@ def row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor, found: Tensor) -
 
 
 def _draw(
-    factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, shard: Shard | None, weights: Tensor | None
+    factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, among: Communicator, weights: Tensor | None
 ) -> tuple[Sample, Tensor]:
     """A systematic sample in proportion to leverage, and its part of ``scaling``, (B, n)."""
     if 2 * count >= factor.shape[2]:
-        return Sample(factor, diagonal, weighted(torch.ones_like(diagonal), weights), shard), scaling
+        return Sample(factor, diagonal, weighted(torch.ones_like(diagonal), weights), among), scaling
     slope = scaling.square()
     leverage = weighted(slope * (1 - diagonal) / (1 + slope * diagonal), weights)  # |u|^2 is 1 - c
     leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
@@ -161,10 +161,10 @@ def _draw(
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
     weight = weight if weights is None else weight * weights.gather(1, chosen)
     columns = factor.gather(2, chosen.unsqueeze(1).expand(-1, factor.shape[1], -1))
-    return Sample(columns, diagonal.gather(1, chosen), weight, shard), scaling.gather(1, chosen)
+    return Sample(columns, diagonal.gather(1, chosen), weight, among), scaling.gather(1, chosen)
 
 
-def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
+def _guess(factor: Tensor, diagonal: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """A first t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
     pixels = factor.shape[2]
     few, rest, each = factor, diagonal, weighted(torch.ones_like(diagonal), weights)
@@ -174,7 +174,7 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tenso
         chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
         few, rest = factor.gather(2, chosen.expand(*factor.shape[:2], -1)), diagonal[:, chosen]
         each = each[:, chosen] * (each.sum(1, keepdim=True) / each[:, chosen].sum(1, keepdim=True))
-    sample = Sample(few, rest, each, shard)
+    sample = Sample(few, rest, each, among)
     sums = spread(sample.moment(torch.ones_like(rest)).to(few).mT, few).squeeze(1) + rest
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):
@@ -183,12 +183,12 @@ def _guess(factor: Tensor, diagonal: Tensor, shard: Shard | None, weights: Tenso
 
 
 def _sweep(
-    factor: Tensor, diagonal: Tensor, total: Tensor, shard: Shard | None, weights: Tensor | None = None
+    factor: Tensor, diagonal: Tensor, total: Tensor, among: Communicator, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor."""
     half = (total / 2).squeeze(2).to(factor)
     scaling, found = sweep(factor, diagonal, half, LARGEST, weights)
-    return scaling, reduce_sum(found.unsqueeze(2), shard)
+    return scaling, among.sum(found.unsqueeze(2))
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ class Solution:
 
 
 def solve(
-    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None = None, weights: Tensor | None = None
+    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator = ALONE, weights: Tensor | None = None
 ) -> Solution:
     """Balance a kernel with a unit diagonal, quickly where sweeps converge and by damped steps where they do not.
 
@@ -219,35 +219,34 @@ def solve(
     kernel. On an accelerator a fixed number of sweeps is taken, as reading a residual would stall its queue.
     """
     solver = _refined if factor.dtype == torch.float64 and factor.device.type == "cpu" else _quasi_newton
-    found = solver(factor, diagonal, tolerance, shard, weights)
-    if factor.device.type != "cpu" or bool((found.residual <= accepted(factor, tolerance, shard)).all()):
+    found = solver(factor, diagonal, tolerance, among, weights)
+    if factor.device.type != "cpu" or bool((found.residual <= accepted(factor, tolerance, among)).all()):
         return found
-    return damped(factor, diagonal, found, tolerance, shard, weights)
+    return damped(factor, diagonal, found, tolerance, among, weights)
 
 
-def accepted(factor: Tensor, tolerance: float, shard: Shard | None) -> float:
+def accepted(factor: Tensor, tolerance: float, among: Communicator) -> float:
     """The residual that balancing aims at: the tolerance, or what rounding leaves of it in a large image."""
-    pixels = factor.shape[2] if shard is None else shard.pixels
+    pixels = among.pixels(factor.shape[2])
     # |u . t| is formed from terms of up to |u| |t|, and |t|^2 is at most the number of pixels.
     return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
 
 
 def _quasi_newton(
-    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None, weights: Tensor | None
+    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator, weights: Tensor | None
 ) -> Solution:
     """Newton's method with the Jacobian of a sample, updated by what the sweeps show of the true one (BFGS)."""
     watched = factor.device.type == "cpu"
     marks, pixels = factor.shape[1:]
-    ranks = 1 if shard is None else len(shard.rows)
-    least, usual, most = (bound * marks // ranks for bound in PER_LANDMARK)
-    count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
-    total = _guess(factor, diagonal, shard, weights)
-    scaling, found = _sweep(factor, diagonal, total, shard, weights)
+    least, usual, most = (bound * marks // among.size for bound in PER_LANDMARK)
+    count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // among.size), least)
+    total = _guess(factor, diagonal, among, weights)
+    scaling, found = _sweep(factor, diagonal, total, among, weights)
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), marks, marks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         before, error = total, total - found
         if gain > ROUGH if watched else sweeps < 3:
-            sample, part = _draw(factor, diagonal, scaling, count, shard, weights)
+            sample, part = _draw(factor, diagonal, scaling, count, among, weights)
             # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
             bias = found - sample.moment(part)
             total = found
@@ -259,7 +258,7 @@ def _quasi_newton(
             inverse = torch.cholesky_inverse(lower)
         else:
             total = total - inverse @ error
-        scaling, found = _sweep(factor, diagonal, total, shard, weights)
+        scaling, found = _sweep(factor, diagonal, total, among, weights)
         inverse = _updated(inverse, total - before, total - found - error)
         if not watched:
             continue
@@ -267,40 +266,40 @@ def _quasi_newton(
         gain = worst / previous
         slow = slow + 1 if not gain <= 0.5 else 0
         if worst <= tolerance or slow > 1:
-            measured = _measure(factor, diagonal, scaling, total, found, shard)
+            measured = _measure(factor, diagonal, scaling, total, found, among)
             if slow > 1 or bool((measured[1] <= tolerance).all()):
                 break
     else:
-        measured = _measure(factor, diagonal, scaling, total, found, shard)
+        measured = _measure(factor, diagonal, scaling, total, found, among)
     return Solution(scaling, found, measured[0], sweeps, inverse)
 
 
 def _refined(
-    factor: Tensor, diagonal: Tensor, tolerance: float, shard: Shard | None, weights: Tensor | None
+    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator, weights: Tensor | None
 ) -> Solution:
     """A solution in float64, by steps worked out from the factor in float32, for which there are kernels in C."""
     single, each = factor.float(), None if weights is None else weights.float()
-    rough = _quasi_newton(single, diagonal.float(), max(tolerance, ROUGHLY), shard, each)
+    rough = _quasi_newton(single, diagonal.float(), max(tolerance, ROUGHLY), among, each)
     total, sweeps = rough.moment, rough.sweeps
     for _ in range(MAX_SWEEPS):
-        scaling, found = _sweep(factor, diagonal, total, shard, weights)
+        scaling, found = _sweep(factor, diagonal, total, among, weights)
         sweeps += 1
         error, d = total - found, scaling.float()
-        if bool((_largest(spread(error.to(single).mT, single, d).squeeze(1), shard) <= tolerance / 2).all()):
+        if bool((_largest(spread(error.to(single).mT, single, d).squeeze(1), among) <= tolerance / 2).all()):
             break
         weight = weighted(d.square() / (1 + d.square() * diagonal.float()), each)
-        total = total - conjugate_gradients(single, weight, error, rough.inverse, shard)
-    residual = _largest(row_sums(factor, diagonal, scaling, found) - 1, shard)
+        total = total - conjugate_gradients(single, weight, error, rough.inverse, among)
+    residual = _largest(row_sums(factor, diagonal, scaling, found) - 1, among)
     return Solution(scaling, found, residual, sweeps, rough.inverse)
 
 
 def _measure(
-    factor: Tensor, diagonal: Tensor, scaling: Tensor, total: Tensor, found: Tensor, shard: Shard | None
+    factor: Tensor, diagonal: Tensor, scaling: Tensor, total: Tensor, found: Tensor, among: Communicator
 ) -> tuple[Tensor, Tensor]:
     """Largest deviation of a row sum from 1, (B,): as measured, and as d = d(total) would have it without rounding."""
     rows = spread(torch.cat([found, total - found], dim=2).to(factor).mT, factor)  # (B, 2, N): one read of the factor
     sums = scaling * (rows[:, 0] + diagonal * scaling)
-    return _largest(sums - 1, shard), _largest(scaling * rows[:, 1], shard)
+    return _largest(sums - 1, among), _largest(scaling * rows[:, 1], among)
 
 
 def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
@@ -313,9 +312,9 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
     return inverse - cross - cross.mT + scale * step @ step.mT
 
 
-def _largest(values: Tensor, shard: Shard | None) -> Tensor:
+def _largest(values: Tensor, among: Communicator) -> Tensor:
     """Largest magnitude among values (B, N), (B,); infinite where one is not finite."""
-    return reduce_max(values.abs().nan_to_num(nan=torch.inf).amax(1), shard)
+    return among.max(values.abs().nan_to_num(nan=torch.inf).amax(1))
 
 
 def damped(
@@ -323,7 +322,7 @@ def damped(
     diagonal: Tensor,
     start: Solution,
     tolerance: float,
-    shard: Shard | None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Solution:
     """Balance by Newton's method on d itself, with an exact line search: it converges from any start.
@@ -336,38 +335,38 @@ def damped(
     tiny = torch.finfo(factor.dtype).tiny
     usable = start.scaling.isfinite() & (start.scaling > 0)
     scaling = torch.where(usable, start.scaling, torch.ones_like(start.scaling))
-    goal, best, slow = accepted(factor, tolerance, shard), start, 0
+    goal, best, slow = accepted(factor, tolerance, among), start, 0
     for steps in range(1, MAX_STEPS + 1):
-        total = moment(factor, weighted(scaling, weights).unsqueeze(1), shard)
+        total = among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1)))
         lacking = 1 - row_sums(factor, diagonal, scaling, total)
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
-        gram = reduce_sum(sum_grams(factor, scaling * weighted(share, weights).sqrt(), None, 1)[:, 0], shard)
+        gram = among.sum(sum_grams(factor, scaling * weighted(share, weights).sqrt(), None, 1)[:, 0])
         lower = torch.linalg.cholesky_ex(gram + torch.eye(gram.shape[1], dtype=gram.dtype, device=gram.device)).L
-        residual = _largest(lacking, shard)
+        residual = _largest(lacking, among)
         found = Solution(scaling, total, residual, start.sweeps + 3 * steps, torch.cholesky_inverse(lower))
         slow = 0 if bool((residual.max() < 0.5 * best.residual.max()).all()) else slow + 1
         if bool(residual.max() <= best.residual.max()):
             best = found
-        right = moment(factor, weighted(scaling * (share * lacking), weights).unsqueeze(1), shard)
+        right = among.sum(moment(factor, weighted(scaling * (share * lacking), weights).unsqueeze(1)))
         affinity = spread(torch.cholesky_solve(right, lower).to(factor).mT, factor, scaling).squeeze(1)
         step = share * (lacking - affinity)
-        small = bool(_largest(step, shard).max() < SMALL_STEP)
+        small = bool(_largest(step, among).max() < SMALL_STEP)
         if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
             break
-        length = 1.0 if small else _line_search(step.double(), lacking.double(), shard, weights)
+        length = 1.0 if small else _line_search(step.double(), lacking.double(), among, weights)
         scaling = (scaling * (1 + length * step)).clamp(min=tiny).to(factor)
     return best
 
 
-def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
+def _line_search(step: Tensor, lacking: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """The s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
     # W 1 = 1 - lacking and W x = lacking - x make the quadratic known.
 
     def total(values: Tensor) -> Tensor:
-        return reduce_sum(weighted(values, weights).sum(1, keepdim=True), shard)
+        return among.sum(weighted(values, weights).sum(1, keepdim=True))
 
     linear, square = total(step * (1 - lacking)), total(step * (lacking - step))
-    longest = reduce_max((-step).amax(1, keepdim=True), shard).clamp(min=1e-12).reciprocal()  # where a d reaches zero
+    longest = among.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()  # where a d reaches zero
     low, high = torch.zeros_like(longest), 0.999 * longest
     length = torch.minimum(torch.ones_like(high), 0.5 * high)
     for _ in range(40):
@@ -381,12 +380,12 @@ def _line_search(step: Tensor, lacking: Tensor, shard: Shard | None, weights: Te
     return length
 
 
-def weighted_moment(factor: Tensor, weight: Tensor, shard: Shard | None, total: Tensor) -> Tensor:
+def weighted_moment(factor: Tensor, weight: Tensor, among: Communicator, total: Tensor) -> Tensor:
     """``factor @ (weight * (factor^T total))``, (B, M, 1) in float64."""
-    return reduce_sum(weigh(factor, weight, total.to(factor).squeeze(2)).unsqueeze(2), shard)
+    return among.sum(weigh(factor, weight, total.to(factor).squeeze(2)).unsqueeze(2))
 
 
-def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, shard: Shard | None) -> Tensor:
+def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, among: Communicator) -> Tensor:
     """The s (B, M, 1) in float64 with ``(I + factor diag(weight) factor^T) s = right``."""
     tiny = torch.finfo(torch.float64).tiny  # where the right side is zero, so is the solution
     solution, residual = torch.zeros_like(right), right
@@ -394,7 +393,7 @@ def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: 
     direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
     goal = SOLVED[factor.dtype] ** 2 * size
     for _ in range(SOLVE_STEPS[factor.dtype]):
-        image = direction + weighted_moment(factor, weight, shard, direction)
+        image = direction + weighted_moment(factor, weight, among, direction)
         step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
         solution, residual = solution + step * direction, residual - step * image
         preconditioned = inverse @ residual

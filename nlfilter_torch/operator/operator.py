@@ -13,7 +13,7 @@ from nlfilter_torch.core.checks import (
     check_order,
     check_same_size,
 )
-from nlfilter_torch.core.communicator import Shard, check_whole, reduce_max, reduce_sum
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.compilation import uncompiled
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
@@ -110,7 +110,7 @@ class NonlocalOperator:
         balancing: what the scaling of other pixels is a function of.
         residual: largest deviation of a row sum of W from 1, (B,).
         balancing_steps: sweeps over the factor that balancing took.
-        shard: of the image, where other ranks have the rest of it; everything above is then what is here.
+        among: ranks that the rows of the image are spread over; all attributes are then of the rows here.
     """
 
     factor: Tensor
@@ -123,7 +123,7 @@ class NonlocalOperator:
     residual: Tensor
     balancing_steps: int
     weights: Tensor | None = None
-    shard: Shard | None = None
+    among: Communicator = ALONE
 
     def at(self, features: Tensor) -> Columns:
         """What W knows of any points: their columns, as functions of their own features and of sums over the image.
@@ -164,7 +164,7 @@ class NonlocalOperator:
         check_image(image, "image")
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
-        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.shard, self.weights)
+        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.among, self.weights)
         return unfold_batch(planes, image.shape[0], self.size)
 
     @property
@@ -184,7 +184,7 @@ class NonlocalOperator:
         Raises:
             ValueError: if the image has more than 16384 pixels, or not all of them are here.
         """
-        check_whole(self.shard, "to_dense")
+        self.among.check_whole("to_dense")
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
@@ -209,7 +209,7 @@ class NonlocalOperator:
         if rank is not None:
             check_count(rank, "rank")
         remainder = self.remainder if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.shard, self.weights)
+        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.among, self.weights)
 
     @full_precision
     @torch.no_grad()
@@ -230,13 +230,13 @@ class NonlocalOperator:
         x, y = images.expand(batch, -1, -1, -1).split(1, dim=1)
         products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().flatten(2)
         products = weighted(products, self.weights).sum(2)
-        inner = reduce_sum(products, self.shard)
-        lengths = reduce_sum(images.double().square().sum((0, 2, 3)), self.shard)
-        highest, lowest = (reduce_max((sign * self.remainder).amax(1), self.shard) for sign in (1, -1))
-        gram = shifted_gram(self.factor, root_mass(self.scaling, self.weights), self.remainder, self.shard)
+        inner = self.among.sum(products)
+        lengths = self.among.sum(images.double().square().sum((0, 2, 3)))
+        highest, lowest = (self.among.max((sign * self.remainder).amax(1)) for sign in (1, -1))
+        gram = shifted_gram(self.factor, root_mass(self.scaling, self.weights), self.remainder, self.among)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
-            row_sums=reduce_max((self.row_sums() - 1).abs().amax((1, 2, 3)), self.shard).tolist(),
+            row_sums=self.among.max((self.row_sums() - 1).abs().amax((1, 2, 3))).tolist(),
             smallest_eigenvalue=(-lowest).tolist(),
             largest_eigenvalue=largest_eigenvalue(gram, highest, self.factor.dtype).tolist(),
         )
@@ -251,12 +251,12 @@ class NonlocalOperator:
         image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
         error = (image - spectrum.eigenvalues[:, :, None, None] * vectors).square().flatten(2)
         error = weighted(error, self.weights).sum(2)
-        residual = reduce_sum(error, self.shard).sqrt()
+        residual = self.among.sum(error).sqrt()
         flat = vectors.flatten(2)
-        inner = reduce_sum(weighted(flat, self.weights) @ flat.mT, self.shard)
+        inner = self.among.sum(weighted(flat, self.weights) @ flat.mT)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
         ones = weighted(torch.ones_like(self.scaling), self.weights).unsqueeze(1)
-        total = moment(self.factor, ones, self.shard).to(self.factor)
+        total = self.among.sum(moment(self.factor, ones)).to(self.factor)
         kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
         recipe = self.kernel.features
         bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)
@@ -267,11 +267,9 @@ class NonlocalOperator:
             photometric_bandwidth=bandwidth.expand(self.factor.shape[0]).tolist(),
             balancing_steps=self.balancing_steps,
             row_sum_residual=certificate.row_sums,
-            smallest_row_sum=(-reduce_max(-kernel_sums.amin(1), self.shard)).tolist(),
+            smallest_row_sum=(-self.among.max(-kernel_sums.amin(1))).tolist(),
             largest_eigenvalue=certificate.largest_eigenvalue,
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(
-                reduce_sum(weighted(self.remainder, self.weights).sum(1), self.shard) / spectrum.pixels
-            ).tolist(),
+            diagonal_share=(self.among.sum(weighted(self.remainder, self.weights).sum(1)) / spectrum.pixels).tolist(),
         )

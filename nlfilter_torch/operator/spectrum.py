@@ -23,7 +23,7 @@ from nlfilter_torch.core.blocks import (
     unfold_batch,
 )
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
-from nlfilter_torch.core.communicator import Shard, reduce_sum
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
@@ -99,7 +99,7 @@ class Spectrum(RitzPairs):
         largest: the first eigenvalue before it was clamped to 1, (B,).
         weights: how many pixels each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum over
             points with these weights.
-        shard: of the image, where other ranks have the rest of it.
+        among: ranks that the rows of the image are spread over.
     """
 
     eigenvalues: Tensor
@@ -108,14 +108,14 @@ class Spectrum(RitzPairs):
     size: tuple[int, int]
     largest: Tensor
     weights: Tensor | None = None
-    shard: Shard | None = None
+    among: Communicator = ALONE
 
     @property
     def pixels(self) -> int:
         """N, of the whole image; of weighted points the sum of their weights."""
         if self.weights is not None:
-            return round(float(reduce_sum(self.weights[0].sum(), self.shard)))
-        return self.scaling.shape[1] if self.shard is None else self.shard.pixels
+            return round(float(self.among.sum(self.weights[0].sum())))
+        return self.among.pixels(self.scaling.shape[1])
 
     @property
     def mass(self) -> Tensor:
@@ -169,7 +169,7 @@ class Spectrum(RitzPairs):
         check_image(image, "image")
         check_same_size(image, self.size, "image", "spectrum")
         planes = fold_batch(image.to(self.factor), self.factor.shape[0])
-        total = moment(self.factor, self.mass.unsqueeze(1) * planes, self.shard)  # (B, M, C)
+        total = self.among.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ class Spectrum(RitzPairs):
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
         with torch.no_grad():
-            ones = moment(self.factor, self.mass.unsqueeze(1), self.shard)  # F 1, (B, M, 1)
+            ones = self.among.sum(moment(self.factor, self.mass.unsqueeze(1)))  # F 1, (B, M, 1)
             cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
             cluster[:, :1] = True
             target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
@@ -204,18 +204,18 @@ def compute_spectrum(
     remainder: Tensor | None,
     size: tuple[int, int],
     rank: int | None,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Spectrum:
     """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
     each = scaling if weights is None else scaling * weights.sqrt()
-    pairs = RitzPairs.of_sums(reduce_sum(compute_grams(factor, each, remainder, count), shard), factor.dtype)
+    pairs = RitzPairs.of_sums(among.sum(compute_grams(factor, each, remainder, count)), factor.dtype)
     checked = factor.dtype == torch.float32 and factor.device.type == "cpu"
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
         grams = compute_grams(factor, each, remainder, count, exact=True)
-        pairs = RitzPairs.of_sums(reduce_sum(grams, shard), factor.dtype)
+        pairs = RitzPairs.of_sums(among.sum(grams), factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
@@ -224,7 +224,7 @@ def compute_spectrum(
     values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
     return Spectrum(
-        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, shard
+        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, among
     )
 
 
