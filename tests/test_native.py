@@ -20,7 +20,7 @@ from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator import landmarks, newton
-from nlfilter_torch.operator.newton import weighted_moment
+from nlfilter_torch.operator.conjugate_gradients import weighted_moment
 from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
 from tests import reference
 

@@ -17,8 +17,9 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.operator.newton import Solution, damped
+from nlfilter_torch.operator.damped_newton import damped
 from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.scaling import Solution
 from tests import reference
 from tests.problems import noise, picture, seeded
 

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from nlfilter_torch import NonlocalOperator, detail_layers, fit_filter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.operator.balancing import balance
-from nlfilter_torch.operator.newton import LARGEST, PixelScaling, Solution, damped, scaling_from_moment
+from nlfilter_torch.operator.damped_newton import damped
+from nlfilter_torch.operator.newton import LARGEST
+from nlfilter_torch.operator.scaling import PixelScaling, Solution, scaling_from_moment
 from nlfilter_torch.tiled import stream_detail
 from tests import reference
 from tests.problems import noise, picture, seeded

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_image,
@@ -24,8 +25,8 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling, weighted
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.scaling import PixelScaling
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,10 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import CACHED, block_length
+from nlfilter_torch.core.blocks import CACHED, block_length, weighted
 from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, is_hidden, warn
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
     check_image,
     check_instance,
@@ -26,7 +27,6 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 SPOT = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240

@@ -1,7 +1,8 @@
 """Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
 The scaling of a completed kernel comes from :mod:`~nlfilter_torch.operator.newton`, that of any other from
-:mod:`~nlfilter_torch.operator.chebyshev`. Its gradient is implicit, whichever way it was found.
+:mod:`~nlfilter_torch.operator.chebyshev`. On processors, :mod:`~nlfilter_torch.operator.damped_newton` continues where
+these do not converge. The gradient is implicit and the same for all methods.
 """
 
 from dataclasses import dataclass
@@ -11,10 +12,14 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable, outer_product
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.operator import chebyshev, newton
+from nlfilter_torch.operator.conjugate_gradients import conjugate_gradients
+from nlfilter_torch.operator.damped_newton import damped
+from nlfilter_torch.operator.scaling import moment_of
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}  # a residual that is worth a warning, unless it was asked for
@@ -72,6 +77,13 @@ def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dty
         warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
 
 
+def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:
+    """The residual that balancing aims at: the tolerance, or the rounding error of row sums if that is larger."""
+    pixels = among.pixels(factor.shape[2])
+    # |u . t| is formed from terms of up to |u| |t|, and |t|^2 is at most the number of pixels.
+    return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
+
+
 class _Balance(torch.autograd.Function):
     """Implicit differentiation of ``log d + log(K d) = 0``.
 
@@ -95,6 +107,9 @@ class _Balance(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, int]:
         solve = newton.solve if completed else chebyshev.solve
         found = solve(factor, diagonal, tolerance, among, weights)
+        goal = attainable(factor, tolerance, among)
+        if factor.device.type == "cpu" and not bool((found.residual <= goal).all()):
+            found = damped(factor, diagonal, found, goal, among, weights)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
         ctx.among, ctx.completed = among, completed
         ctx.mark_non_differentiable(found.moment, found.residual)
@@ -109,10 +124,10 @@ class _Balance(torch.autograd.Function):
             factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
-        right = ctx.among.sum(moment(factor, (weight * grad).unsqueeze(1)))
-        solution = newton.conjugate_gradients(factor, newton.weighted(weight, weights), right, inverse, ctx.among)
-        affinity = newton.weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
+        right = moment_of(factor, weight * grad, ctx.among, None)
+        solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, ctx.among)
+        affinity = weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
-        grad_factor = outer_product(totals, torch.stack([-a, -newton.weighted(scaling, weights)], dim=1).to(dtype))
+        grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))
         return grad_factor, (-a * scaling).to(dtype), None, None, None, None

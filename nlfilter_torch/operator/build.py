@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import root_weighted
 from nlfilter_torch.core.checks import (
     called_by_edit,
     check_choice,
@@ -25,16 +26,15 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.balancing import Balancing, balance, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
-from nlfilter_torch.operator.newton import PixelScaling, isolated, root_mass, row_sums, weighted
 from nlfilter_torch.operator.nystrom import Completion, whitener
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.scaling import PixelScaling, isolated, moment_of, row_sums
 
 ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
 
@@ -274,24 +274,25 @@ def assemble(
     factor, diagonal = kernel.factor(features)
     completed, watched = completion == "diagonal", factor.device.type == "cpu"
 
-    def balanced() -> Balancing:
-        return balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
+    def balanced() -> tuple[Balancing, float]:
+        found = balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
+        return found, float(found.residual.max()) if watched else 0.0
 
-    balancing = balanced()
+    balancing, worst = balanced()
     before: list[Tensor] = []
     while completed and watched and len(before) < ROUNDS:
-        alone = isolated(balancing.scaling.detach(), float(balancing.residual.max()))
+        alone = isolated(balancing.scaling.detach(), worst)
         if not bool(among.max(alone.any().to(factor))):
             break
         before.append(balancing.moment)
         factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
-        balancing = balanced()
+        balancing, worst = balanced()
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = shifted_gram(factor, root_mass(scaling, weights), remainder, among)
-    allowed = slack(factor.dtype, float(residual.max())) if watched else 0.0
+    gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, among)
+    allowed = slack(factor.dtype, worst)
     if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1))), allowed)
+        limit = limiter(gram, moment_of(factor, scaling, among, weights), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
         residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), among, weights)
@@ -303,9 +304,7 @@ def assemble(
         size=size,
         kernel=kernel,
         remainder=remainder,
-        balancing=PixelScaling(
-            balancing.moment, completed, float(balancing.residual.max()) if watched else 0.0, tuple(before)
-        ),
+        balancing=PixelScaling(balancing.moment, completed, worst, tuple(before)),
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,
@@ -315,5 +314,5 @@ def assemble(
 
 def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """Largest deviation of a row sum from 1, (B,)."""
-    sums = row_sums(factor, diagonal, scaling, among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1))))
+    sums = row_sums(factor, diagonal, scaling, moment_of(factor, scaling, among, weights))
     return among.max((sums - 1).abs().amax(1))

@@ -10,16 +10,14 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import SWEPT, pixel_blocks
+from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
-from nlfilter_torch.operator.newton import Solution, accepted, damped, weighted
+from nlfilter_torch.core.kernels.tall_skinny import gather, spread
+from nlfilter_torch.operator.scaling import Solution, moment_of
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # on an accelerator a look at the residual would stop the queue
 TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
-SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
-STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it are left to the damped method
 SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
 STALL = 1e-3  # below this residual, two sweeps in turn that do not halve it are left to the damped method
 LARGEST_SCALING = 1e30  # of a pixel whose affinities the plain method makes negative, so that no scaling balances it
@@ -38,16 +36,16 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
 
 def _start(factor: Tensor, diagonal: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
-    total = among.sum(moment(factor, weighted(torch.ones_like(diagonal), weights).unsqueeze(1))).to(factor)
+    total = moment_of(factor, torch.ones_like(diagonal), among, weights).to(factor)
     return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_SUM).rsqrt()
 
 
 def solve(
     factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator = ALONE, weights: Tensor | None = None
 ) -> Solution:
-    """Balance any kernel: by Chebyshev's method where it converges, otherwise on processors by damped Newton steps."""
+    """Balance any kernel; on processors until the residual is at most ``tolerance`` or stalls."""
     scaling = _start(factor, diagonal, among, weights)
-    total = among.sum(moment(factor, weighted(scaling, weights).unsqueeze(1)))
+    total = moment_of(factor, scaling, among, weights)
     move = torch.zeros_like(scaling)
     watched = factor.device.type == "cpu"
     worst, slow = float("inf"), 0
@@ -72,7 +70,4 @@ def solve(
             break
         scaling, total = following, next_total
     identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
-    found = Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
-    if not watched or bool((found.residual <= accepted(factor, tolerance, among)).all()):
-        return found
-    return damped(factor, diagonal, found, tolerance, among, weights)
+    return Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import fold_batch, unfold_batch
+from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
 from nlfilter_torch.core.checks import (
     check_count,
     check_features,
@@ -15,12 +15,12 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling, root_mass, weighted
 from nlfilter_torch.operator.products import apply_powers
+from nlfilter_torch.operator.scaling import PixelScaling, moment_of
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
@@ -191,9 +191,7 @@ class NonlocalOperator:
                 f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
             )
         scaled = self.factor * self.scaling.unsqueeze(1)  # F first: without completion U may be too small to square
-        matrix = scaled.mT @ scaled
-        matrix = matrix if self.weights is None else matrix * self.weights.unsqueeze(1)
-        return matrix + torch.diag_embed(self.remainder)
+        return weighted(scaled.mT @ scaled, self.weights) + torch.diag_embed(self.remainder)
 
     @uncompiled
     @full_precision
@@ -233,7 +231,7 @@ class NonlocalOperator:
         inner = self.among.sum(products)
         lengths = self.among.sum(images.double().square().sum((0, 2, 3)))
         highest, lowest = (self.among.max((sign * self.remainder).amax(1)) for sign in (1, -1))
-        gram = shifted_gram(self.factor, root_mass(self.scaling, self.weights), self.remainder, self.among)
+        gram = shifted_gram(self.factor, root_weighted(self.scaling, self.weights), self.remainder, self.among)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
             row_sums=self.among.max((self.row_sums() - 1).abs().amax((1, 2, 3))).tolist(),
@@ -255,8 +253,7 @@ class NonlocalOperator:
         flat = vectors.flatten(2)
         inner = self.among.sum(weighted(flat, self.weights) @ flat.mT)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
-        ones = weighted(torch.ones_like(self.scaling), self.weights).unsqueeze(1)
-        total = self.among.sum(moment(self.factor, ones)).to(self.factor)
+        total = moment_of(self.factor, torch.ones_like(self.scaling), self.among, self.weights).to(self.factor)
         kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
         recipe = self.kernel.features
         bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable, outer_product
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 
@@ -52,7 +53,7 @@ def _powers(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """The k + 1 images from y to W^k y, and the k moments (B, M, C) that they passed through."""
     images, moments = [image], []
-    each = scaling if weights is None else scaling * weights.unsqueeze(1)
+    each = weighted(scaling, weights)
     for _ in range(order):
         moments.append(among.sum(moment(factor, each * images[-1])).to(factor))
         smooth = spread(moments[-1].mT, factor, scaling.squeeze(1))
@@ -98,13 +99,12 @@ class _Powers(torch.autograd.Function):
             before = images[i - 1]
             total = ctx.among.sum(moment(factor, d * adjoint)).to(factor)
             affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
-            summed = before if weights is None else before * weights.unsqueeze(1)
+            summed = weighted(before, weights)
             # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
             grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
             grad_remainder += (adjoint * before).sum(1)
             left += [moments[i - 1], total]
             right += [d * adjoint, d * summed]
-            pulled = d * affinity
-            adjoint = (pulled if weights is None else pulled * weights.unsqueeze(1)) + r * adjoint
+            adjoint = weighted(d * affinity, weights) + r * adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
         return grad_factor, grad_scaling, grad_remainder, adjoint, None, None, None

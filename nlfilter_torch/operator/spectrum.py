@@ -20,7 +20,9 @@ from nlfilter_torch.core.blocks import (
     buffered_blocks,
     fold_batch,
     pixel_blocks,
+    root_weighted,
     unfold_batch,
+    weighted,
 )
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
@@ -120,7 +122,7 @@ class Spectrum(RitzPairs):
     @property
     def mass(self) -> Tensor:
         """D times the weights of the points, (B, N), by which values are summed up."""
-        return self.scaling if self.weights is None else self.scaling * self.weights
+        return weighted(self.scaling, self.weights)
 
     @property
     def eigenvectors(self) -> Tensor:
@@ -177,8 +179,8 @@ class Spectrum(RitzPairs):
         check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
-        weighted = total @ self.gain(response).mT
-        planes = spread(weighted.to(self.factor), self.factor, self.scaling)
+        filtered = total @ self.gain(response).mT
+        planes = spread(filtered.to(self.factor), self.factor, self.scaling)
         return unfold_batch(planes.unsqueeze(1), count, self.size)[:, 0]
 
     def _constant_first(self, vectors: Tensor) -> Tensor:
@@ -210,7 +212,7 @@ def compute_spectrum(
     """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
-    each = scaling if weights is None else scaling * weights.sqrt()
+    each = root_weighted(scaling, weights)
     pairs = RitzPairs.of_sums(among.sum(compute_grams(factor, each, remainder, count)), factor.dtype)
     checked = factor.dtype == torch.float32 and factor.device.type == "cpu"
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
@@ -279,14 +281,14 @@ class _Grams(torch.autograd.Function):
         grad_factor, grad_scaling = torch.empty_like(factor), torch.empty_like(scaling)
         grad_remainder = None if remainder is None else torch.empty_like(remainder)
         symmetric = (grad + grad.mT).to(factor)  # (B, J, M, M)
-        for block, (rows, pulled, weighted, product) in buffered_blocks(factor, 4):
+        for block, (rows, pulled, inner, product) in buffered_blocks(factor, 4):
             d = scaling[:, None, block]
             torch.mul(factor[:, :, block], d, out=rows)
             torch.bmm(symmetric[:, 0], rows, out=pulled)
             if remainder is not None and grad_remainder is not None:
-                torch.bmm(symmetric[:, 1], rows, out=weighted)
-                grad_remainder[:, block] = torch.mul(weighted, rows, out=product).sum(1) / 2
-                pulled.addcmul_(weighted, remainder[:, None, block])
+                torch.bmm(symmetric[:, 1], rows, out=inner)
+                grad_remainder[:, block] = torch.mul(inner, rows, out=product).sum(1) / 2
+                pulled.addcmul_(inner, remainder[:, None, block])
             grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
             grad_factor[:, :, block] = pulled.mul_(d)
         return grad_factor, grad_scaling, grad_remainder, None, None

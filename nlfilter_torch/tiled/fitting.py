@@ -15,7 +15,7 @@ from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, sq
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling
+from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.sampling import Image, Report, all_blocks, sample_by_influence, take_pilot
 from nlfilter_torch.tiled.sources import Picture, RowSource, Tile

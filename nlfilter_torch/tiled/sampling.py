@@ -25,8 +25,8 @@ from nlfilter_torch.operator.features import (
 )
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.operator.newton import PixelScaling, scaling_from_moment
 from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
 from nlfilter_torch.operator.spectrum import CUT
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sources import Picture, Tile

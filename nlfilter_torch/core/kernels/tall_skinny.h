@@ -1,4 +1,4 @@
-/* Tall-skinny products that read the factor once; see tall_skinny.py, and operator/newton.py for the sweep. */
+/* Tall-skinny products that read the factor once; see tall_skinny.py, and sweeps.py for the sweep. */
 
 #define LEAST (FLT_EPSILON / 4)
 
@@ -84,7 +84,7 @@ static TARGET void NAME(sweep)(const struct thin *task, long first, long last, d
         const long end = last - start < step ? last : start + step;
         NAME(spread)(task, start, end);
         for (long i = start; task->diagonal && i < end; i++) {
-            /* operator/newton.py: the root without cancellation for either sign of u . t; finite if c = 0 */
+            /* positive_root of sweeps.py: without cancellation for either sign of u . t; finite if c = 0 */
             const float half = task->out[i], c = task->diagonal[i], root = sqrtf(half * half + c);
             const float over = half < 0.0f ? root - half : 1.0f, under = half < 0.0f ? c : root + half;
             const float d = over / (under < LEAST ? LEAST : under);
