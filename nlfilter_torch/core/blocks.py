@@ -69,12 +69,12 @@ def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Te
         factor: (B, M, N), from which the buffers take shape, dtype and device.
         count: number of buffers.
     """
-    batch, marks, pixels = factor.shape
+    batch, landmarks, pixels = factor.shape
     storage: list[Tensor] = []
     for block in pixel_blocks(pixels, batch, factor.device):
         length = block.stop - block.start
         if not storage or length != storage[0].shape[2]:
-            storage = [factor.new_empty(batch, marks, length) for _ in range(count)]
+            storage = [factor.new_empty(batch, landmarks, length) for _ in range(count)]
         yield block, storage
 
 

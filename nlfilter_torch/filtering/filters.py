@@ -139,22 +139,22 @@ def polynomial_filter(
     return filtered.to(image.dtype)
 
 
-def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor, remainder: Tensor) -> Tensor:
-    """Correction of a filtered image that gives ``missed``, the part no eigenvector captures, its own weight.
+def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, remainder: Tensor) -> Tensor:
+    """The change of a filtered image that gives the residual, the part that no eigenvector captures, its own weight.
 
-    F annihilates that part, so W multiplies it by r and the sliders have given it the weight f(r). The share r of it
-    keeps that weight: W preserves a pixel unlike all others, though no eigenvector captures it.
+    F maps the residual to zero, so W multiplies it by r, and the sliders have given it the weight f(r). The share r of
+    it keeps that weight: W preserves a pixel unlike all others, although no eigenvector captures it.
 
     Args:
         alpha: the sliders, of any shape that :func:`weigh_layers` takes.
-        residual: the weight it is to have.
-        missed: (B, C, H, W).
+        weight: of the residual.
+        residual: (B, C, H, W).
         remainder: r, (B, 1, H, W).
     """
     entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
     powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
     gain = weigh_layers(layers_between(powers), alpha)
-    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - gain) * (1 - remainder) * missed
+    return (torch.as_tensor(weight).to(residual).reshape(-1, 1, 1, 1) - gain) * (1 - remainder) * residual
 
 
 @full_precision
@@ -205,8 +205,8 @@ def spectral_filter(
     else:
         check_image(image, "image")
         check_same_size(image, spectrum.size, "image", "spectrum")
-        batch, marks, _ = spectrum.factor.shape
-        shape = (max(batch, image.shape[0]), image.shape[1], marks)
+        batch, landmarks, _ = spectrum.factor.shape
+        shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
         check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
     if isinstance(residual, int | float) and residual == 0:
         return spectrum.synthesize(response, coefficients).to(image.dtype)

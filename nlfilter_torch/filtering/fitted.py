@@ -39,13 +39,13 @@ class FittedFilter:
         kernel: landmarks, bandwidths and window.
         balancing: determines the scaling of a pixel.
         moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
-        explained: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
+        captured: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
     """
 
     kernel: Kernel
     balancing: PixelScaling
     moments: Tensor
-    explained: Tensor
+    captured: Tensor
 
     @full_precision
     def layers(
@@ -92,7 +92,7 @@ class FittedFilter:
         check_alpha(alpha)
         if residual is not None:
             check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
-        planes = self._planes(image, guide, origin, halo, by_rows=by_rows, missed=residual is not None)
+        planes = self._planes(image, guide, origin, halo, by_rows=by_rows, with_residual=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
         if residual is not None:
@@ -107,9 +107,9 @@ class FittedFilter:
         halo: tuple[int, int],
         *,
         by_rows: bool = False,
-        missed: bool = False,
+        with_residual: bool = False,
     ) -> Tensor:
-        """Layers (B, k+1, C, H, W) and, on request, the residual and r as two more, in the kernel's dtype."""
+        """Layers (B, k+1, C, H, W), with the residual and r as two more if asked for, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
@@ -122,18 +122,17 @@ class FittedFilter:
             guide = guide.expand(image.shape[0], -1, -1, -1)
             check_same_size(guide, size, "guide", "image")
         batch = (image.shape[0], -1, -1)
-        kernel = replace(
-            self.kernel, landmarks=self.kernel.landmarks.expand(batch), whitening=self.kernel.whitening.expand(batch)
-        )
+        landmarks, inverse = (matrix.expand(batch) for matrix in (self.kernel.landmarks, self.kernel.inverse_cholesky))
+        kernel = replace(self.kernel, landmarks=landmarks, inverse_cholesky=inverse)
         features = kernel.recipe(image if guide is None else guide, origin=origin, halo=halo)
         image = _without(image, halo)
         size = (image.shape[-2], image.shape[-1])
         step = size[1] if by_rows else features.shape[2]
         parts = zip(features.split(step, dim=2), image.to(features).flatten(2).split(step, dim=2), strict=True)
-        planes = [self._split(kernel, *part, missed=missed) for part in parts]
+        planes = [self._split(kernel, *part, with_residual=with_residual) for part in parts]
         return torch.cat(planes, dim=-1).unflatten(-1, size)
 
-    def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
+    def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, with_residual: bool) -> Tensor:
         """The same (B, k+1 or k+3, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
         scaling, remainder = self.balancing(factor, diagonal)
@@ -142,10 +141,10 @@ class FittedFilter:
         for coefficients in self.moments.to(factor).unbind(1):  # one for each power of W
             smoothed.append(torch.addcmul(spread(coefficients.mT, factor, scaling), remainder, smoothed[-1]))
         layers = layers_between(torch.stack(smoothed, dim=1))
-        if not missed:
+        if not with_residual:
             return layers
-        explained = spread(self.explained.to(factor).mT, factor, scaling)
-        return torch.cat([layers, torch.stack([image - explained, remainder.expand_as(image)], dim=1)], dim=1)
+        captured = spread(self.captured.to(factor).mT, factor, scaling)
+        return torch.cat([layers, torch.stack([image - captured, remainder.expand_as(image)], dim=1)], dim=1)
 
 
 def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:
@@ -191,5 +190,5 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     # The moment of the factor itself has a gradient.
     balancing = replace(operator.balancing, moment=among.sum(moment(factor, scaling)))
     moments = torch.stack([among.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
-    explained = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
-    return FittedFilter(operator.kernel, balancing, moments, explained)
+    captured = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
+    return FittedFilter(operator.kernel, balancing, moments, captured)

@@ -11,7 +11,7 @@ from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined
 STEEPEST = 1e30  # limit of pixels / width: a distance of 0 never becomes NaN
-EXPLAINED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
+CAPTURED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
 LOOKED_AT = 4096  # pixels of a region that are checked
 ITERATIONS = 20  # of k-means, which starts close to the solution
 
@@ -107,7 +107,7 @@ def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
         for number, region in enumerate(regions):
             places = region.nonzero().squeeze(1)
             few = places[:: 1 + len(places) // LOOKED_AT]
-            if len(few) > 0 and columns[:, few].square().sum(0).mean() < EXPLAINED:
+            if len(few) > 0 and columns[:, few].square().sum(0).mean() < CAPTURED:
                 warn(
                     f"region {number} is like no landmark, so its mask may take in other pixels like none; "
                     "raise num_landmarks or photometric_bandwidth"

@@ -29,11 +29,11 @@ from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
-SPOT = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240
+DAB = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240
 NOISE = 0.08  # variance of the values of one dab, relative to that of the image
 FLOOR = 1e-12  # of eigenvalues; keeps the derivative of their square root finite
 
-Painted = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
+ScribbledBlocks = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
 
 
 @full_precision
@@ -127,7 +127,7 @@ class FittedStrokes:
 
 
 def fit_strokes(
-    painted: Painted,
+    painted: ScribbledBlocks,
     pairs: RitzPairs,
     pixels: int,
     *,
@@ -149,21 +149,22 @@ def fit_strokes(
         among: ranks that the rows of the image are spread over.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T
-    heed = Heed.of(painted, half, SPOT * pixels, among)
+    effective_weights = EffectiveWeights.of(painted, half, DAB * pixels, among)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for factor, weights, values in painted():
-        heeded = heed(factor, weights)
-        images = max(len(factor), len(heeded), len(values))
+        effective = effective_weights(factor, weights)
+        images = max(len(factor), len(effective), len(values))
         known = torch.cat([values, torch.ones_like(values[:, :1])], dim=1).expand(images, -1, -1)
-        gram = gram + moment(factor * heeded, factor)  # (B, M, M)
-        target = target + moment(factor.expand(images, -1, -1), heeded * known)  # (B, M, C+1)
-        sums = sums + (heeded * known).double().sum(2)  # (B, C+1)
+        gram = gram + moment(factor * effective, factor)  # (B, M, M)
+        target = target + moment(factor.expand(images, -1, -1), effective * known)  # (B, M, C+1)
+        sums = sums + (effective * known).double().sum(2)  # (B, C+1)
     gram, target, sums = (among.sum(total) for total in (gram, target, sums))
 
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
     inner = half.mT @ gram @ half
-    noise = _per_image(smoothness, gram) * heed.spot * heed.noise  # of a single pixel of a dab
+    # The noise of a single pixel of a dab.
+    noise = _per_image(smoothness, gram) * effective_weights.dab * effective_weights.noise
     identity = torch.eye(inner.shape[1]).to(inner)
     lower = torch.linalg.cholesky_ex(inner + noise * identity).L
     solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
@@ -188,7 +189,7 @@ def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Heed:
+class EffectiveWeights:
     """Effective weights of scribbled pixels.
 
     A single dot must not be outweighed by broad scribbles or by the size of the photograph: pixels similar to few other
@@ -198,42 +199,42 @@ class Heed:
     Attributes:
         core: X, (B, M, M).
         gram: ``X G X / v`` with G the sum over the scribbled pixels and v their mean captured variance, (B, M, M).
-        spot: pixels in a dab of the brush.
+        dab: number of pixels in a dab of the brush.
         noise: variance of the values of a dab, (B, 1, 1).
     """
 
     core: Tensor
     gram: Tensor
-    spot: float
+    dab: float
     noise: Tensor
 
     @staticmethod
-    def of(painted: Painted, half: Tensor, spot: float, among: Communicator) -> "Heed":
+    def of(painted: ScribbledBlocks, half: Tensor, dab: float, among: Communicator) -> "EffectiveWeights":
         """From a pass over the scribbled pixels."""
-        gram, missed, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
+        gram, residual, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
-            missed = missed + (weights * unexplained(factor)).double().sum((1, 2))
+            residual = residual + (weights * diagonal_residual(factor)).double().sum((1, 2))
             total = total + weights.double().sum((1, 2))
-        gram, missed, total = (among.sum(part) for part in (gram, missed, total))
+        gram, residual, total = (among.sum(part) for part in (gram, residual, total))
         core = half @ half.mT
         variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
-        noise = NOISE * (variance + missed / total).reshape(-1, 1, 1)
-        return Heed(core, core @ gram @ core / variance.reshape(-1, 1, 1), spot, noise)
+        noise = NOISE * (variance + residual / total).reshape(-1, 1, 1)
+        return EffectiveWeights(core, core @ gram @ core / variance.reshape(-1, 1, 1), dab, noise)
 
     def __call__(self, factor: Tensor, weights: Tensor) -> Tensor:
         """The weights (B, 1, n) of columns (B, M, n)."""
-        noise, own = self.noise.to(weights), unexplained(factor) / min(self.spot, 1.0)
+        noise, own = self.noise.to(weights), diagonal_residual(factor) / min(self.dab, 1.0)
         weights = weights * noise / (noise + own)
-        if self.spot <= 1:
+        if self.dab <= 1:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
         # The sum of squared correlations with the scribbled pixels.
         likes = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
-        return weights * (self.spot / likes.clamp(min=1.0)).clamp(min=1.0)
+        return weights * (self.dab / likes.clamp(min=1.0)).clamp(min=1.0)
 
 
-def unexplained(factor: Tensor) -> Tensor:
+def diagonal_residual(factor: Tensor) -> Tensor:
     """Residual of columns (B, M, n) on the kernel's unit diagonal, (B, 1, n): 1 for a pixel like no landmark."""
     return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 

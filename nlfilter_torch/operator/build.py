@@ -32,7 +32,7 @@ from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limite
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
-from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.scaling import PixelScaling, isolated, moment_of, row_sums
 
@@ -270,7 +270,7 @@ def assemble(
         )
         num_landmarks = points
     chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, among, weights)
-    kernel = Kernel(chosen, whitener(chosen), completion, features=recipe)
+    kernel = Kernel(chosen, inverse_cholesky(chosen), completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = completion == "diagonal", factor.device.type == "cpu"
 

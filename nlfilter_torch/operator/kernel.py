@@ -58,14 +58,14 @@ class Kernel:
 
     Attributes:
         landmarks: (B, D, M).
-        whitening: (B, M, M).
+        inverse_cholesky: (B, M, M).
         completion: ``"diagonal"`` or ``"none"``.
         limiter: (B, M, M) that the factor is multiplied by so that no eigenvalue of W exceeds 1, or None.
         features: how features come from a guide; None where the operator was made from features.
     """
 
     landmarks: Tensor
-    whitening: Tensor
+    inverse_cholesky: Tensor
     completion: Completion
     limiter: Tensor | None = None
     features: GuideFeatures | None = None
@@ -92,5 +92,5 @@ class Kernel:
 
     def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
-        factor, diagonal = nystrom_factor(features, self.landmarks, self.whitening, self.completion)
+        factor, diagonal = nystrom_factor(features, self.landmarks, self.inverse_cholesky, self.completion)
         return factor if self.limiter is None else self.limiter @ factor, diagonal

@@ -11,7 +11,7 @@ from nlfilter_torch.core.kernels.clusters import affinities_between, chance, dra
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
-EXPLAINED = 1e-4  # a residual of the unit diagonal below which a point counts as explained
+CAPTURED = 1e-4  # a residual of the unit diagonal below which a point counts as captured
 # More features or iterations move the centroids by less than their sampling error: at 512x400 pixels and m = 100, twice
 # as many features lower the mean diagonal, what the landmarks miss, by at most 2 %; ten iterations by at most 3 %.
 PER_LANDMARK = 64
@@ -141,7 +141,7 @@ def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
 def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices (B, count) of points (B, D, S) to start k-means from: the pivots of a random Cholesky decomposition.
 
-    Each is drawn by what the ones before leave unexplained of the kernel's unit diagonal (Chen, Epperly, Tropp and
+    Each is drawn by what the ones before do not capture of the kernel's unit diagonal (Chen, Epperly, Tropp and
     Webber, 2022). Patches that are rare but unlike all others get a landmark, which a uniform draw would miss, and
     k-means would never move one there. The fourth power is greedier than the residual itself: at h_y = 40/255 the
     error of W y on the small astronaut of benchmarks.accuracy is 0.55 grey levels with it, 0.79 with the first power,
@@ -152,7 +152,7 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         offsets = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points.device)
         images = points.split(1) if points.device.type == "cpu" else [points]  # columns of one at a time
         return torch.cat([_pivots_by_blocks(image, draws, offsets) for image in images])
-    return pivots(points, draws, EXPLAINED)
+    return pivots(points, draws, CAPTURED)
 
 
 def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
     for block, offset in zip(draws.split(BLOCK), offsets, strict=False):
         first = sum(pivot.shape[2] for pivot in found)
         before = columns[:, :first]
-        odds = chance(residual, EXPLAINED)
+        odds = chance(residual, CAPTURED)
         odds += odds.mean(2, keepdim=True)
         summed = odds.cumsum(2, dtype=torch.float64)
         ticks = (torch.arange(PROPOSED * len(block), device=points.device) + offset) / (PROPOSED * len(block))
@@ -178,7 +178,7 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
         few, lengths, known = (pick(planes, proposed) for planes in (points, norms, before))
         shared = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
         chosen, rows, scales = draw_pivots(
-            partial(_row, shared), pick(residual, proposed), pick(odds, proposed), block, EXPLAINED
+            partial(_row, shared), pick(residual, proposed), pick(odds, proposed), block, CAPTURED
         )
         found.append(proposed.gather(2, chosen))  # (B, 1, n)
         few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))

@@ -138,12 +138,12 @@ def _quasi_newton(
 ) -> Solution:
     """Newton's method with the Jacobian of a sample, updated by what the sweeps show of the true one (BFGS)."""
     watched = factor.device.type == "cpu"
-    marks, pixels = factor.shape[1:]
-    least, usual, most = (bound * marks // among.size for bound in PER_LANDMARK)
+    landmarks, pixels = factor.shape[1:]
+    least, usual, most = (bound * landmarks // among.size for bound in PER_LANDMARK)
     count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // among.size), least)
     total = _guess(factor, diagonal, among, weights)
     scaling, found = _sweep(factor, diagonal, total, among, weights)
-    worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), marks, marks)
+    worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), landmarks, landmarks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         before, error = total, total - found
         if gain > ROUGH if watched else sweeps < 3:

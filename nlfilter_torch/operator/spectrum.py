@@ -57,8 +57,8 @@ class RitzPairs:
 
     @staticmethod
     def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
-        """From the sums that :func:`whiten_gram` takes."""
-        root, inner, ranks = whiten_gram(grams, dtype)
+        """From the sums that :func:`rayleigh_ritz` takes."""
+        root, inner, ranks = rayleigh_ritz(grams, dtype)
         ritz = SymmetricMatrix.of(inner)
         ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
         return RitzPairs(ritz, root, torch.arange(inner.shape[1], device=inner.device) < ranks.unsqueeze(1))
@@ -230,7 +230,7 @@ def compute_spectrum(
     )
 
 
-def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+def rayleigh_ritz(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
     """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels and nothing else.
 
     Args:

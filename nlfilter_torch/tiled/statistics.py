@@ -21,7 +21,7 @@ from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
-from nlfilter_torch.operator.spectrum import whiten_gram
+from nlfilter_torch.operator.spectrum import rayleigh_ritz
 
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
 MAX_PASSES = 12
@@ -119,7 +119,7 @@ class Sums:
 
     def explained(self) -> Tensor:
         """The coefficients (1, M, C) of ``V V^T y``."""
-        root = whiten_gram(self.grams[:, :2], self.dtype)[0]
+        root = rayleigh_ritz(self.grams[:, :2], self.dtype)[0]
         return root @ root @ self.moments[:, 0]
 
 
