@@ -180,7 +180,7 @@ def spectral_filter(
 
     Returns:
         (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
-        ``response``, with a finite gradient where eigenvalues meet.
+        ``response``, with a finite gradient where eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size,

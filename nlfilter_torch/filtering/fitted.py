@@ -37,8 +37,8 @@ class FittedFilter:
 
     Attributes:
         kernel: landmarks, bandwidths and window.
-        balancing: determines the scaling of a pixel.
-        moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
+        balancing: computes the scaling of a pixel.
+        moments: of the images ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
         captured: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
     """
 
@@ -62,8 +62,8 @@ class FittedFilter:
             image: (B, C, H, W), with the channels of the fitted image.
             guide: (B, C', H, W), with the channels of the fitted guide; None is the image.
             origin: row and column of the first pixel, for tiles of the fitted image.
-            halo: rows at the top and at the bottom of a tile that only complete the patches of the others: half a
-                patch, or fewer at the border of the picture. The result does not contain them.
+            halo: rows at the top and at the bottom of a tile that patches reach into but that the result does not
+                contain: half a patch, or fewer at the border of the picture.
 
         Raises:
             TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.

@@ -12,7 +12,7 @@ from nlfilter_torch.operator.spectrum import Spectrum
 FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined
 STEEPEST = 1e30  # limit of pixels / width: a distance of 0 never becomes NaN
 CAPTURED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
-LOOKED_AT = 4096  # pixels of a region that are checked
+CHECKED = 4096  # most pixels of a region that are compared with the landmarks
 ITERATIONS = 20  # of k-means, which starts close to the solution
 
 
@@ -25,7 +25,7 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
 
     Args:
         spectrum: of the operator.
-        time: t > 0; larger values keep only the coarse structure, so that edits reach further.
+        time: t > 0; larger values keep only coarse structure, so that edits extend further.
 
     Returns:
         (B, R-1, H, W). Differentiable, with the limits of :attr:`Spectrum.eigenvectors`.
@@ -56,7 +56,7 @@ def diffusion_mask(
     Args:
         spectrum: of the operator.
         region: (B, K, H, W), non-negative weights of the pixels of K regions.
-        time: diffusion time t > 0, a number or a tensor of shape () or (B,); larger reaches further.
+        time: diffusion time t > 0, a number or a tensor of shape () or (B,); with larger values masks extend further.
         width: squared distance at which the mask has fallen to 1/e, likewise.
         negative: (B, 1 or K, H, W), weights of pixels that the mask avoids: it is halved where a pixel is as close to
             them as to the region, and smaller where it is closer to them. None is no such region.
@@ -64,7 +64,7 @@ def diffusion_mask(
     Returns:
         (B, K, H, W) in (0, 1], in the region's dtype (float16 rounds the least to 0); without ``negative`` it grows
         with time at every pixel.
-        Differentiable in operator, regions, time and width, also where eigenvalues meet.
+        Differentiable in operator, regions, time and width, also where eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if a region does not fit, is negative or empty, or ``time`` or ``width`` is not positive.
@@ -100,13 +100,13 @@ def diffusion_mask(
 
 @torch.no_grad()
 def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
-    """Warn of a region (B, K, N) unlike all landmarks: all pixels the landmarks do not capture have coordinates 0."""
+    """Warn of a region (B, K, N) unlike all landmarks: such pixels all have the diffusion coordinates 0."""
     if is_hidden(weights):
         return
     for columns, regions in zip(spectrum.factor, weights.expand(len(spectrum.factor), -1, -1), strict=True):
         for number, region in enumerate(regions):
             places = region.nonzero().squeeze(1)
-            few = places[:: 1 + len(places) // LOOKED_AT]
+            few = places[:: 1 + len(places) // CHECKED]
             if len(few) > 0 and columns[:, few].square().sum(0).mean() < CAPTURED:
                 warn(
                     f"region {number} is like no landmark, so its mask may take in other pixels like none; "

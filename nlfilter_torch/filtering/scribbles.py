@@ -60,7 +60,7 @@ def propagate_strokes(
 
     Returns:
         (B, C, H, W) in the dtype of ``strokes``. Linear in ``strokes``; at strength 1 a constant comes back as itself.
-        Differentiable in operator, strokes, mask and parameters, also where eigenvalues meet.
+        Differentiable in operator, strokes, mask and parameters, also where eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if sizes or batches differ, ``stroke_mask`` exceeds [0, 1] or is empty, or a parameter
@@ -192,9 +192,9 @@ def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
 class EffectiveWeights:
     """Effective weights of scribbled pixels.
 
-    A single dot must not be outweighed by broad scribbles or by the size of the photograph: pixels similar to few other
-    scribbled ones count for up to a whole dab. The part of a pixel that the landmarks do not capture says nothing about
-    other pixels, so pixels unlike all others have little weight.
+    So that broad scribbles or a large photograph do not outweigh a single dot, pixels similar to few other scribbled
+    pixels count for up to a whole dab. The part of a pixel that the landmarks do not capture carries no information
+    about other pixels, so pixels unlike all others have little weight.
 
     Attributes:
         core: X, (B, M, M).
@@ -210,7 +210,7 @@ class EffectiveWeights:
 
     @staticmethod
     def of(painted: ScribbledBlocks, half: Tensor, dab: float, among: Communicator) -> "EffectiveWeights":
-        """From a pass over the scribbled pixels."""
+        """From sums over the scribbled pixels."""
         gram, residual, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
@@ -230,8 +230,8 @@ class EffectiveWeights:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
         # The sum of squared correlations with the scribbled pixels.
-        likes = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
-        return weights * (self.dab / likes.clamp(min=1.0)).clamp(min=1.0)
+        similar = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
+        return weights * (self.dab / similar.clamp(min=1.0)).clamp(min=1.0)
 
 
 def diagonal_residual(factor: Tensor) -> Tensor:

@@ -22,7 +22,10 @@ from nlfilter_torch.operator.damped_newton import damped
 from nlfilter_torch.operator.scaling import moment_of
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}  # a residual that is worth a warning, unless it was asked for
+ALARM = {
+    torch.float32: 1e-4,
+    torch.float64: 1e-9,
+}  # larger residuals raise a warning, unless the tolerance allows them
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Balancing:
         scaling: d, (B, N), positive; differentiable in factor and diagonal.
         moment: ``factor @ d``, (B, M, 1) in float64, without a gradient.
         residual: largest deviation of a row sum of W from 1, (B,).
-        steps: sweeps over the factor that it took.
+        steps: number of sweeps over the factor.
     """
 
     scaling: Tensor
@@ -56,11 +59,11 @@ def balance(
     Args:
         factor: (B, M, N).
         diagonal: (B, N), non-negative.
-        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a residual
-            that ends above it and above 1e-4 (1e-9 in float64) raises a warning.
-        completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
+        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a final
+            residual above it and above 1e-4 (1e-9 in float64) raises a warning.
+        completed: whether K has a unit diagonal and no negative entries but for errors; a faster method then applies.
         among: ranks that the rows of the image are spread over.
-        weights: how many equal pixels each point stands for, (B, N), a constant; None is one each.
+        weights: number of equal pixels that each point stands for, (B, N), a constant; None is one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
     scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, among, weights)  # type: ignore[no-untyped-call]
@@ -87,12 +90,13 @@ def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:
 class _Balance(torch.autograd.Function):
     """Implicit differentiation of ``log d + log(K d) = 0``.
 
-    ``(I + W) d(log d) = -diag(d) dK d``, so with ``(I + W) x = d * g`` and ``a = d * x`` the loss changes by ``-a^T dK
-    d``: its gradient is ``-(z a^T + s d^T)`` in the factor, z = factor d, s = factor a, and ``-a d`` in the diagonal.
+    Differentiated, ``(I + W) d(log d) = -diag(d) dK d``. With g the gradient of the loss in d, ``(I + W) x = d * g``
+    and ``a = d * x``, the loss changes by ``-a^T dK d``. Its gradient is ``-(z a^T + s d^T)`` in the factor, with
+    z = factor d and s = factor a, and ``-a d`` in the diagonal.
 
     With r = d^2 c the equation reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, which solves a system of
-    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`; the estimate of its inverse
-    that balancing leaves behind preconditions conjugate gradients.
+    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`. Conjugate gradients solve it,
+    preconditioned by the approximate inverse of J from balancing.
     """
 
     @staticmethod

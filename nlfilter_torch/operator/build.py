@@ -36,7 +36,7 @@ from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.scaling import PixelScaling, isolated, moment_of, row_sums
 
-ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
+ROUNDS = 8  # most rounds in which isolated pixels are removed; one or two are usual
 
 
 def check_options(
@@ -48,7 +48,7 @@ def check_options(
     generator: torch.Generator | None,
     guide_channels: str = "all",
 ) -> None:
-    """Raise unless those options of :func:`nonlocal_operator` are right that can be checked without its guide."""
+    """Check the options of :func:`nonlocal_operator` that do not depend on its guide."""
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     remedy = "choose one of these, and pass how many there are as num_landmarks"
     check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
@@ -89,7 +89,7 @@ def nonlocal_operator(
 
     Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
     autocast too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks
-    (for k-means, the assignment of pixels to centroids) held.
+    (for k-means, the assignment of pixels to centroids) held fixed.
 
     Args:
         guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
@@ -101,18 +101,18 @@ def nonlocal_operator(
         spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
-        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method,
-            which fails at small bandwidths.
+        completion: ``"diagonal"`` corrects the diagonal of the kernel to 1; ``"none"`` is the paper's method, which
+            fails at small bandwidths.
         guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides
             of another number of channels are taken whole.
         patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
         tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
         generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
             never used.
-        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
-            this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
-            process would, for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, which
-            ``torch.distributed.group.WORLD`` is as well before there is one, is the whole image here.
+        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is the
+            rows of this rank, from the top of the image down. All ranks make the same calls, and get the results of one
+            process for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, or
+            ``torch.distributed.group.WORLD`` before it is initialised, means that the whole image is here.
 
     Returns:
         The operator, with row sums of 1 to ``tolerance`` or to rounding.
@@ -190,13 +190,13 @@ def operator_from_features(
     generator: torch.Generator | None = None,
     group: Any = None,
 ) -> NonlocalOperator:
-    """The filter of any points, given what is compared: landmarks, Nystrom factor, completion and balancing.
+    """The filter of any points, given their features: landmarks, Nystrom factor, completion and balancing.
 
     Points may be the pixels of an image, every n-th of them, a weighted sample, the voxels of a volume, a point cloud.
     :func:`nonlocal_operator` is this function on the weighted patches of a guide.
 
     Args:
-        features: (B, D, N), for which the affinity of two points is ``exp(-|x_i - x_j|^2)``: divide them by bandwidths.
+        features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
         size: (H, W) with H * W = N, the shape of images that are filtered; (N,), which is (1, N), for points in no
             order.
         weights: (N,) or (B, N), positive: how many equal pixels each point stands for. Landmarks are drawn in
@@ -206,7 +206,7 @@ def operator_from_features(
         completion: see there.
         tolerance: see there.
         generator: see there.
-        group: see there; ``features`` and ``size`` are then what this rank has of whole rows.
+        group: see there; ``features`` and ``size`` are then of the rows of this rank.
 
     Returns:
         The operator. Differentiable once in the features.
@@ -260,7 +260,7 @@ def assemble(
     weights: Tensor | None = None,
     among: Communicator = ALONE,
 ) -> NonlocalOperator:
-    """The one way from features (B, D, N) to an operator; ``recipe`` is how they came from a guide, if they did."""
+    """Features (B, D, N) to operator; ``recipe`` says how they were computed, if they come from a guide."""
     whole = among.whole(size)
     points = whole[0] * whole[1]
     if num_landmarks > points:

@@ -23,10 +23,10 @@ def damped(
 ) -> Solution:
     """Balance from any start until the residual is at most ``goal``, or does not fall any more.
 
-    A balanced d is the one minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
-    whatever the signs of its entries. With d changing by ``s d x`` the step x solves ``(I + W) x = 1 - W 1``, a system
-    of M equations with the Jacobian J of all pixels. Along x the function is a quadratic and a sum of logarithms, whose
-    minimum takes no further read of the factor.
+    A balanced d is the only minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
+    even if entries of K are negative. If d changes by ``s d x``, the step x solves ``(I + W) x = 1 - W 1``, a system of
+    M equations with the Jacobian J of all pixels. Along x the function is a quadratic and a sum of logarithms, whose
+    minimum is found without reading the factor again.
     """
     tiny = torch.finfo(factor.dtype).tiny
     usable = start.scaling.isfinite() & (start.scaling > 0)

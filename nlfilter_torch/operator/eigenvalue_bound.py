@@ -17,7 +17,7 @@ from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator.spectrum import compute_grams
 
-# By which rounding and the tolerance of row sums may exceed 1: more than the r of a pixel that is not isolated.
+# By how much eigenvalues may exceed 1 through rounding and inexact row sums; r of a pixel exceeds 1 by less.
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}
 MAX_STEPS = 12
 ALWAYS = 1 << 22  # numbers of a factor; up to here the bound takes a few milliseconds

@@ -1,8 +1,8 @@
-"""The recipe of a fitted operator: all that it takes to compute the columns of points it has not seen.
+"""Guide to features, and features to columns of the factor, for pixels that the operator was not built from.
 
-A pixel's column of the factor is a function of its own patch and of the landmarks; its scaling is a closed form of
-that column and of one m-vector. Tiles of an image that fits no memory, rows on another machine and the other frames of
-a film are therefore exact, without seams and without flicker, as long as landmarks and moments are shared.
+A pixel's column of the factor is a function of its own patch and of the landmarks; its scaling follows from that column
+and one m-vector. Tiles of a large image, rows on another machine and other frames of a film therefore get exact
+columns, without seams or flicker, if they share landmarks and moments.
 """
 
 from dataclasses import dataclass
@@ -37,9 +37,9 @@ class GuideFeatures:
         Args:
             guide: with the channels of the guide that the landmarks come from.
             origin: row and column of its first pixel in the coordinates of that guide, for tiles.
-            halo: rows at the top and at the bottom of a tile that only patches reach into; they get no features. Half
-                a patch, or as many as there are before the border of the whole guide.
-            stride: n, for the pixel in the middle of each square of n x n pixels alone, with its patch of the guide.
+            halo: rows at the top and at the bottom of a tile that patches reach into but that get no features: half a
+                patch, or fewer at the border of the whole guide.
+            stride: n, for features of only the pixel in the middle of each square of n x n pixels.
         """
         return extract_features(
             reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels),

@@ -1,4 +1,4 @@
-"""Features to landmarks, the few points through which every affinity passes. Paper: Sec. II-C, set A."""
+"""Features to landmarks, the few points that all affinities are computed from. Paper: Sec. II-C, set A."""
 
 from functools import partial
 from typing import Literal
@@ -11,9 +11,9 @@ from nlfilter_torch.core.kernels.clusters import affinities_between, chance, dra
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
-CAPTURED = 1e-4  # a residual of the unit diagonal below which a point counts as captured
+CAPTURED = 1e-4  # a point with a residual below this on the unit diagonal counts as captured
 # More features or iterations move the centroids by less than their sampling error: at 512x400 pixels and m = 100, twice
-# as many features lower the mean diagonal, what the landmarks miss, by at most 2 %; ten iterations by at most 3 %.
+# as many features lower the mean diagonal correction by at most 2 %; ten iterations by at most 3 %.
 PER_LANDMARK = 64
 STARTED_FROM = 32  # of them; more do not lower the error of W y
 # Without bounds the cost would be quadratic in the number of landmarks. At 256x256 and m = 1000, 16384 candidates raise
@@ -47,9 +47,9 @@ def choose_landmarks(
         count: M, at most N. With M = N the landmarks are the pixels themselves.
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
-        generator: source of randomness; None seeds a new one with 0, so that equal calls give equal landmarks.
-        among: ranks that the rows of the image are spread over; N is then the pixels here, and all ranks use what the
-            first one draws.
+        generator: source of randomness; None is a new one with seed 0, so that equal calls give equal landmarks.
+        among: ranks that the rows of the image are spread over; N is then the number of pixels here, and all ranks use
+            what the first one draws.
         weights: (B, N), how many pixels each point stands for: candidates of k-means are drawn in proportion to them.
 
     Returns:
@@ -69,7 +69,7 @@ def choose_landmarks(
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
-    """Indices of the pixels whose features :func:`condense` makes ``count`` landmarks of, all different."""
+    """Indices of distinct pixels, from whose features :func:`condense` computes ``count`` landmarks."""
     pixels = size[0] * size[1]
     if count == pixels:
         return torch.arange(pixels)

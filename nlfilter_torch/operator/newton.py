@@ -1,14 +1,14 @@
 """Balancing by Newton's method on the moment ``t = factor @ d``, with the Jacobian of a sample of the pixels.
 
-Given t, a pixel's equation ``d (u . t + c d) = 1`` is a quadratic with one positive root d(t), so M numbers are all
-that is unknown: ``t = sum_i u_i d_i(t)``. The Jacobian of ``t - sum_i u_i d_i(t)`` is symmetric,
+Given t, a pixel's equation ``d (u . t + c d) = 1`` is a quadratic with one positive root d(t), so the M entries of t
+are the only unknowns: ``t = sum_i u_i d_i(t)``. The Jacobian of ``t - sum_i u_i d_i(t)`` is symmetric,
 
-    J = I + sum_i w_i u_i u_i^T,    w = d^2 / (1 + c d^2),
+    J = I + sum_i p_i u_i u_i^T,    p = d^2 / (1 + c d^2),
 
-with its spectrum in [1, 2] at the solution. It costs as much as 14 sweeps over the factor, its sum over a sample next
-to nothing. Pixels enter the sample in proportion to ``w |u|^2``, their leverage, so that the rare ones, which a uniform
-sample misses and which converge last, are in it: on photographs of a megapixel each sweep then gains a factor of 10 to
-100, where Chebyshev's iteration gains 5.8.
+with a spectrum in [1, 2] at the solution. Over all pixels the sum costs as much as 14 sweeps over the factor, over a
+sample almost nothing. Pixels are sampled in proportion to their leverage score ``p |u|^2``, because rare pixels, which
+a uniform sample misses, converge last. On photographs of a megapixel each sweep then reduces the error by a factor of
+10 to 100; Chebyshev's iteration reduces it by 5.8.
 """
 
 from dataclasses import dataclass
@@ -25,28 +25,28 @@ from nlfilter_torch.operator.conjugate_gradients import conjugate_gradients
 from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import Solution, largest_magnitude, row_sums, scaling_from_moment
 
-PER_LANDMARK = (8, 32, 160)  # pixels of the sample: its Jacobian is then within 35, 18 or 8 % of the true one
-EXPLORED = 8192  # pixels that the first guess comes from, at most
-SHARE = 8  # the part of the pixels that either is, between these bounds
-LARGE = 64  # the part that the sample is at least: larger images have rarer pixels
-GUESSES = 3  # steps of the first guess towards its fixed point; more gain nothing for pixels outside its sample
-REFINEMENTS = 3  # steps of Newton's method on the sample; after two the Jacobian still changes
-UNIFORM = 0.05  # of the sample is drawn uniformly, so that no pixel of it stands for more than 20 times its share
+PER_LANDMARK = (8, 32, 160)  # sampled pixels at least, usually and at most: the Jacobian is then within 35, 18 or 8 %
+EXPLORED = 8192  # most pixels that the first guess is computed from
+SHARE = 8  # one of so many pixels is sampled, within these bounds
+LARGE = 64  # at least one of so many pixels is sampled: larger images have rarer pixels
+GUESSES = 3  # fixed-point steps of the first guess; more do not help pixels outside its sample
+REFINEMENTS = 3  # steps of Newton's method on a sample; after two the Jacobian still changes
+UNIFORM = 0.05  # part of the sample that is drawn uniformly, so that a pixel stands for at most 20 times its share
 LARGEST = 2.0  # bounds d while t is a guess; a larger d is left to the damped method
 MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
-ROUGHLY = 1e-6  # residual of a first solution in float32
-ROUGH = 0.2  # a sweep that gains less than a factor of five asks for another sample
+FIRST_TOLERANCE = 1e-6  # of the solution in float32 that one in float64 starts from
+RESAMPLED = 0.2  # after a sweep that reduces the error by less than a factor of five, another sample is drawn
 
 
 @dataclass(frozen=True)
 class JacobianSample:
-    """Pixels that stand for the image.
+    """A weighted sample of the pixels, from which the Jacobian is computed.
 
     Attributes:
         factor: their columns, (B, M, n).
         diagonal: (B, n).
-        weight: how many pixels each stands for, (B, n).
+        weight: number of pixels that each stands for, (B, n).
         among: ranks, each with a sample of its rows.
     """
 
@@ -80,7 +80,7 @@ class JacobianSample:
 def _draw(
     factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, among: Communicator, weights: Tensor | None
 ) -> tuple[JacobianSample, Tensor]:
-    """A systematic sample in proportion to leverage, and its part of ``scaling``, (B, n)."""
+    """A systematic sample in proportion to leverage scores, and its part of ``scaling``, (B, n)."""
     if 2 * count >= factor.shape[2]:
         return JacobianSample(factor, diagonal, weighted(torch.ones_like(diagonal), weights), among), scaling
     slope = scaling.square()
@@ -96,12 +96,12 @@ def _draw(
 
 
 def _guess(factor: Tensor, diagonal: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
-    """A first t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
+    """A first guess of t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
     pixels = factor.shape[2]
     few, rest, each = factor, diagonal, weighted(torch.ones_like(diagonal), weights)
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
-        # One at random from every stretch: a fixed stride would meet the periods of a texture.
+        # One pixel at random from each stretch: a fixed stride could coincide with the period of a texture.
         chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
         few, rest = factor.gather(2, chosen.expand(*factor.shape[:2], -1)), diagonal[:, chosen]
         each = each[:, chosen] * (each.sum(1, keepdim=True) / each[:, chosen].sum(1, keepdim=True))
@@ -136,7 +136,7 @@ def solve(
 def _quasi_newton(
     factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator, weights: Tensor | None
 ) -> Solution:
-    """Newton's method with the Jacobian of a sample, updated by what the sweeps show of the true one (BFGS)."""
+    """Newton's method with the Jacobian of a sample, corrected by BFGS updates from the sweeps over all pixels."""
     watched = factor.device.type == "cpu"
     landmarks, pixels = factor.shape[1:]
     least, usual, most = (bound * landmarks // among.size for bound in PER_LANDMARK)
@@ -146,14 +146,15 @@ def _quasi_newton(
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), landmarks, landmarks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         before, error = total, total - found
-        if gain > ROUGH if watched else sweeps < 3:
+        if gain > RESAMPLED if watched else sweeps < 3:
             sample, part = _draw(factor, diagonal, scaling, count, among, weights)
-            # The sample foretells how the moment changes with t; its value here is known, so is the sample's error.
+            # The sample predicts how the moment changes with t. The true moment at the current t is known, and so the
+            # error of the sample there, which is subtracted.
             bias = found - sample.moment(part)
             total = found
             for _ in range(REFINEMENTS):
                 part = sample.scaling(total)
-                # J is positive definite; its Cholesky factor, unlike batched LU in MKL, withstands several threads.
+                # J is positive definite. Cholesky is safe with several threads; batched LU of MKL is not.
                 lower = torch.linalg.cholesky_ex(sample.jacobian(part)).L
                 total = total - torch.cholesky_solve(total - sample.moment(part) - bias, lower)
             inverse = torch.cholesky_inverse(lower)
@@ -178,9 +179,9 @@ def _quasi_newton(
 def _refined(
     factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator, weights: Tensor | None
 ) -> Solution:
-    """A solution in float64, by steps worked out from the factor in float32, for which there are kernels in C."""
+    """A solution in float64, whose steps are computed from the factor in float32 by the kernels in C."""
     single, each = factor.float(), None if weights is None else weights.float()
-    rough = _quasi_newton(single, diagonal.float(), max(tolerance, ROUGHLY), among, each)
+    rough = _quasi_newton(single, diagonal.float(), max(tolerance, FIRST_TOLERANCE), among, each)
     total, sweeps = rough.moment, rough.sweeps
     for _ in range(MAX_SWEEPS):
         scaling, found = _sweep(factor, diagonal, total, among, weights)
@@ -197,14 +198,14 @@ def _refined(
 def _measure(
     factor: Tensor, diagonal: Tensor, scaling: Tensor, total: Tensor, found: Tensor, among: Communicator
 ) -> tuple[Tensor, Tensor]:
-    """Largest deviation of a row sum from 1, (B,): as measured, and as d = d(total) would have it without rounding."""
+    """Largest deviation of a row sum from 1, (B,): with the rounding of d = d(total), and without it."""
     rows = spread(torch.cat([found, total - found], dim=2).to(factor).mT, factor)  # (B, 2, N): one read of the factor
     sums = scaling * (rows[:, 0] + diagonal * scaling)
     return largest_magnitude(sums - 1, among), largest_magnitude(scaling * rows[:, 1], among)
 
 
 def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """BFGS: an inverse (B, M, M) that takes the change of ``t - factor @ d(t)`` (B, M, 1) to the step in t."""
+    """BFGS update of the inverse (B, M, M): it then maps ``change``, of ``t - factor @ d(t)``, to ``step``, of t."""
     curvature = (step * change).sum(1, keepdim=True)  # positive, as the Jacobian is
     rho = torch.where(curvature > 0, 1 / curvature, torch.zeros_like(curvature))
     moved = inverse @ change

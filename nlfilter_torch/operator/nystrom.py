@@ -15,9 +15,7 @@ from nlfilter_torch.core.kernels.columns import columns, columns_backward
 
 Completion = Literal["diagonal", "none"]
 
-JITTER = (
-    1e-5  # of the landmark block's diagonal; the inverse Cholesky factor then multiplies rounding errors by at most 316
-)
+JITTER = 1e-5  # added to the landmark block; the inverse Cholesky factor then amplifies rounding at most 316 times
 
 
 def inverse_cholesky(landmarks: Tensor) -> Tensor:

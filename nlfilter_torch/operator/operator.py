@@ -28,7 +28,7 @@ DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """What an operator knows of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i and j are one.
+    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
 
     Attributes:
         factor: u, (B, M, n).
@@ -43,20 +43,20 @@ class Columns:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Figures that tell how good an operator is; those of shape (B,) are lists with one entry per image.
+    """Measures of the quality of an operator; lists have one entry per image.
 
     Attributes:
         pixels: N.
         num_landmarks: M.
-        rank: eigenvectors that rise above rounding.
+        rank: number of eigenvectors above rounding.
         photometric_bandwidth: h_y in units of the guide; 1 for an operator that was made from features.
-        balancing_steps: sweeps over the factor that balancing took.
+        balancing_steps: number of sweeps over the factor in balancing.
         row_sum_residual: largest deviation of a row sum from 1.
-        smallest_row_sum: the least row sum of the kernel before balancing; the plain method fails as it nears zero.
+        smallest_row_sum: smallest row sum of the kernel before balancing; without completion W fails as it nears zero.
         largest_eigenvalue: an upper bound, as :meth:`NonlocalOperator.certify` has it.
         eigenvector_residual: largest ||W v - lambda v|| over the unit eigenvectors.
         orthogonality: largest deviation of V V^T from the identity.
-        diagonal_share: mean of the diagonal part r of W: how much of a pixel the landmarks leave to itself.
+        diagonal_share: mean of the diagonal part r of W, the weight with which a pixel keeps its own value.
     """
 
     pixels: int
@@ -74,7 +74,7 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What an operator keeps of its promises, measured; lists with one entry per image.
+    """Measured properties of an operator; lists have one entry per image.
 
     Attributes:
         symmetry: difference of ``x^T W y`` and ``y^T W x`` for random images x and y, relative to their lengths.
@@ -100,16 +100,16 @@ class NonlocalOperator:
 
     Attributes:
         factor: U, (B, M, N), pixels last.
-        diagonal: c, (B, N), what the landmarks miss of the kernel's unit diagonal; zeros without completion.
+        diagonal: c, (B, N), the diagonal correction that gives the kernel its unit diagonal; zeros without completion.
         scaling: d, (B, N), positive.
         size: (H, W).
-        kernel: the recipe of factor and diagonal, for the pixels of other guides.
+        kernel: computes factor and diagonal of the pixels of other guides.
         remainder: r, (B, N), the diagonal part of W.
         weights: how many pixels each point stands for, (B, N); None is one each. ``W y`` is then
             ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points stand for.
-        balancing: what the scaling of other pixels is a function of.
+        balancing: computes the scaling of other pixels.
         residual: largest deviation of a row sum of W from 1, (B,).
-        balancing_steps: sweeps over the factor that balancing took.
+        balancing_steps: number of sweeps over the factor in balancing.
         among: ranks that the rows of the image are spread over; all attributes are then of the rows here.
     """
 
@@ -126,7 +126,7 @@ class NonlocalOperator:
     among: Communicator = ALONE
 
     def at(self, features: Tensor) -> Columns:
-        """What W knows of any points: their columns, as functions of their own features and of sums over the image.
+        """The columns of any points, computed from their own features and from sums over the image.
 
         Args:
             features: (B, D, n), of points of the image or of another one, with the meaning and scale of the features
@@ -169,11 +169,11 @@ class NonlocalOperator:
 
     @property
     def diagonal_share(self) -> Tensor:
-        """What W takes of a pixel's own value for want of pixels like it, r in [0, 1] as (B, 1, H, W)."""
+        """The weight r in [0, 1] with which a pixel keeps its own value where few pixels are similar, (B, 1, H, W)."""
         return self.remainder.unflatten(1, self.size).unsqueeze(1)
 
     def row_sums(self) -> Tensor:
-        """(B, 1, H, W), one everywhere to :attr:`residual`."""
+        """Row sums of W, (B, 1, H, W): one everywhere, with an error of at most :attr:`residual`."""
         batch = self.factor.shape[0]
         return self.matmul(self.factor.new_ones(batch, 1, *self.size))
 
@@ -212,7 +212,7 @@ class NonlocalOperator:
     @full_precision
     @torch.no_grad()
     def certify(self) -> "Certificate":
-        """Measure whether W is what it promises to be, for the price of a spectrum's Gram matrix and three products.
+        """Measure symmetry, row sums and eigenvalue bounds of W, at the cost of a Gram matrix and three products.
 
         Example:
             >>> from nlfilter_torch import nonlocal_operator
@@ -242,7 +242,7 @@ class NonlocalOperator:
     @full_precision
     @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
-        """Measure how good the operator is. Costs several times as much as the spectrum."""
+        """Measure the quality of the operator. Costs several times as much as the spectrum."""
         spectrum, certificate = self.spectrum(), self.certify()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]

@@ -29,11 +29,11 @@ def apply_powers(
         image: y, (B, C, N).
         order: k, at least 1.
         among: ranks that the rows of the image are spread over.
-        weights: how many equal pixels each point stands for, (B, N); None is one each.
+        weights: number of equal pixels that each point stands for, (B, N); None is one each.
 
     Returns:
-        (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
-        as the operator needs no gradient.
+        (B, k, C, N). Differentiable in everything. If the operator needs no gradient, differentiable any number of
+        times in the image, and in forward mode.
     """
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, among, weights)  # type: ignore[no-untyped-call]
@@ -51,7 +51,7 @@ def _powers(
     among: Communicator,
     weights: Tensor | None,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """The k + 1 images from y to W^k y, and the k moments (B, M, C) that they passed through."""
+    """The k + 1 images from y to W^k y, and the k moments (B, M, C) of the images from y to W^(k-1) y."""
     images, moments = [image], []
     each = weighted(scaling, weights)
     for _ in range(order):
@@ -62,7 +62,7 @@ def _powers(
 
 
 class _Powers(torch.autograd.Function):
-    """All products share one gradient of the factor: a single matrix product, where autograd would write 2k full ones.
+    """All products share one gradient of the factor, a single matrix product; autograd would form 2k full matrices.
 
     With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W^T A_i`` backwards, the loss changes by ``sum_i A_i^T dW
     P_(i-1)``. Weights are on the right of W: they multiply its columns.

@@ -23,10 +23,10 @@ class Solution:
 
     Attributes:
         scaling: d, (B, N), positive.
-        moment: ``factor @ d``, (B, M, 1) in float64.
-        residual: largest deviation of a row sum of this very scaling from 1, (B,).
-        sweeps: over the factor.
-        inverse: of J, to a few per cent, (B, M, M) in float64.
+        moment: t of this scaling, (B, M, 1) in float64.
+        residual: largest deviation of a row sum from 1 with this scaling, (B,).
+        sweeps: number of sweeps over the factor.
+        inverse: approximate inverse of the Jacobian J, (B, M, M) in float64.
     """
 
     scaling: Tensor
@@ -39,8 +39,8 @@ class Solution:
 def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
     """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
 
-    A pixel's equation is ``d (u . total + diagonal d) = 1``. Its positive root is formed without cancellation whichever
-    sign ``u . total`` has; approximate affinities may be negative.
+    It is the positive root of ``d (u . total + diagonal d) = 1``, computed without cancellation. The sign of
+    ``u . total`` may be either, since approximate affinities may be negative.
     """
     return positive_root(spread((total / 2).mT, factor).squeeze(1), diagonal)
 
@@ -56,28 +56,28 @@ def row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor, found: Tensor) -
 
 
 def largest_magnitude(values: Tensor, among: Communicator) -> Tensor:
-    """Largest magnitude among values (B, N), (B,); infinite where one is not finite."""
+    """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of them is not finite."""
     return among.max(values.abs().nan_to_num(nan=torch.inf).amax(1))
 
 
 def isolated(scaling: Tensor, residual: float) -> Tensor:
     """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
 
-    Their row of W reads ``d^2 + (the others) = 1``, so that d^2, itself an entry on the diagonal of W, exceeds 1, by
-    more than row sums that are off by ``residual`` do.
+    The diagonal entry of W is then d^2, and the other entries of the row sum to 1 - d^2, so d exceeds 1. It must do so
+    by more than ``residual``, the error of row sums.
     """
     return scaling > 1 + max(EXCESS[scaling.dtype], residual)
 
 
 @dataclass(frozen=True, eq=False)
 class PixelScaling:
-    """What the scaling of any pixel of a balanced image is a function of, beside the pixel's own column.
+    """The scaling of any pixel as a function of the pixel's own column.
 
     Attributes:
         moment: t, (B, M, 1).
         completed: the kernel has a unit diagonal.
         residual: largest deviation of a row sum from 1.
-        before: moments that found pixels to be isolated, before these were taken out.
+        before: moments at which pixels were found to be isolated and then removed, one for each round of balancing.
     """
 
     moment: Tensor

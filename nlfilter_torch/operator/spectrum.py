@@ -1,9 +1,8 @@
 """Operator to spectrum, by Rayleigh and Ritz in the span of the factor. Paper: Sec. II-A to II-C, eq. (3), (4).
 
-With ``F`` (M, N) the scaled factor, ``G = F F^T`` is m x m. The rows of ``G^(-1/2) F`` are orthonormal, and W seen by
-them is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. All of it lives in m x m matrices, in float64; pixels are
-touched twice: once for G, once to form or apply eigenvectors. No square root of a sampled block, no permutation of
-pixels.
+With ``F`` (M, N) the scaled factor and ``G = F F^T``, the rows of ``G^(-1/2) F`` are orthonormal, and W projected on
+their span is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. G and T are m x m matrices in float64. The pixels are
+read twice: once for G, and once to form or apply eigenvectors.
 """
 
 from collections.abc import Callable
@@ -31,9 +30,9 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
 
-# Directions of G below this are rounding.
+# Eigenvalues of G below this, relative to the largest, are rounding.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
-# Where the inverse eigenvalues of G sum to more, some are so small that sums in float32 cost orthogonality.
+# If the inverse eigenvalues of G sum to more, eigenvectors from sums in float32 are not orthogonal enough.
 WEAK = 3e3
 # Eigenvalues this close to 1 count as 1 when the constant vector is picked out of their eigenspace.
 CLUSTER = {torch.float32: 1e-3, torch.float64: 1e-8}
@@ -43,12 +42,12 @@ Response = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class RitzPairs:
-    """All that functions of W need beside the factor itself: sums over pixels, and no pixel.
+    """What functions of W need besides the factor: matrices that are sums over pixels.
 
     Attributes:
         ritz: T, (B, M, M), float64.
         root: G^(-1/2), (B, M, M), float64.
-        support: (B, M) bool, which of the eigenvalues of T count.
+        support: (B, M) bool, which eigenvalues of T are above rounding.
     """
 
     ritz: SymmetricMatrix
@@ -86,21 +85,21 @@ class RitzPairs:
 class Spectrum(RitzPairs):
     """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
 
-    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first asked for; filters and masks never
-    need them, since :meth:`gain` applies any f(W) through m x m matrices.
+    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first used. Filters and masks do not need
+    them, since :meth:`gain` applies any f(W) through m x m matrices.
 
     Attributes:
         eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
-            gradient is exact, also where they meet.
+            gradient is exact, also for repeated eigenvalues.
         ritz: T, (B, M, M), float64.
         root: G^(-1/2), (B, M, M), float64.
-        support: (B, M) bool, which of the eigenvalues of T count.
+        support: (B, M) bool, which eigenvalues of T are above rounding.
         factor: (B, M, N), before scaling.
         scaling: d, (B, N).
         size: (H, W).
         largest: the first eigenvalue before it was clamped to 1, (B,).
-        weights: how many pixels each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum over
-            points with these weights.
+        weights: number of pixels that each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum
+            over points with these weights.
         among: ranks that the rows of the image are spread over.
     """
 
@@ -121,7 +120,7 @@ class Spectrum(RitzPairs):
 
     @property
     def mass(self) -> Tensor:
-        """D times the weights of the points, (B, N), by which values are summed up."""
+        """The scaling d times the weights of the points, (B, N): the weights of sums over points."""
         return weighted(self.scaling, self.weights)
 
     @property
@@ -130,8 +129,8 @@ class Spectrum(RitzPairs):
 
         The first is the constant one as far as the landmarks span it (exactly so for W; without completion to the
         tolerance of the balancing), positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
-        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the
-        choice of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
+        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues are equal. Results that do not depend
+        on the choice of eigenvectors (:func:`spectral_filter`, masks) always have an exact gradient.
         """
         return self._recorded if torch.is_grad_enabled() and self.ritz.matrix.requires_grad else self._constant
 
@@ -142,7 +141,7 @@ class Spectrum(RitzPairs):
     @cached_property
     @torch.no_grad()
     def _constant(self) -> Tensor:
-        """Kept apart: who looks at the eigenvectors without a gradient must not take it from who needs it."""
+        """Cached apart from eigenvectors with a gradient, so that a call without gradients does not replace those."""
         return self._form(self.ritz.vectors)
 
     def _form(self, vectors: Tensor) -> Tensor:
@@ -155,9 +154,9 @@ class Spectrum(RitzPairs):
 
     @full_precision
     def coefficients(self, image: Tensor) -> Tensor:
-        """``F y``, all that a response needs to know of an image: one read of the factor.
+        """``F y``, the only thing that a response depends on in an image: one read of the factor.
 
-        Whoever tries several responses on one image, or learns one, keeps them: see :func:`spectral_filter`.
+        To apply several responses to one image, or to learn one, compute them once: see :func:`spectral_filter`.
 
         Args:
             image: y, (B, C, H, W).
@@ -193,7 +192,7 @@ class Spectrum(RitzPairs):
             mirror = target / target.norm(dim=1, keepdim=True).clamp(min=1e-12)
             mirror[:, :1] -= 1.0
             length = mirror.square().sum(1, keepdim=True).unsqueeze(2)
-            # However short the mirror is, the reflection in it keeps lengths; none at all is divided by something tiny.
+            # A reflection preserves lengths however short the mirror is; the clamp only avoids 0 / 0.
             reflection = (
                 2 * mirror.unsqueeze(2) * mirror.unsqueeze(1) / length.clamp(min=torch.finfo(length.dtype).tiny)
             )
@@ -231,11 +230,11 @@ def compute_spectrum(
 
 
 def rayleigh_ritz(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels and nothing else.
+    """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels.
 
     Args:
         grams: ``F F^T`` and, where W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
-        dtype: of the factor, whose rounding they hold.
+        dtype: of the factor, which determines their rounding error.
     """
     gram = SymmetricMatrix.of(grams[:, 0])
     kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
@@ -250,7 +249,7 @@ def compute_grams(
 ) -> Tensor:
     """:func:`sum_grams`, differentiable; ``exact`` works in float64."""
     recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else _exact_or_quick  # transforms of torch.func know no such class
+    sums = _Grams.apply if recorded else _exact_or_quick  # transforms of torch.func do not support such a class
     grams: Tensor = sums(factor, scaling, remainder, count, exact)
     return grams
 
