@@ -18,7 +18,7 @@ from PIL import Image
 
 from nlfilter_torch.cli import folders, main
 from nlfilter_torch.cli.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
-from nlfilter_torch.core.communicator import Ranks, connected_ranks
+from nlfilter_torch.core.ranks import Ranks, connected_ranks
 from nlfilter_torch.edits.presets import PRESETS
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
@@ -128,7 +128,7 @@ def test_shares_are_a_partition() -> None:
         shares = [Ranks(rank, size).share(items) for rank in range(size)]
         assert sorted(item for share in shares for item in share) == items
         assert max(map(len, shares)) - min(map(len, shares)) <= 1
-    assert Ranks(1, 3).gather("own") == ["own"]
+    assert Ranks(1, 3).all_gather("own") == ["own"]
 
 
 def meet_and_die(rank: str, word: str) -> None:
@@ -137,7 +137,7 @@ def meet_and_die(rank: str, word: str) -> None:
         if rank == "1":
             os._exit(9)
         try:
-            ranks.gather(word)
+            ranks.all_gather(word)
         except OSError as error:
             sys.stdout.write(str(error))
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels import columns, definitions_only, grams, sweeps
 from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
-from nlfilter_torch.operator.nystrom import whitener
+from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
 DERIVED = ("spread", "moment")
@@ -22,7 +22,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
     """Arguments of every operator, by its name."""
     features, landmarks = random(BATCH, SIZE, PIXELS).to(dtype), random(BATCH, SIZE, LANDMARKS, seed=1).to(dtype)
-    inputs = (features, landmarks, whitener(landmarks))
+    inputs = (features, landmarks, inverse_cholesky(landmarks))
     factor, norms = columns.columns(*inputs, limited=True)
     vector, rows = random(BATCH, LANDMARKS, seed=2).to(dtype), random(BATCH, ROWS, LANDMARKS, seed=3).to(dtype)
     images = random(BATCH, ROWS, PIXELS, seed=4).to(dtype)

@@ -14,7 +14,7 @@ from nlfilter_torch.operator.landmarks import (
     choose_landmarks,
     condense,
 )
-from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from tests.images import hard_images, photograph
 
 HEIGHT, WIDTH = 20, 30
@@ -112,7 +112,7 @@ def test_few_distinct_features_leave_the_landmarks_finite_and_usable(name: str, 
     assert landmarks.isfinite().all()
     assert landmarks.min() >= x.min() - 1e-3
     assert landmarks.max() <= x.max() + 1e-3
-    factor, diagonal = nystrom_factor(x, landmarks, whitener(landmarks), "diagonal")
+    factor, diagonal = nystrom_factor(x, landmarks, inverse_cholesky(landmarks), "diagonal")
     assert factor.isfinite().all()
     assert diagonal.isfinite().all()
 
@@ -135,7 +135,7 @@ def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(
         assert all(len(row.unique()) == 300 for row in pivots)
         assert {7, 1007, 2007} <= set(pivots[0].tolist())
         marks = condense(x, 300, seeded())
-        return nystrom_factor(x, marks, whitener(marks), "diagonal")[1].mean(1)
+        return nystrom_factor(x, marks, inverse_cholesky(marks), "diagonal")[1].mean(1)
 
     in_blocks = residual()
     monkeypatch.setattr(landmarks, "DRAWN_SINGLY", 300)

@@ -21,7 +21,7 @@ ROOMS = (
     "cli",
 )
 INTERFACES = ("app", "cli")  # each counts as one where depth is concerned
-DEEPEST = 16  # levels of imports; the aim is 9
+DEEPEST = 15  # levels of imports; the aim is 9
 Imports = dict[str, set[str]]
 
 

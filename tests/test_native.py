@@ -14,13 +14,14 @@ from hatch_build import FOLDER, CompiledKernels
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core import instruction_sets
 from nlfilter_torch.core.autograd import OuterProduct
+from nlfilter_torch.core.communicator import ALONE
 from nlfilter_torch.core.kernels import definitions_only, library
 from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator import landmarks, newton
-from nlfilter_torch.operator.newton import weighted_moment
-from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator.conjugate_gradients import weighted_moment
+from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from tests import reference
 
 LEVELS = [
@@ -61,7 +62,7 @@ def test_columns(level: int, completion: Any, pixels: int, size: int, marks: int
     z = random(2, size, marks, seed=1)
     x = random(2, size, pixels) * 0.7
     x[:, :, : min(pixels, marks)] = z[:, :, : min(pixels, marks)]  # columns that rounding may make longer than 1
-    arguments = (x, z, whitener(z), completion)
+    arguments = (x, z, inverse_cholesky(z), completion)
     found = nystrom_factor(*arguments)
     expected = nystrom_factor(*(part.double() for part in arguments[:3]), completion)
     plain = by_torch(nystrom_factor, *arguments)
@@ -93,14 +94,14 @@ def test_derivatives_of_columns(
     slopes = along, random(2, pixels, seed=4)
 
     def gradients(dtype: torch.dtype) -> list[Tensor]:
-        inputs = [part.to(dtype).requires_grad_() for part in (x, z, whitener(z))]
+        inputs = [part.to(dtype).requires_grad_() for part in (x, z, inverse_cholesky(z))]
         *found, whitening = torch.autograd.grad(
             nystrom_factor(*inputs, completion), inputs, [slope.to(dtype) for slope in slopes]
         )
         return [*found, whitening.tril()]
 
     found, plain = gradients(torch.float32), by_torch(gradients, torch.float32)
-    exact, size_of_terms = gradients(torch.float64), (whitener(z).mT.abs() @ (0 + along).abs()).max()
+    exact, size_of_terms = gradients(torch.float64), (inverse_cholesky(z).mT.abs() @ (0 + along).abs()).max()
     for native_part, torch_part, part in zip(found, plain, exact, strict=True):
         error, usual = (native_part - part).abs().max(), (torch_part - part).abs().max()
         assert error <= 4 * usual + 1e-6 * size_of_terms, (error, usual)
@@ -125,7 +126,7 @@ def test_far_features_meet_the_floor_and_nan_is_not_hidden(level: int) -> None:
     x = random(1, 3, 200, seed=1)
     x[:, :, 50] = 1e30  # its squared norm overflows
     x[:, 1, 60] = torch.nan
-    factor, diagonal = nystrom_factor(x, z, whitener(z), "diagonal")
+    factor, diagonal = nystrom_factor(x, z, inverse_cholesky(z), "diagonal")
     assert factor[..., 50].abs().max() < 1e-12
     assert diagonal[0, 50] == 1
     assert factor[..., 60].isnan().all()
@@ -141,8 +142,8 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
     diagonal = 1 - factor.square().sum(1).clamp(max=1)
     total = random(2, marks, 1, seed=1).abs().double() * pixels**0.5
-    arguments = (factor, diagonal, total, None)
-    exact = newton._sweep(*(part.double() for part in arguments[:3]), None)
+    arguments = (factor, diagonal, total, ALONE)
+    exact = newton._sweep(*(part.double() for part in arguments[:3]), ALONE)
     found = newton._sweep(*arguments)
     plain = by_torch(newton._sweep, *arguments)
     torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
@@ -216,8 +217,8 @@ def test_ties_are_broken_by_one_rule(level: int, image: torch.Tensor, spatial_ba
 @pytest.mark.parametrize("pixels", [1, 300, 40_000])
 @pytest.mark.parametrize("marks", [1, 3, 50, 900])
 def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
-    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), None, random(2, marks, 1).double()
-    factor, weights, total = (t.double() for t in arguments if t is not None)
+    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
+    factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
     exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
     found = weighted_moment(*arguments)
     plain = by_torch(weighted_moment, *arguments)
@@ -247,9 +248,9 @@ def test_tensors_of_any_layout(level: int) -> None:
     torch.testing.assert_close(moment(factor, images), factor.double() @ images.double().mT, atol=1e-4, rtol=0)
     torch.testing.assert_close(spread(vectors, factor[..., 5:205:2]), vectors @ factor[..., 5:205:2])
     z, x, diagonal = random(1, 7, 4).mT, random(1, 300, 4).mT, random(1, 600)[:, ::2].sigmoid()
-    arguments = (x, z, whitener(z), "diagonal")
+    arguments = (x, z, inverse_cholesky(z), "diagonal")
     torch.testing.assert_close(nystrom_factor(*arguments), by_torch(nystrom_factor, *arguments))
-    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, None)
+    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, ALONE)
     found, expected = newton._sweep(*arguments), by_torch(newton._sweep, *arguments)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
@@ -271,8 +272,8 @@ def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
     marks = features[:, :, ::1000]
 
     def results() -> list[Tensor]:
-        factor, diagonal = nystrom_factor(features, marks, whitener(marks), "diagonal")
-        scaling, found = newton._sweep(factor, diagonal, factor.double().sum(2, keepdim=True), None)
+        factor, diagonal = nystrom_factor(features, marks, inverse_cholesky(marks), "diagonal")
+        scaling, found = newton._sweep(factor, diagonal, factor.double().sum(2, keepdim=True), ALONE)
         return [factor, scaling, found, sum_grams(factor, scaling, diagonal, 2)]
 
     threads(1)
@@ -302,7 +303,7 @@ def test_without_memory_for_its_buffers_it_says_so(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(library, "_library", Exhausted())
     x = random(1, 2, 9)
     with pytest.raises(MemoryError, match="make the image smaller"):
-        nystrom_factor(x, x[:, :, :3], whitener(x[:, :, :3]), "diagonal")
+        nystrom_factor(x, x[:, :, :3], inverse_cholesky(x[:, :, :3]), "diagonal")
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script")  # torch's own way to forward derivatives

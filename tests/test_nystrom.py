@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch.operator.nystrom import nystrom_factor, whitener
+from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from tests import reference
 
 
@@ -25,13 +25,13 @@ def dense(x: torch.Tensor) -> np.ndarray:
 
 def test_with_every_pixel_a_landmark_it_is_the_kernel() -> None:
     x = cloud(2, 3, 70)
-    factor, diagonal = nystrom_factor(x, x, whitener(x), "diagonal")
+    factor, diagonal = nystrom_factor(x, x, inverse_cholesky(x), "diagonal")
     np.testing.assert_allclose(completed(factor, diagonal), dense(x), atol=2e-5)  # twice the jitter
 
 
 def test_rows_of_landmarks_are_those_of_the_kernel() -> None:
     x = cloud(1, 3, 200)
-    factor, _ = nystrom_factor(x, x[:, :, :40], whitener(x[:, :, :40]), "none")
+    factor, _ = nystrom_factor(x, x[:, :, :40], inverse_cholesky(x[:, :, :40]), "none")
     np.testing.assert_allclose((factor.mT @ factor)[:, :40], dense(x)[:, :40], atol=3e-3)
     np.testing.assert_allclose((factor.mT @ factor)[:, :40, :40], dense(x)[:, :40, :40], atol=2e-5)
 
@@ -40,7 +40,7 @@ def test_rows_of_landmarks_are_those_of_the_kernel() -> None:
 def test_completion_keeps_the_unit_diagonal(spread: float, landmarks: int, dtype: torch.dtype) -> None:
     x = cloud(2, 5, 120, spread=spread).to(dtype)
     z = x[:, :, :landmarks]
-    factor, diagonal = nystrom_factor(x, z, whitener(z), "diagonal")
+    factor, diagonal = nystrom_factor(x, z, inverse_cholesky(z), "diagonal")
     norms = factor.square().sum(1)
     assert (diagonal >= 0).all()
     assert (norms <= 1 + 1e-5).all()
@@ -49,14 +49,14 @@ def test_completion_keeps_the_unit_diagonal(spread: float, landmarks: int, dtype
 
 def test_without_completion_there_is_no_diagonal() -> None:
     x = cloud(1, 5, 60, spread=3)
-    factor, diagonal = nystrom_factor(x, x[:, :, :5], whitener(x[:, :, :5]), "none")
+    factor, diagonal = nystrom_factor(x, x[:, :, :5], inverse_cholesky(x[:, :, :5]), "none")
     assert (diagonal == 0).all()
     assert factor.square().sum(1).min() < 0.01  # a pixel that no landmark resembles has a row of about zero
 
 
 def test_the_residual_of_the_plain_factor_is_positive() -> None:
     x = cloud(1, 3, 150)
-    factor, _ = nystrom_factor(x, x[:, :, ::5], whitener(x[:, :, ::5]), "none")
+    factor, _ = nystrom_factor(x, x[:, :, ::5], inverse_cholesky(x[:, :, ::5]), "none")
     assert np.linalg.eigvalsh(dense(x)[0] - (factor.mT @ factor)[0].numpy()).min() > -1e-12
 
 
@@ -64,8 +64,8 @@ def test_the_residual_of_the_plain_factor_is_positive() -> None:
 def test_pixels_in_another_order_give_columns_in_that_order(order: list[int]) -> None:
     x = cloud(1, 3, 40)
     z = x[:, :, 5:15]
-    factor, diagonal = nystrom_factor(x, z, whitener(z), "diagonal")
-    other, other_diagonal = nystrom_factor(x[:, :, order], z, whitener(z), "diagonal")
+    factor, diagonal = nystrom_factor(x, z, inverse_cholesky(z), "diagonal")
+    other, other_diagonal = nystrom_factor(x[:, :, order], z, inverse_cholesky(z), "diagonal")
     torch.testing.assert_close(other, factor[:, :, order], atol=1e-13, rtol=0)
     torch.testing.assert_close(other_diagonal, diagonal[:, order], atol=1e-13, rtol=0)
 
@@ -74,7 +74,7 @@ def test_pixels_in_another_order_give_columns_in_that_order(order: list[int]) ->
 def test_the_order_of_the_landmarks_does_not_matter(order: list[int]) -> None:
     x = cloud(1, 3, 40)
     z = x[:, :, 5:15]
-    one, other = (completed(*nystrom_factor(x, y, whitener(y), "diagonal")) for y in (z, z[:, :, order]))
+    one, other = (completed(*nystrom_factor(x, y, inverse_cholesky(y), "diagonal")) for y in (z, z[:, :, order]))
     torch.testing.assert_close(one, other, atol=1e-10, rtol=0)
 
 
@@ -85,31 +85,31 @@ def test_a_common_offset_does_not_matter(dtype: torch.dtype) -> None:
     results = []
     for offset in (0.0, 100.0):
         y = (x + offset).to(dtype)
-        results.append(completed(*nystrom_factor(y, y[:, :, :30], whitener(y[:, :, :30]), "diagonal")))
+        results.append(completed(*nystrom_factor(y, y[:, :, :30], inverse_cholesky(y[:, :, :30]), "diagonal")))
     torch.testing.assert_close(*results, atol=tolerance, rtol=0)
 
 
 def test_repeated_landmarks_are_no_harm() -> None:
     x = cloud(1, 3, 60).float()
     once, twice = x[:, :, :10], torch.cat([x[:, :, :10]] * 2, dim=2)
-    one, other = (completed(*nystrom_factor(x, z, whitener(z), "diagonal")) for z in (once, twice))
+    one, other = (completed(*nystrom_factor(x, z, inverse_cholesky(z), "diagonal")) for z in (once, twice))
     torch.testing.assert_close(one, other, atol=1e-3, rtol=0)
 
 
 def test_single_precision_is_double_precision_rounded() -> None:
     x = cloud(1, 25, 500, spread=0.3)
     z = x[:, :, ::10]
-    exact = completed(*nystrom_factor(x, z, whitener(z), "diagonal"))
-    single = completed(*nystrom_factor(x.float(), z.float(), whitener(z.float()), "diagonal"))
+    exact = completed(*nystrom_factor(x, z, inverse_cholesky(z), "diagonal"))
+    single = completed(*nystrom_factor(x.float(), z.float(), inverse_cholesky(z.float()), "diagonal"))
     torch.testing.assert_close(single.double(), exact, atol=2e-3, rtol=0)
 
 
 def test_a_batch_is_its_images() -> None:
     x = cloud(3, 4, 9000)  # longer than a block of pixels
     z = x[:, :, ::200]
-    together = nystrom_factor(x, z, whitener(z), "diagonal")
+    together = nystrom_factor(x, z, inverse_cholesky(z), "diagonal")
     for i in range(3):
-        alone = nystrom_factor(x[i : i + 1], z[i : i + 1], whitener(z[i : i + 1]), "diagonal")
+        alone = nystrom_factor(x[i : i + 1], z[i : i + 1], inverse_cholesky(z[i : i + 1]), "diagonal")
         for one, other in zip(together, alone, strict=True):
             torch.testing.assert_close(one[i : i + 1], other, atol=1e-11, rtol=0)
 
@@ -118,7 +118,7 @@ def test_a_batch_is_its_images() -> None:
 def test_gradients_are_those_of_the_formula(completion: str) -> None:
     """The recomputing backward against autograd through the same three lines."""
     x, z = cloud(2, 3, 50, spread=0.7).requires_grad_(), cloud(2, 3, 8, seed=1, spread=0.7).requires_grad_()
-    a = whitener(z.detach()).requires_grad_()
+    a = inverse_cholesky(z.detach()).requires_grad_()
     weights = cloud(2, 9, 50, seed=2)
 
     def formula() -> tuple[torch.Tensor, torch.Tensor]:

@@ -31,7 +31,7 @@ from nlfilter_torch import (
     propagate_strokes,
     segment_mask,
 )
-from nlfilter_torch.core.communicator import Shard, meet, with_halo
+from nlfilter_torch.core.communicator import ALONE, RowCommunicator, all_gather_shapes
 from tests.problems import noise, picture, seeded
 
 pytestmark = [
@@ -238,12 +238,12 @@ def refusals(group: Any, rank: int) -> dict[str, str]:
     return found
 
 
-def halos(shard: Shard) -> list[tuple[Tensor, tuple[int, int], Tensor]]:
+def halos(among: RowCommunicator) -> list[tuple[Tensor, tuple[int, int], Tensor]]:
     """Rows with halos of several sizes, and the gradient of a function of them."""
     found = []
     for margin in (0, 1, 3, 30):
-        rows = noise(2, 2, HEIGHT, WIDTH)[:, :, shard.first :][:, :, : shard.rows[shard.rank]].requires_grad_()
-        extended, halo = with_halo(rows, margin, shard)
+        rows = noise(2, 2, HEIGHT, WIDTH)[:, :, among.first_row :][:, :, : among.rows[among.rank]].requires_grad_()
+        extended, halo = among.with_halo(rows, margin)
         extended.pow(3).sum().backward()
         assert rows.grad is not None
         found.append((extended.detach(), halo, rows.grad))
@@ -283,9 +283,9 @@ def work(rank: int, folder: str) -> None:
         place = members.index(rank)
         rows = slice(cuts[place], cuts[place + 1])
         found: dict[str, Any] = {problem: solve(rows, group, dtype) for problem, (solve, dtype, _) in PROBLEMS.items()}
-        shard = meet(noise(2, 2, rows.stop - rows.start, WIDTH), group)
-        assert shard is not None
-        found["halos"] = halos(shard)
+        among = all_gather_shapes(noise(2, 2, rows.stop - rows.start, WIDTH), group)
+        assert isinstance(among, RowCommunicator)
+        found["halos"] = halos(among)
         torch.save(found, f"{folder}/{name}{place}.pt")
     world = dist.group.WORLD
     found = {"refusals": refusals(world, rank), "traffic": traffic(world, rank)}
@@ -357,7 +357,7 @@ def test_what_is_sent_does_not_grow_with_the_image(folder: Path) -> None:
         assert first["sums"] < 64 * 3 * 25 * 4 + 40 * 3 * 3 * 8  # candidates for landmarks, and small matrices
 
 
-def test_refusals_in_shards(folder: Path) -> None:
+def test_refusals_for_rows_over_ranks(folder: Path) -> None:
     for found in load(folder, "end"):
         said = found["refusals"]
         for name in ("to_dense", "a loss"):
@@ -378,8 +378,8 @@ def test_a_rank_that_is_gone_is_named_in_time(folder: Path) -> None:
 def test_without_a_group() -> None:
     """Without a group nothing is exchanged: the same function, in one process."""
     image = noise(1, 1, 6, 7)
-    assert nonlocal_operator(image, num_landmarks=5, group=None).shard is None
-    assert with_halo(image, 2, None) == (image, (0, 0))
-    assert meet(image, None) is None
+    assert nonlocal_operator(image, num_landmarks=5, group=None).among is ALONE
+    assert ALONE.with_halo(image, 2) == (image, (0, 0))
+    assert all_gather_shapes(image, None) is ALONE
     with pytest.raises(TypeError, match=r"group must be a process group of torch.distributed"):
         nonlocal_operator(image, group="world")

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlfilter_torch import Spectrum, nonlocal_operator, propagate_strokes
-from nlfilter_torch.filtering.scribbles import NOISE, SPOT
+from nlfilter_torch.filtering.scribbles import DAB, NOISE
 from tests.images import two_colours
 from tests.problems import build, guides, noise, options, picture, seeded
 
@@ -45,7 +45,7 @@ def kriging(
     inner = covariance[np.ix_(painted, painted)]
     own = 1 - np.square(factor[:, painted]).sum(0)  # of the kernel's unit diagonal
     variance = ((np.diag(inner) + own) * weights[painted]).sum() / weights[painted].sum()
-    spot = SPOT * factor.shape[1]  # less than a pixel here
+    spot = DAB * factor.shape[1]  # less than a pixel here
     noisy = inner + np.diag(smoothness * (spot * NOISE * variance + own) / weights[painted])
     ones = np.ones(painted.sum())
     solved, of_ones = np.linalg.solve(noisy, strokes[painted]), np.linalg.solve(noisy, ones)

@@ -15,7 +15,7 @@ from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.speed.cases import Case
 from nlfilter_torch import NonlocalFilter
 from nlfilter_torch.operator.balancing import balance
-from nlfilter_torch.operator.nystrom import whitener
+from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 
@@ -60,7 +60,7 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
             patch_weights=kernel.recipe.patch_weights.double(),
             photometric_bandwidth=torch.as_tensor(kernel.recipe.photometric_bandwidth).double(),
         )
-        exact_kernel = replace(kernel, landmarks=points, whitening=whitener(points), features=recipe)
+        exact_kernel = replace(kernel, landmarks=points, inverse_cholesky=inverse_cholesky(points), features=recipe)
         factor, diagonal = exact_kernel.columns(image.double())
         scaling = balance(factor, diagonal).scaling
         remainder = scaling.square() * diagonal

@@ -82,7 +82,7 @@ def batch(
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.cli.tiled import allowed_memory
     from nlfilter_torch.core.checks import check_patch_size
-    from nlfilter_torch.core.communicator import connected_ranks
+    from nlfilter_torch.core.ranks import connected_ranks
 
     check_patch_size(given["patch_size"])
     allowed_memory(memory)
@@ -120,11 +120,12 @@ def batch(
         except KeyboardInterrupt:
             interrupted = True
             _tell("the same command does the rest")
-        for part in ranks.gather(tally):
+        for part in ranks.all_gather(tally):
             total.add(part)
         if ranks.rank == 0 or ranks.group is None:
             _summarise(total, target)
-        ranks.gather(None)  # the first rank to end with status 1 ends the others, which may still have to say something
+        # The first rank to end with status 1 ends the others, which may still have to say something.
+        ranks.all_gather(None)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
     if total.failures or total.left:

@@ -1,4 +1,4 @@
-"""Cutting the pixels of an image into blocks whose intermediate results stay in the processor's cache."""
+"""Planes of pixels: cut into blocks that stay in the processor's cache, folded with their batch, and weighted."""
 
 import math
 from collections.abc import Iterator
@@ -69,12 +69,12 @@ def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Te
         factor: (B, M, N), from which the buffers take shape, dtype and device.
         count: number of buffers.
     """
-    batch, marks, pixels = factor.shape
+    batch, landmarks, pixels = factor.shape
     storage: list[Tensor] = []
     for block in pixel_blocks(pixels, batch, factor.device):
         length = block.stop - block.start
         if not storage or length != storage[0].shape[2]:
-            storage = [factor.new_empty(batch, marks, length) for _ in range(count)]
+            storage = [factor.new_empty(batch, landmarks, length) for _ in range(count)]
         yield block, storage
 
 
@@ -101,3 +101,15 @@ def unfold_batch(planes: Tensor, images: int, size: tuple[int, int]) -> Tensor:
     if planes.shape[0] == 1:
         planes = planes.squeeze(0).unflatten(1, (images, -1)).transpose(0, 1)
     return planes.unflatten(-1, size)
+
+
+def weighted(values: Tensor, weights: Tensor | None) -> Tensor:
+    """Values (B, ..., N) times the number of pixels that each point stands for, (B, N); None is one each."""
+    if weights is None:
+        return values
+    return values * weights.view(weights.shape[0], *[1] * (values.ndim - 2), -1).to(values)
+
+
+def root_weighted(scaling: Tensor, weights: Tensor | None) -> Tensor:
+    """``d sqrt(w)``, (B, N): the scaling of the symmetric matrix that has the eigenvalues of W."""
+    return scaling if weights is None else scaling * weights.sqrt()

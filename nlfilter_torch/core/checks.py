@@ -273,11 +273,11 @@ def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) 
 def check_coefficients(coefficients: Tensor, factor: Tensor) -> None:
     """Raise unless coefficients (b, C, M) in float64 fit a factor (B, M, N)."""
     check_tensor(coefficients, "coefficients", "take spectrum.coefficients of an image")
-    batch, marks, _ = factor.shape
+    batch, count, _ = factor.shape
     shape = tuple(coefficients.shape)
-    if coefficients.ndim != 3 or shape[2] != marks or 0 in shape or (shape[0] != batch and 1 not in (batch, shape[0])):
+    if coefficients.ndim != 3 or shape[2] != count or 0 in shape or (shape[0] != batch and 1 not in (batch, shape[0])):
         raise ValueError(
-            f"coefficients must have shape ({batch}, C, {marks}), got {shape}; take spectrum.coefficients of an image"
+            f"coefficients must have shape ({batch}, C, {count}), got {shape}; take spectrum.coefficients of an image"
         )
     if coefficients.dtype != torch.float64:
         raise TypeError(f"coefficients must be of dtype torch.float64, got {coefficients.dtype}; convert them")

@@ -19,7 +19,6 @@ from nlfilter_torch.core.checks import (
     check_weight,
     checked_response,
 )
-from nlfilter_torch.core.communicator import reduce_sum, replicate
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, Spectrum
@@ -131,31 +130,31 @@ def polynomial_filter(
         batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
         check_weight(residual, "residual", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
-    alpha = alpha if alpha.ndim == 4 else replicate(alpha, operator.shard)
+    alpha = alpha if alpha.ndim == 4 else operator.among.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None:
         captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
-        weight = replicate(residual, operator.shard)
+        weight = operator.among.copy_to_group(residual)
         filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
     return filtered.to(image.dtype)
 
 
-def residual_change(alpha: Tensor, residual: float | Tensor, missed: Tensor, remainder: Tensor) -> Tensor:
-    """Correction of a filtered image that gives ``missed``, the part no eigenvector captures, its own weight.
+def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, remainder: Tensor) -> Tensor:
+    """The change of a filtered image that gives the residual, the part that no eigenvector captures, its own weight.
 
-    F annihilates that part, so W multiplies it by r and the sliders have given it the weight f(r). The share r of it
-    keeps that weight: W preserves a pixel unlike all others, though no eigenvector captures it.
+    F maps the residual to zero, so W multiplies it by r, and the sliders have given it the weight f(r). The share r of
+    it keeps that weight: W preserves a pixel unlike all others, although no eigenvector captures it.
 
     Args:
         alpha: the sliders, of any shape that :func:`weigh_layers` takes.
-        residual: the weight it is to have.
-        missed: (B, C, H, W).
+        weight: of the residual.
+        residual: (B, C, H, W).
         remainder: r, (B, 1, H, W).
     """
     entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
     powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
     gain = weigh_layers(layers_between(powers), alpha)
-    return (torch.as_tensor(residual).to(missed).reshape(-1, 1, 1, 1) - gain) * (1 - remainder) * missed
+    return (torch.as_tensor(weight).to(residual).reshape(-1, 1, 1, 1) - gain) * (1 - remainder) * residual
 
 
 @full_precision
@@ -181,7 +180,7 @@ def spectral_filter(
 
     Returns:
         (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
-        ``response``, with a finite gradient where eigenvalues meet.
+        ``response``, with a finite gradient where eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size,
@@ -206,12 +205,12 @@ def spectral_filter(
     else:
         check_image(image, "image")
         check_same_size(image, spectrum.size, "image", "spectrum")
-        batch, marks, _ = spectrum.factor.shape
-        shape = (max(batch, image.shape[0]), image.shape[1], marks)
+        batch, landmarks, _ = spectrum.factor.shape
+        shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
         check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
     if isinstance(residual, int | float) and residual == 0:
         return spectrum.synthesize(response, coefficients).to(image.dtype)
-    rho = torch.as_tensor(replicate(residual, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
+    rho = torch.as_tensor(spectrum.among.copy_to_group(residual)).to(spectrum.root).reshape(-1, 1)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
     return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered)).to(image.dtype)
@@ -236,8 +235,8 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
     captured = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
-    energy = reduce_sum(image.to(spectrum.factor).square().sum((1, 2, 3)), spectrum.shard)
-    inner = reduce_sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)), spectrum.shard)  # y^T V V^T y
+    energy = spectrum.among.sum(image.to(spectrum.factor).square().sum((1, 2, 3)))
+    inner = spectrum.among.sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)))  # y^T V V^T y
     return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))
 
 
@@ -319,7 +318,7 @@ def filter_regions(
     check_image(image, "image")
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_same_size(masks, operator.size, "masks", "operator")
-    alpha = replicate(alpha, operator.shard)
+    alpha = operator.among.copy_to_group(alpha)
     return blend_regions(
         image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)
     )

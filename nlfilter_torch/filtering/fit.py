@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import (
     check_same_size,
     check_tensor,
 )
-from nlfilter_torch.core.communicator import Shard, check_whole, reduce_max, reduce_sum
+from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import detail_layers
@@ -96,7 +96,7 @@ def fit_alpha(
     if loss is not None and not callable(loss):
         raise TypeError(f"loss must be a function of two images, got {type(loss).__name__}; pass it or None")
     if loss is not None:
-        check_whole(operator.shard, "a loss")
+        operator.among.check_whole("a loss")
     check_order(order)
     check_image(image, "image")
     check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
@@ -104,7 +104,7 @@ def fit_alpha(
     check_same_size(target, operator.size, "target", "image")
     _check_not_negative(ridge, "ridge")
     if rounding is None:
-        rounding = HALF_LEVEL if _is_rounded(target, operator.shard) else 0.0
+        rounding = HALF_LEVEL if _is_rounded(target, operator.among) else 0.0
     _check_not_negative(rounding, "rounding")
 
     layers = detail_layers(operator, image.to(operator.factor), order=order).double()  # (B, k+1, C, H, W)
@@ -112,11 +112,11 @@ def fit_alpha(
         layers=layers.flatten(2),
         edit=(target.double() - layers.sum(1)).flatten(1),
         dead_zone=_dead_zone(target.detach().double().flatten(1), rounding) if rounding > 0.0 else None,
-        weights=_pixel_weights(mask, layers, operator.shard).flatten(1),
+        weights=_pixel_weights(mask, layers, operator.among).flatten(1),
         ridge=ridge,
         shared=shared,
         precision=operator.factor.dtype,
-        shard=operator.shard,
+        among=operator.among,
     )
     change = problem.fit()
     if loss is not None:
@@ -129,10 +129,10 @@ def _check_not_negative(value: float, name: str) -> None:
     check_not_negative(value, name, "0.0 is plain least squares")
 
 
-def _is_rounded(target: Tensor, shard: Shard | None) -> bool:
+def _is_rounded(target: Tensor, among: Communicator) -> bool:
     """Whether all values of ``target`` are multiples of 1/255."""
     levels = target.detach().double() * 255
-    return bool(reduce_max((levels - levels.round()).abs().max(), shard) < OFF_LEVEL)
+    return bool(among.max((levels - levels.round()).abs().max()) < OFF_LEVEL)
 
 
 def _dead_zone(target: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
@@ -154,7 +154,7 @@ class _Problem:
         ridge: see :func:`fit_alpha`.
         shared: one change for all images.
         precision: dtype in which the layers were computed.
-        shard: of the images, if other ranks have the remaining rows.
+        among: ranks that the rows of the images are spread over.
     """
 
     layers: Tensor
@@ -164,7 +164,7 @@ class _Problem:
     ridge: float
     shared: bool
     precision: torch.dtype
-    shard: Shard | None
+    among: Communicator
 
     def fit(self) -> Tensor:
         """Least-squares change (B, k+1) with the dead zone.
@@ -208,7 +208,7 @@ class _Problem:
 
     def _weighed(self, weights: Tensor) -> Tensor:
         """Gram matrix of the layers, (B, k+1, k+1), under weights (B, P)."""
-        return self._pool(reduce_sum((self.layers * weights.unsqueeze(1)) @ self.layers.mT, self.shard))
+        return self._pool(self.among.sum((self.layers * weights.unsqueeze(1)) @ self.layers.mT))
 
     def _errors(self, change: Tensor) -> Tensor:
         """Remaining error of the edit, (B, P)."""
@@ -219,14 +219,14 @@ class _Problem:
         return values.mean(0, keepdim=True) if self.shared else values
 
     def _cost(self, change: Tensor) -> Tensor:
-        squares = reduce_sum((self.weights * self._errors(change).square()).sum(1), self.shard)
+        squares = self.among.sum((self.weights * self._errors(change).square()).sum(1))
         return self._pool(squares) + self.ridge * change.square().sum(1)
 
     def _step(self, change: Tensor) -> Tensor:
         """Newton's step (B, k+1); without a dead zone it leads to the solution from any point."""
         errors = self._errors(change)
         products = self._products if self.dead_zone is None else self._weighed(self.weights * (errors != 0.0))
-        slope = reduce_sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2), self.shard)
+        slope = self.among.sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2))
         slope = self._pool(slope) - self.ridge * change
         scale, inverse = self._inverse(products)
         return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)
@@ -295,17 +295,17 @@ class _Problem:
         return change_of(coefficients.detach())
 
 
-def _pixel_weights(mask: Tensor | None, layers: Tensor, shard: Shard | None) -> Tensor:
+def _pixel_weights(mask: Tensor | None, layers: Tensor, among: Communicator) -> Tensor:
     """Weights (B, C, H, W) or (1, C, H, W) of the pixels, of unit sum for every image."""
     batch, _, channels, height, width = layers.shape
     if mask is None:
-        pixels = height * width if shard is None else shard.pixels
+        pixels = among.pixels(height * width)
         return layers.new_full((1, channels, height, width), 1.0 / (channels * pixels))
     check_image(mask, "mask", channels=1, batch=batch)
     check_same_size(mask, (height, width), "mask", "image")
     if bool((mask < 0).any()):
         raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
-    total = reduce_sum(mask.double().sum((2, 3), keepdim=True), shard)
+    total = among.sum(mask.double().sum((2, 3), keepdim=True))
     if bool((total <= 0).any()):
         raise ValueError(
             "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"

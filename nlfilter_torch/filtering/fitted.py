@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_image,
@@ -24,8 +25,8 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling, weighted
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
+from nlfilter_torch.operator.scaling import PixelScaling
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +37,15 @@ class FittedFilter:
 
     Attributes:
         kernel: landmarks, bandwidths and window.
-        balancing: determines the scaling of a pixel.
-        moments: the same of ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
-        explained: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
+        balancing: computes the scaling of a pixel.
+        moments: of the images ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
+        captured: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
     """
 
     kernel: Kernel
     balancing: PixelScaling
     moments: Tensor
-    explained: Tensor
+    captured: Tensor
 
     @full_precision
     def layers(
@@ -61,8 +62,8 @@ class FittedFilter:
             image: (B, C, H, W), with the channels of the fitted image.
             guide: (B, C', H, W), with the channels of the fitted guide; None is the image.
             origin: row and column of the first pixel, for tiles of the fitted image.
-            halo: rows at the top and at the bottom of a tile that only complete the patches of the others: half a
-                patch, or fewer at the border of the picture. The result does not contain them.
+            halo: rows at the top and at the bottom of a tile that patches reach into but that the result does not
+                contain: half a patch, or fewer at the border of the picture.
 
         Raises:
             TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
@@ -91,7 +92,7 @@ class FittedFilter:
         check_alpha(alpha)
         if residual is not None:
             check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
-        planes = self._planes(image, guide, origin, halo, by_rows=by_rows, missed=residual is not None)
+        planes = self._planes(image, guide, origin, halo, by_rows=by_rows, with_residual=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
         if residual is not None:
@@ -106,9 +107,9 @@ class FittedFilter:
         halo: tuple[int, int],
         *,
         by_rows: bool = False,
-        missed: bool = False,
+        with_residual: bool = False,
     ) -> Tensor:
-        """Layers (B, k+1, C, H, W) and, on request, the residual and r as two more, in the kernel's dtype."""
+        """Layers (B, k+1, C, H, W), with the residual and r as two more if asked for, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
@@ -121,25 +122,24 @@ class FittedFilter:
             guide = guide.expand(image.shape[0], -1, -1, -1)
             check_same_size(guide, size, "guide", "image")
         batch = (image.shape[0], -1, -1)
-        kernel = replace(
-            self.kernel, landmarks=self.kernel.landmarks.expand(batch), whitening=self.kernel.whitening.expand(batch)
-        )
+        landmarks, inverse = (matrix.expand(batch) for matrix in (self.kernel.landmarks, self.kernel.inverse_cholesky))
+        kernel = replace(self.kernel, landmarks=landmarks, inverse_cholesky=inverse)
         features = kernel.recipe(image if guide is None else guide, origin=origin, halo=halo)
         image = _without(image, halo)
         size = (image.shape[-2], image.shape[-1])
         step = size[1] if by_rows else features.shape[2]
         parts = zip(features.split(step, dim=2), image.to(features).flatten(2).split(step, dim=2), strict=True)
-        planes = [self._split(kernel, *part, missed=missed) for part in parts]
+        planes = [self._split(kernel, *part, with_residual=with_residual) for part in parts]
         return torch.cat(planes, dim=-1).unflatten(-1, size)
 
-    def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, missed: bool) -> Tensor:
+    def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, with_residual: bool) -> Tensor:
         """The same (B, k+1 or k+3, C, n) of pixels (B, C, n) with features (B, D, n)."""
         factor, diagonal = kernel.factor(features)
         columns = Columns(factor, *self.balancing(factor, diagonal))
         layers = layers_of_columns(columns, self.moments, image)
-        if not missed:
+        if not with_residual:
             return layers
-        captured = spread(self.explained.to(factor).mT, factor, columns.scaling)
+        captured = spread(self.captured.to(factor).mT, factor, columns.scaling)
         share = columns.remainder.unsqueeze(1).expand_as(image)
         return torch.cat([layers, torch.stack([image - captured, share], dim=1)], dim=1)
 
@@ -197,8 +197,9 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = weighted(operator.scaling, operator.weights).unsqueeze(1)  # (1, 1, N)
+    factor, among = operator.factor, operator.among
     # The moment of the factor itself has a gradient.
-    balancing = replace(operator.balancing, moment=moment(operator.factor, scaling, operator.shard))
-    moments = torch.stack([moment(operator.factor, scaling * y, operator.shard) for y in before.unsqueeze(1)], dim=1)
-    explained = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
-    return FittedFilter(operator.kernel, balancing, moments, explained)
+    balancing = replace(operator.balancing, moment=among.sum(moment(factor, scaling)))
+    moments = torch.stack([among.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
+    captured = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
+    return FittedFilter(operator.kernel, balancing, moments, captured)

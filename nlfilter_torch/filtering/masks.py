@@ -3,18 +3,16 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import CACHED, block_length
+from nlfilter_torch.core.blocks import CACHED, block_length, weighted
 from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, is_hidden, warn
-from nlfilter_torch.core.communicator import reduce_max, reduce_sum, replicate
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined
 STEEPEST = 1e30  # limit of pixels / width: a distance of 0 never becomes NaN
-EXPLAINED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
-LOOKED_AT = 4096  # pixels of a region that are checked
+CAPTURED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
+CHECKED = 4096  # most pixels of a region that are compared with the landmarks
 ITERATIONS = 20  # of k-means, which starts close to the solution
 
 
@@ -27,7 +25,7 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
 
     Args:
         spectrum: of the operator.
-        time: t > 0; larger values keep only the coarse structure, so that edits reach further.
+        time: t > 0; larger values keep only coarse structure, so that edits extend further.
 
     Returns:
         (B, R-1, H, W). Differentiable, with the limits of :attr:`Spectrum.eigenvectors`.
@@ -58,7 +56,7 @@ def diffusion_mask(
     Args:
         spectrum: of the operator.
         region: (B, K, H, W), non-negative weights of the pixels of K regions.
-        time: diffusion time t > 0, a number or a tensor of shape () or (B,); larger reaches further.
+        time: diffusion time t > 0, a number or a tensor of shape () or (B,); with larger values masks extend further.
         width: squared distance at which the mask has fallen to 1/e, likewise.
         negative: (B, 1 or K, H, W), weights of pixels that the mask avoids: it is halved where a pixel is as close to
             them as to the region, and smaller where it is closer to them. None is no such region.
@@ -66,7 +64,7 @@ def diffusion_mask(
     Returns:
         (B, K, H, W) in (0, 1], in the region's dtype (float16 rounds the least to 0); without ``negative`` it grows
         with time at every pixel.
-        Differentiable in operator, regions, time and width, also where eigenvalues meet.
+        Differentiable in operator, regions, time and width, also where eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if a region does not fit, is negative or empty, or ``time`` or ``width`` is not positive.
@@ -85,7 +83,7 @@ def diffusion_mask(
     check_positive(time, "time", spectrum.factor.shape[0])
     check_positive(width, "width", max(spectrum.factor.shape[0], weights.shape[0]))
     _warn_of_unlike(spectrum, weights)
-    exponent = torch.as_tensor(replicate(time, spectrum.shard)).to(spectrum.root).reshape(-1, 1)
+    exponent = torch.as_tensor(spectrum.among.copy_to_group(time)).to(spectrum.root).reshape(-1, 1)
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
     if others is not None:
         check_negative(others.shape[1], weights.shape[1])
@@ -93,7 +91,7 @@ def diffusion_mask(
         weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
     # The constant eigenvector adds nothing to distances, so it may stay, and no eigenvectors need to be chosen.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
-    scale = spectrum.pixels / torch.as_tensor(replicate(width, spectrum.shard)).to(distances).reshape(-1, 1, 1)
+    scale = spectrum.pixels / torch.as_tensor(spectrum.among.copy_to_group(width)).to(distances).reshape(-1, 1, 1)
     exponents = scale.clamp(max=STEEPEST) * distances
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = mask_of_exponents(inner, None if negative is None else outer)
@@ -102,14 +100,14 @@ def diffusion_mask(
 
 @torch.no_grad()
 def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
-    """Warn of a region (B, K, N) unlike all landmarks: all pixels the landmarks do not capture have coordinates 0."""
+    """Warn of a region (B, K, N) unlike all landmarks: such pixels all have the diffusion coordinates 0."""
     if is_hidden(weights):
         return
     for columns, regions in zip(spectrum.factor, weights.expand(len(spectrum.factor), -1, -1), strict=True):
         for number, region in enumerate(regions):
             places = region.nonzero().squeeze(1)
-            few = places[:: 1 + len(places) // LOOKED_AT]
-            if len(few) > 0 and columns[:, few].square().sum(0).mean() < EXPLAINED:
+            few = places[:: 1 + len(places) // CHECKED]
+            if len(few) > 0 and columns[:, few].square().sum(0).mean() < CAPTURED:
                 warn(
                     f"region {number} is like no landmark, so its mask may take in other pixels like none; "
                     "raise num_landmarks or photometric_bandwidth"
@@ -159,7 +157,7 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     flat = region.to(spectrum.factor).flatten(2)
     if bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
-    total = reduce_sum(weighted(flat, spectrum.weights).sum(2, keepdim=True), spectrum.shard)
+    total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
     if bool((total <= 0).any()):
         raise ValueError(
             f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
@@ -197,12 +195,12 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         for _ in range(ITERATIONS):
             members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
             counts = weighted(members, spectrum.weights).sum(2, dtype=torch.float64)
-            sizes = reduce_sum(counts, spectrum.shard).unsqueeze(1)  # (B, 1, K)
+            sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
             centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
             if members.device.type != "cpu":  # comparing would synchronise with the device
                 continue
-            if not reduce_max((previous != assignment).any().to(members), spectrum.shard):
+            if not spectrum.among.max((previous != assignment).any().to(members)):
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
     return mask.unflatten(2, spectrum.size).to(regions.dtype)
@@ -210,7 +208,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
 
 def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     """Weighted sums (B, M, K) of the coordinates ``basis @ F`` of all pixels, with weights (B, K, N); float64."""
-    return basis @ moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights, spectrum.shard)
+    return basis @ spectrum.among.sum(moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights))
 
 
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
     check_image,
     check_instance,
@@ -23,17 +24,16 @@ from nlfilter_torch.core.checks import (
     check_tensor,
     check_unit_range,
 )
-from nlfilter_torch.core.communicator import Shard, reduce_max, reduce_sum, replicate
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.operator.newton import weighted
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
-SPOT = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240
+DAB = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240
 NOISE = 0.08  # variance of the values of one dab, relative to that of the image
 FLOOR = 1e-12  # of eigenvalues; keeps the derivative of their square root finite
 
-Painted = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
+ScribbledBlocks = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
 
 
 @full_precision
@@ -60,7 +60,7 @@ def propagate_strokes(
 
     Returns:
         (B, C, H, W) in the dtype of ``strokes``. Linear in ``strokes``; at strength 1 a constant comes back as itself.
-        Differentiable in operator, strokes, mask and parameters, also where eigenvalues meet.
+        Differentiable in operator, strokes, mask and parameters, also where eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if sizes or batches differ, ``stroke_mask`` exceeds [0, 1] or is empty, or a parameter
@@ -77,7 +77,7 @@ def propagate_strokes(
         tensor([0., 0., 1., 1.])
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
-    shard = spectrum.shard
+    among = spectrum.among
     batch = spectrum.factor.shape[0]
     check_tensor(strokes, "strokes")
     check_tensor(stroke_mask, "stroke_mask")
@@ -85,12 +85,12 @@ def propagate_strokes(
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum")
-    check_painted(stroke_mask, shard=shard)
+    check_painted(stroke_mask, among=among)
     check_share(strength, "strength", images)
     check_share(reach, "reach", batch, below=True)
     check_positive(smoothness, "smoothness", images)
 
-    strength, reach, smoothness = (replicate(value, shard) for value in (strength, reach, smoothness))
+    strength, reach, smoothness = (among.copy_to_group(value) for value in (strength, reach, smoothness))
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
@@ -104,7 +104,7 @@ def propagate_strokes(
         strength=strength,
         reach=reach,
         smoothness=smoothness,
-        shard=shard,
+        among=among,
     )
     return fitted(spectrum.factor).unflatten(2, spectrum.size).to(strokes.dtype)
 
@@ -127,14 +127,14 @@ class FittedStrokes:
 
 
 def fit_strokes(
-    painted: Painted,
+    painted: ScribbledBlocks,
     pairs: RitzPairs,
     pixels: int,
     *,
     strength: float | Tensor,
     reach: float | Tensor,
     smoothness: float | Tensor,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
 ) -> FittedStrokes:
     """The regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
@@ -146,24 +146,25 @@ def fit_strokes(
         strength: as of :func:`propagate_strokes`, and so are ``reach`` and ``smoothness``.
         reach: s of the walks.
         smoothness: scales the noise.
-        shard: of the image, if other ranks have the remaining rows.
+        among: ranks that the rows of the image are spread over.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T
-    heed = Heed.of(painted, half, SPOT * pixels, shard)
+    effective_weights = EffectiveWeights.of(painted, half, DAB * pixels, among)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for factor, weights, values in painted():
-        heeded = heed(factor, weights)
-        images = max(len(factor), len(heeded), len(values))
+        effective = effective_weights(factor, weights)
+        images = max(len(factor), len(effective), len(values))
         known = torch.cat([values, torch.ones_like(values[:, :1])], dim=1).expand(images, -1, -1)
-        gram = gram + moment(factor * heeded, factor)  # (B, M, M)
-        target = target + moment(factor.expand(images, -1, -1), heeded * known)  # (B, M, C+1)
-        sums = sums + (heeded * known).double().sum(2)  # (B, C+1)
-    gram, target, sums = (reduce_sum(total, shard) for total in (gram, target, sums))
+        gram = gram + moment(factor * effective, factor)  # (B, M, M)
+        target = target + moment(factor.expand(images, -1, -1), effective * known)  # (B, M, C+1)
+        sums = sums + (effective * known).double().sum(2)  # (B, C+1)
+    gram, target, sums = (among.sum(total) for total in (gram, target, sums))
 
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
     inner = half.mT @ gram @ half
-    noise = _per_image(smoothness, gram) * heed.spot * heed.noise  # of a single pixel of a dab
+    # The noise of a single pixel of a dab.
+    noise = _per_image(smoothness, gram) * effective_weights.dab * effective_weights.noise
     identity = torch.eye(inner.shape[1]).to(inner)
     lower = torch.linalg.cholesky_ex(inner + noise * identity).L
     solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
@@ -188,60 +189,60 @@ def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Heed:
+class EffectiveWeights:
     """Effective weights of scribbled pixels.
 
-    A single dot must not be outweighed by broad scribbles or by the size of the photograph: pixels similar to few other
-    scribbled ones count for up to a whole dab. The part of a pixel that the landmarks do not capture says nothing about
-    other pixels, so pixels unlike all others have little weight.
+    So that broad scribbles or a large photograph do not outweigh a single dot, pixels similar to few other scribbled
+    pixels count for up to a whole dab. The part of a pixel that the landmarks do not capture carries no information
+    about other pixels, so pixels unlike all others have little weight.
 
     Attributes:
         core: X, (B, M, M).
         gram: ``X G X / v`` with G the sum over the scribbled pixels and v their mean captured variance, (B, M, M).
-        spot: pixels in a dab of the brush.
+        dab: number of pixels in a dab of the brush.
         noise: variance of the values of a dab, (B, 1, 1).
     """
 
     core: Tensor
     gram: Tensor
-    spot: float
+    dab: float
     noise: Tensor
 
     @staticmethod
-    def of(painted: Painted, half: Tensor, spot: float, shard: Shard | None) -> "Heed":
-        """From a pass over the scribbled pixels."""
-        gram, missed, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
+    def of(painted: ScribbledBlocks, half: Tensor, dab: float, among: Communicator) -> "EffectiveWeights":
+        """From sums over the scribbled pixels."""
+        gram, residual, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
-            missed = missed + (weights * unexplained(factor)).double().sum((1, 2))
+            residual = residual + (weights * diagonal_residual(factor)).double().sum((1, 2))
             total = total + weights.double().sum((1, 2))
-        gram, missed, total = (reduce_sum(part, shard) for part in (gram, missed, total))
+        gram, residual, total = (among.sum(part) for part in (gram, residual, total))
         core = half @ half.mT
         variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
-        noise = NOISE * (variance + missed / total).reshape(-1, 1, 1)
-        return Heed(core, core @ gram @ core / variance.reshape(-1, 1, 1), spot, noise)
+        noise = NOISE * (variance + residual / total).reshape(-1, 1, 1)
+        return EffectiveWeights(core, core @ gram @ core / variance.reshape(-1, 1, 1), dab, noise)
 
     def __call__(self, factor: Tensor, weights: Tensor) -> Tensor:
         """The weights (B, 1, n) of columns (B, M, n)."""
-        noise, own = self.noise.to(weights), unexplained(factor) / min(self.spot, 1.0)
+        noise, own = self.noise.to(weights), diagonal_residual(factor) / min(self.dab, 1.0)
         weights = weights * noise / (noise + own)
-        if self.spot <= 1:
+        if self.dab <= 1:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
         # The sum of squared correlations with the scribbled pixels.
-        likes = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
-        return weights * (self.spot / likes.clamp(min=1.0)).clamp(min=1.0)
+        similar = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
+        return weights * (self.dab / similar.clamp(min=1.0)).clamp(min=1.0)
 
 
-def unexplained(factor: Tensor) -> Tensor:
+def diagonal_residual(factor: Tensor) -> Tensor:
     """Residual of columns (B, M, n) on the kernel's unit diagonal, (B, 1, n): 1 for a pixel like no landmark."""
     return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 
 
-def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, shard: Shard | None = None) -> None:
+def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, among: Communicator = ALONE) -> None:
     """Raise unless every image of ``stroke_mask`` (B, 1, H, W) has a scribbled pixel and all values are in [0, 1]."""
     check_unit_range(stroke_mask, name)
-    empty = reduce_max(stroke_mask.detach().amax((1, 2, 3)), shard) <= 0
+    empty = among.max(stroke_mask.detach().amax((1, 2, 3))) <= 0
     if bool(empty.any()):
         raise ValueError(
             f"{name} must hold a painted pixel in every image, got none in image(s) "

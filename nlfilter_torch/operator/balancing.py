@@ -1,7 +1,8 @@
 """Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
 The scaling of a completed kernel comes from :mod:`~nlfilter_torch.operator.newton`, that of any other from
-:mod:`~nlfilter_torch.operator.chebyshev`. Its gradient is implicit, whichever way it was found.
+:mod:`~nlfilter_torch.operator.chebyshev`. On processors, :mod:`~nlfilter_torch.operator.damped_newton` continues where
+these do not converge. The gradient is implicit and the same for all methods.
 """
 
 from dataclasses import dataclass
@@ -11,13 +12,20 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable, outer_product
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import warn
-from nlfilter_torch.core.communicator import Shard
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.communicator import ALONE, Communicator
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.operator import chebyshev, newton
+from nlfilter_torch.operator.conjugate_gradients import conjugate_gradients
+from nlfilter_torch.operator.damped_newton import damped
+from nlfilter_torch.operator.scaling import moment_of
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}  # a residual that is worth a warning, unless it was asked for
+ALARM = {
+    torch.float32: 1e-4,
+    torch.float64: 1e-9,
+}  # larger residuals raise a warning, unless the tolerance allows them
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,7 @@ class Balancing:
         scaling: d, (B, N), positive; differentiable in factor and diagonal.
         moment: ``factor @ d``, (B, M, 1) in float64, without a gradient.
         residual: largest deviation of a row sum of W from 1, (B,).
-        steps: sweeps over the factor that it took.
+        steps: number of sweeps over the factor.
     """
 
     scaling: Tensor
@@ -43,7 +51,7 @@ def balance(
     *,
     tolerance: float | None = None,
     completed: bool = False,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Balancing:
     """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
@@ -51,14 +59,14 @@ def balance(
     Args:
         factor: (B, M, N).
         diagonal: (B, N), non-negative.
-        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a residual
-            that ends above it and above 1e-4 (1e-9 in float64) raises a warning.
-        completed: that K has a unit diagonal and, but for errors, no negative entry, for which there is a quicker way.
-        shard: of the image, where other ranks have the rest of it.
-        weights: how many equal pixels each point stands for, (B, N), a constant; None is one each.
+        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a final
+            residual above it and above 1e-4 (1e-9 in float64) raises a warning.
+        completed: whether K has a unit diagonal and no negative entries but for errors; a faster method then applies.
+        among: ranks that the rows of the image are spread over.
+        weights: number of equal pixels that each point stands for, (B, N), a constant; None is one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, shard, weights)  # type: ignore[no-untyped-call]
+    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, among, weights)  # type: ignore[no-untyped-call]
     warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return Balancing(scaling, total, residual, int(steps))
 
@@ -72,15 +80,23 @@ def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dty
         warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
 
 
+def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:
+    """The residual that balancing aims at: the tolerance, or the rounding error of row sums if that is larger."""
+    pixels = among.pixels(factor.shape[2])
+    # |u . t| is formed from terms of up to |u| |t|, and |t|^2 is at most the number of pixels.
+    return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
+
+
 class _Balance(torch.autograd.Function):
     """Implicit differentiation of ``log d + log(K d) = 0``.
 
-    ``(I + W) d(log d) = -diag(d) dK d``, so with ``(I + W) x = d * g`` and ``a = d * x`` the loss changes by ``-a^T dK
-    d``: its gradient is ``-(z a^T + s d^T)`` in the factor, z = factor d, s = factor a, and ``-a d`` in the diagonal.
+    Differentiated, ``(I + W) d(log d) = -diag(d) dK d``. With g the gradient of the loss in d, ``(I + W) x = d * g``
+    and ``a = d * x``, the loss changes by ``-a^T dK d``. Its gradient is ``-(z a^T + s d^T)`` in the factor, with
+    z = factor d and s = factor a, and ``-a d`` in the diagonal.
 
     With r = d^2 c the equation reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, which solves a system of
-    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`; the estimate of its inverse
-    that balancing leaves behind preconditions conjugate gradients.
+    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`. Conjugate gradients solve it,
+    preconditioned by the approximate inverse of J from balancing.
     """
 
     @staticmethod
@@ -90,13 +106,16 @@ class _Balance(torch.autograd.Function):
         diagonal: Tensor,
         tolerance: float,
         completed: bool,
-        shard: Shard | None,
+        among: Communicator,
         weights: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, int]:
         solve = newton.solve if completed else chebyshev.solve
-        found = solve(factor, diagonal, tolerance, shard, weights)
+        found = solve(factor, diagonal, tolerance, among, weights)
+        goal = attainable(factor, tolerance, among)
+        if factor.device.type == "cpu" and not bool((found.residual <= goal).all()):
+            found = damped(factor, diagonal, found, goal, among, weights)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
-        ctx.shard, ctx.completed = shard, completed
+        ctx.among, ctx.completed = among, completed
         ctx.mark_non_differentiable(found.moment, found.residual)
         return found.scaling, found.moment, found.residual, found.sweeps
 
@@ -109,10 +128,10 @@ class _Balance(torch.autograd.Function):
             factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
-        right = moment(factor, (weight * grad).unsqueeze(1), ctx.shard)
-        solution = newton.conjugate_gradients(factor, newton.weighted(weight, weights), right, inverse, ctx.shard)
-        affinity = newton.weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
+        right = moment_of(factor, weight * grad, ctx.among, None)
+        solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, ctx.among)
+        affinity = weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
-        grad_factor = outer_product(totals, torch.stack([-a, -newton.weighted(scaling, weights)], dim=1).to(dtype))
+        grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))
         return grad_factor, (-a * scaling).to(dtype), None, None, None, None

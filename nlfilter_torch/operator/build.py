@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import root_weighted
 from nlfilter_torch.core.checks import (
     called_by_edit,
     check_choice,
@@ -23,20 +24,19 @@ from nlfilter_torch.core.checks import (
     warn,
     warn_of_scale,
 )
-from nlfilter_torch.core.communicator import Shard, meet, reduce_max, replicate, with_halo
+from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.balancing import Balancing, balance, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
-from nlfilter_torch.operator.newton import PixelScaling, isolated, root_mass, row_sums, weighted
-from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.scaling import PixelScaling, isolated, moment_of, row_sums
 
-ROUNDS = 8  # in which isolated pixels are taken out; one or two are the rule
+ROUNDS = 8  # most rounds in which isolated pixels are removed; one or two are usual
 
 
 def check_options(
@@ -48,7 +48,7 @@ def check_options(
     generator: torch.Generator | None,
     guide_channels: str = "all",
 ) -> None:
-    """Raise unless those options of :func:`nonlocal_operator` are right that can be checked without its guide."""
+    """Check the options of :func:`nonlocal_operator` that do not depend on its guide."""
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     remedy = "choose one of these, and pass how many there are as num_landmarks"
     check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
@@ -89,7 +89,7 @@ def nonlocal_operator(
 
     Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
     autocast too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks
-    (for k-means, the assignment of pixels to centroids) held.
+    (for k-means, the assignment of pixels to centroids) held fixed.
 
     Args:
         guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
@@ -101,18 +101,18 @@ def nonlocal_operator(
         spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
-        completion: ``"diagonal"`` puts back on the diagonal what the landmarks miss; ``"none"`` is the paper's method,
-            which fails at small bandwidths.
+        completion: ``"diagonal"`` corrects the diagonal of the kernel to 1; ``"none"`` is the paper's method, which
+            fails at small bandwidths.
         guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides
             of another number of channels are taken whole.
         patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
         tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
         generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
             never used.
-        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is what
-            this rank has of them, from the top of the image down. All ranks make the same calls, and get what one
-            process would, for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, which
-            ``torch.distributed.group.WORLD`` is as well before there is one, is the whole image here.
+        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is the
+            rows of this rank, from the top of the image down. All ranks make the same calls, and get the results of one
+            process for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, or
+            ``torch.distributed.group.WORLD`` before it is initialised, means that the whole image is here.
 
     Returns:
         The operator, with row sums of 1 to ``tolerance`` or to rounding.
@@ -147,24 +147,24 @@ def nonlocal_operator(
     if _is_small(photometric_bandwidth) and not called_by_edit():
         warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-    shard = meet(guide, group)
+    among = all_gather_shapes(guide, group)
     size = (guide.shape[2], guide.shape[3])  # here
-    height, width = size if shard is None else (shard.height, shard.width)
-    weights = unit_window(patch_size, replicate(patch_weights, shard)).to(guide)
-    guide, halo = with_halo(guide, max(weights.shape[0] // 2, 1), shard)
+    height, width = among.whole(size)
+    weights = unit_window(patch_size, among.copy_to_group(patch_weights)).to(guide)
+    guide, halo = among.with_halo(guide, max(weights.shape[0] // 2, 1))
     if isinstance(photometric_bandwidth, str):
-        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, shard)
+        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, among)
     else:
-        bandwidth = replicate(photometric_bandwidth, shard)
+        bandwidth = among.copy_to_group(photometric_bandwidth)
     largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
         farthest = torch.full_like(largest, max(height, width))
         check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
-        spatial_bandwidth = replicate(spatial_bandwidth, shard)
+        spatial_bandwidth = among.copy_to_group(spatial_bandwidth)
     recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
     return assemble(
-        recipe(guide, origin=(0 if shard is None else shard.first - halo[0], 0), halo=halo),
+        recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo),
         size,
         recipe=recipe,
         num_landmarks=num_landmarks,
@@ -172,7 +172,7 @@ def nonlocal_operator(
         completion=completion,
         tolerance=tolerance,
         generator=generator,
-        shard=shard,
+        among=among,
     )
 
 
@@ -190,13 +190,13 @@ def operator_from_features(
     generator: torch.Generator | None = None,
     group: Any = None,
 ) -> NonlocalOperator:
-    """The filter of any points, given what is compared: landmarks, Nystrom factor, completion and balancing.
+    """The filter of any points, given their features: landmarks, Nystrom factor, completion and balancing.
 
     Points may be the pixels of an image, every n-th of them, a weighted sample, the voxels of a volume, a point cloud.
     :func:`nonlocal_operator` is this function on the weighted patches of a guide.
 
     Args:
-        features: (B, D, N), for which the affinity of two points is ``exp(-|x_i - x_j|^2)``: divide them by bandwidths.
+        features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
         size: (H, W) with H * W = N, the shape of images that are filtered; (N,), which is (1, N), for points in no
             order.
         weights: (N,) or (B, N), positive: how many equal pixels each point stands for. Landmarks are drawn in
@@ -206,7 +206,7 @@ def operator_from_features(
         completion: see there.
         tolerance: see there.
         generator: see there.
-        group: see there; ``features`` and ``size`` are then what this rank has of whole rows.
+        group: see there; ``features`` and ``size`` are then of the rows of this rank.
 
     Returns:
         The operator. Differentiable once in the features.
@@ -233,7 +233,7 @@ def operator_from_features(
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
-    shard = meet(features.unflatten(2, shape), group)
+    among = all_gather_shapes(features.unflatten(2, shape), group)
     return assemble(
         features,
         shape,
@@ -243,7 +243,7 @@ def operator_from_features(
         completion=completion,
         tolerance=tolerance,
         generator=generator,
-        shard=shard,
+        among=among,
     )
 
 
@@ -258,10 +258,10 @@ def assemble(
     generator: torch.Generator | None,
     recipe: GuideFeatures | None = None,
     weights: Tensor | None = None,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
 ) -> NonlocalOperator:
-    """The one way from features (B, D, N) to an operator; ``recipe`` is how they came from a guide, if they did."""
-    whole = size if shard is None else (shard.height, shard.width)
+    """Features (B, D, N) to operator; ``recipe`` says how they were computed, if they come from a guide."""
+    whole = among.whole(size)
     points = whole[0] * whole[1]
     if num_landmarks > points:
         warn(
@@ -269,32 +269,33 @@ def assemble(
             "using every pixel"
         )
         num_landmarks = points
-    chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, shard, weights)
-    kernel = Kernel(chosen, whitener(chosen), completion, features=recipe)
+    chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, among, weights)
+    kernel = Kernel(chosen, inverse_cholesky(chosen), completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = completion == "diagonal", factor.device.type == "cpu"
 
-    def balanced() -> Balancing:
-        return balance(factor, diagonal, tolerance=tolerance, completed=completed, shard=shard, weights=weights)
+    def balanced() -> tuple[Balancing, float]:
+        found = balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
+        return found, float(found.residual.max()) if watched else 0.0
 
-    balancing = balanced()
+    balancing, worst = balanced()
     before: list[Tensor] = []
     while completed and watched and len(before) < ROUNDS:
-        alone = isolated(balancing.scaling.detach(), float(balancing.residual.max()))
-        if not bool(reduce_max(alone.any().to(factor), shard)):
+        alone = isolated(balancing.scaling.detach(), worst)
+        if not bool(among.max(alone.any().to(factor))):
             break
         before.append(balancing.moment)
         factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
-        balancing = balanced()
+        balancing, worst = balanced()
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = shifted_gram(factor, root_mass(scaling, weights), remainder, shard)
-    allowed = slack(factor.dtype, float(residual.max())) if watched else 0.0
+    gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, among)
+    allowed = slack(factor.dtype, worst)
     if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, moment(factor, weighted(scaling, weights).unsqueeze(1), shard), allowed)
+        limit = limiter(gram, moment_of(factor, scaling, among, weights), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
-        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), shard, weights)
+        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), among, weights)
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return NonlocalOperator(
         factor=factor,
@@ -303,17 +304,15 @@ def assemble(
         size=size,
         kernel=kernel,
         remainder=remainder,
-        balancing=PixelScaling(
-            balancing.moment, completed, float(balancing.residual.max()) if watched else 0.0, tuple(before)
-        ),
+        balancing=PixelScaling(balancing.moment, completed, worst, tuple(before)),
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,
-        shard=shard,
+        among=among,
     )
 
 
-def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, shard: Shard | None, weights: Tensor | None) -> Tensor:
+def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
     """Largest deviation of a row sum from 1, (B,)."""
-    sums = row_sums(factor, diagonal, scaling, moment(factor, weighted(scaling, weights).unsqueeze(1), shard))
-    return reduce_max((sums - 1).abs().amax(1), shard)
+    sums = row_sums(factor, diagonal, scaling, moment_of(factor, scaling, among, weights))
+    return among.max((sums - 1).abs().amax(1))

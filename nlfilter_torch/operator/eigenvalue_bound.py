@@ -13,11 +13,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.communicator import Shard, reduce_sum
+from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator.spectrum import compute_grams
 
-# By which rounding and the tolerance of row sums may exceed 1: more than the r of a pixel that is not isolated.
+# By how much eigenvalues may exceed 1 through rounding and inexact row sums; r of a pixel exceeds 1 by less.
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}
 MAX_STEPS = 12
 ALWAYS = 1 << 22  # numbers of a factor; up to here the bound takes a few milliseconds
@@ -35,12 +35,12 @@ def is_bounded(sampling: str, pixels: int, num_landmarks: int) -> bool:
     return sampling != "kmeans" or pixels * num_landmarks <= ALWAYS
 
 
-def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, shard: Shard | None) -> ShiftedGram:
+def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, among: Communicator) -> ShiftedGram:
     """The matrices S of an image in memory: factor (B, M, N), d (B, N), r (B, N); differentiable."""
 
     def gram(at: Tensor, power: int) -> Tensor:
         weights = shift(at, remainder).pow(-power / 2)
-        return reduce_sum(compute_grams(factor, (scaling * weights).to(factor), None, 1)[:, 0], shard)
+        return among.sum(compute_grams(factor, (scaling * weights).to(factor), None, 1)[:, 0])
 
     return gram
 

@@ -21,7 +21,7 @@ from nlfilter_torch.core.checks import (
     check_patch_size,
     check_tensor,
 )
-from nlfilter_torch.core.communicator import Shard, meet, reduce_sum, with_halo
+from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, working_dtype
 
 GuideChannels = Literal["luminance", "all"]
@@ -65,7 +65,7 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
     """(B, 3, H, W) to luminance (B, 1, H, W) unless ``guide_channels`` is ``"all"``; other guides are taken whole."""
     if guide_channels == "luminance" and guide.shape[1] == 3:
-        from kornia.color import rgb_to_grayscale  # kornia takes half a second to import: only who needs it waits
+        from kornia.color import rgb_to_grayscale  # importing kornia takes half a second
 
         return rgb_to_grayscale(guide)
     return guide
@@ -86,7 +86,7 @@ def extract_features(
     Paper: eq. (1), with the mean over channels where the guide has several, and eq. (18).
 
     Args:
-        guide: (B, C, H, W), already reduced to the channels that count.
+        guide: (B, C, H, W), already reduced to the channels that are compared.
         patch_weights: (p, p), non-negative, of unit sum; differentiable.
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
         spatial_bandwidth: h_x in pixels, likewise; None leaves the coordinates out.
@@ -102,7 +102,7 @@ def extract_features(
     size = patch_weights.shape[0]
     scale = patch_weights.to(guide).div(channels).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
     padded = pad_border(guide, size // 2)
-    # Real rows push as many reflected ones out: where the halo is shorter than the margin, the border is near.
+    # Rows of the halo replace reflected ones; a halo shorter than the margin ends at the border of the image.
     padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
     features: Tensor = (
         _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
@@ -129,7 +129,7 @@ def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:
 
 
 class _ScaledPatches(torch.autograd.Function):
-    """Every offset of the patch as a plane of its own: a shifted copy of the image times the weight of that offset."""
+    """A plane for each offset of the patch: a shifted copy of the image times the weight of that offset."""
 
     @staticmethod
     def forward(ctx: Any, padded: Tensor, scale: Tensor) -> Tensor:
@@ -182,17 +182,17 @@ SMALLEST = 1.0 / 255.0  # a flat image has no gradient; one grey level keeps the
 
 @full_precision
 def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "luminance", group: Any = None) -> Tensor:
-    """Photometric bandwidth h_y from the mean gradient magnitude: 2.5 times it, at least one grey level of 255.
+    """Photometric bandwidth h_y: 2.5 times the mean gradient magnitude, at least one grey level of 255.
 
     Paper: eq. (20), whose 1/n is read as the mean (outside the root it would make the bandwidth shrink with the image).
 
     Args:
         guide: (B, C, H, W) in [0, 1].
         guide_channels: ``"luminance"`` reduces three channels to one; ``"all"`` takes the mean over channels.
-        group: of :func:`nonlocal_operator`: ``guide`` is then what this rank has of the rows.
+        group: as of :func:`nonlocal_operator`: ``guide`` is then the rows of this rank.
 
     Returns:
-        (B,), in units of the guide. Constant, as no gradient reaches the guide through it.
+        (B,), in units of the guide, without a gradient.
 
     Raises:
         TypeError, ValueError: if ``guide`` is not a finite floating-point (B, C, H, W) tensor.
@@ -205,16 +205,16 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-        shard = meet(rows, group)
-        return bandwidth_of_rows(*with_halo(rows, 1, shard), shard)
+        among = all_gather_shapes(rows, group)
+        return bandwidth_of_rows(*among.with_halo(rows, 1), among)
 
 
-def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], shard: Shard | None) -> Tensor:
-    """:func:`estimate_bandwidth` from some rows of an image, and as many of their neighbours as ``halo`` tells."""
+def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], among: Communicator) -> Tensor:
+    """:func:`estimate_bandwidth` from some rows of an image with a halo of neighbouring rows."""
     with torch.no_grad():
         magnitude = gradients(guide, halo)
-        count = magnitude[0].numel() if shard is None else guide.shape[1] * shard.pixels
-        mean = reduce_sum(magnitude.sum((1, 2, 3), dtype=torch.float64), shard) / count
+        count = magnitude.shape[1] * among.pixels(magnitude[0, 0].numel())
+        mean = among.sum(magnitude.sum((1, 2, 3), dtype=torch.float64)) / count
         return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 
@@ -226,7 +226,7 @@ def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
     right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
     magnitude = (down.square() + right.square()).sqrt()
     if magnitude.device.type != "cpu" or not bool(magnitude.sum().isfinite()):
-        # Cannot overflow, but on a processor the last digit may depend on the place of a pixel, and so on tiles.
+        # hypot cannot overflow, but on processors its last digit depends on the position in memory, and so on tiles.
         magnitude = torch.hypot(down, right)
     return magnitude[:, :, halo[0] : guide.shape[2] - halo[1]]
 

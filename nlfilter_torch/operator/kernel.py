@@ -1,8 +1,8 @@
-"""The recipe of a fitted operator: all that it takes to compute the columns of points it has not seen.
+"""Guide to features, and features to columns of the factor, for pixels that the operator was not built from.
 
-A pixel's column of the factor is a function of its own patch and of the landmarks; its scaling is a closed form of
-that column and of one m-vector. Tiles of an image that fits no memory, rows on another machine and the other frames of
-a film are therefore exact, without seams and without flicker, as long as landmarks and moments are shared.
+A pixel's column of the factor is a function of its own patch and of the landmarks; its scaling follows from that column
+and one m-vector. Tiles of a large image, rows on another machine and other frames of a film therefore get exact
+columns, without seams or flicker, if they share landmarks and moments.
 """
 
 from dataclasses import dataclass
@@ -37,9 +37,9 @@ class GuideFeatures:
         Args:
             guide: with the channels of the guide that the landmarks come from.
             origin: row and column of its first pixel in the coordinates of that guide, for tiles.
-            halo: rows at the top and at the bottom of a tile that only patches reach into; they get no features. Half
-                a patch, or as many as there are before the border of the whole guide.
-            stride: n, for the pixel in the middle of each square of n x n pixels alone, with its patch of the guide.
+            halo: rows at the top and at the bottom of a tile that patches reach into but that get no features: half a
+                patch, or fewer at the border of the whole guide.
+            stride: n, for features of only the pixel in the middle of each square of n x n pixels.
         """
         return extract_features(
             reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels),
@@ -58,14 +58,14 @@ class Kernel:
 
     Attributes:
         landmarks: (B, D, M).
-        whitening: (B, M, M).
+        inverse_cholesky: (B, M, M).
         completion: ``"diagonal"`` or ``"none"``.
         limiter: (B, M, M) that the factor is multiplied by so that no eigenvalue of W exceeds 1, or None.
         features: how features come from a guide; None where the operator was made from features.
     """
 
     landmarks: Tensor
-    whitening: Tensor
+    inverse_cholesky: Tensor
     completion: Completion
     limiter: Tensor | None = None
     features: GuideFeatures | None = None
@@ -92,5 +92,5 @@ class Kernel:
 
     def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
-        factor, diagonal = nystrom_factor(features, self.landmarks, self.whitening, self.completion)
+        factor, diagonal = nystrom_factor(features, self.landmarks, self.inverse_cholesky, self.completion)
         return factor if self.limiter is None else self.limiter @ factor, diagonal

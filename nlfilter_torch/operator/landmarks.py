@@ -1,4 +1,4 @@
-"""Features to landmarks, the few points through which every affinity passes. Paper: Sec. II-C, set A."""
+"""Features to landmarks, the few points that all affinities are computed from. Paper: Sec. II-C, set A."""
 
 from functools import partial
 from typing import Literal
@@ -6,14 +6,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.communicator import Shard, from_first, gather_columns
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
-EXPLAINED = 1e-4  # a residual of the unit diagonal below which a point counts as explained
+CAPTURED = 1e-4  # a point with a residual below this on the unit diagonal counts as captured
 # More features or iterations move the centroids by less than their sampling error: at 512x400 pixels and m = 100, twice
-# as many features lower the mean diagonal, what the landmarks miss, by at most 2 %; ten iterations by at most 3 %.
+# as many features lower the mean diagonal correction by at most 2 %; ten iterations by at most 3 %.
 PER_LANDMARK = 64
 STARTED_FROM = 32  # of them; more do not lower the error of W y
 # Without bounds the cost would be quadratic in the number of landmarks. At 256x256 and m = 1000, 16384 candidates raise
@@ -36,7 +36,7 @@ def choose_landmarks(
     count: int,
     sampling: Sampling,
     generator: torch.Generator | None,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
     """Choose or compute ``count`` landmarks.
@@ -47,8 +47,9 @@ def choose_landmarks(
         count: M, at most N. With M = N the landmarks are the pixels themselves.
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
-        generator: source of randomness; None seeds a new one with 0, so that equal calls give equal landmarks.
-        shard: of the image; N is then the pixels here, and the first rank's choices hold.
+        generator: source of randomness; None is a new one with seed 0, so that equal calls give equal landmarks.
+        among: ranks that the rows of the image are spread over; N is then the number of pixels here, and all ranks use
+            what the first one draws.
         weights: (B, N), how many pixels each point stands for: candidates of k-means are drawn in proportion to them.
 
     Returns:
@@ -56,19 +57,19 @@ def choose_landmarks(
         same pixels, so that a batch gives what single calls give.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    if count == features.shape[-1] and shard is None:
+    if count == features.shape[-1] and among.size == 1:
         return features
     pixels = (
         _candidates_by_weight(weights.mean(0), count, generator)
         if weights is not None and sampling == "kmeans"
         else candidate_pixels(size, count, sampling, generator)
     )
-    pixels = from_first(pixels.to(features.device), shard)
-    return condense(gather_columns(features, pixels, shard), count, generator, shard)
+    pixels = among.broadcast(pixels.to(features.device))
+    return condense(among.columns(features, pixels), count, generator, among)
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
-    """Indices of the pixels whose features :func:`condense` makes ``count`` landmarks of, all different."""
+    """Indices of distinct pixels, from whose features :func:`condense` computes ``count`` landmarks."""
     pixels = size[0] * size[1]
     if count == pixels:
         return torch.arange(pixels)
@@ -93,7 +94,7 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
     )
 
 
-def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shard | None = None) -> Tensor:
+def condense(subset: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE) -> Tensor:
     """Landmarks (B, D, M) from the features (B, D, S) of the candidates: centroids where there are more than M."""
     if subset.shape[2] == count:
         return subset
@@ -103,9 +104,9 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, shard: Shar
     # Half of them start the clusters, drawn at random.
     few = torch.randperm(points.shape[2], generator=generator, device=generator.device)
     few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)].to(points.device)
-    chosen = _pivots(gather_columns(points, few, None), count, generator)
-    start = from_first(few[chosen], shard).unsqueeze(1)  # (B, 1, M)
-    assignment = from_first(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps), shard)
+    chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
+    start = among.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
+    assignment = among.broadcast(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps))
     return _cluster_means(subset, assignment, pick(subset, start))
 
 
@@ -141,7 +142,7 @@ def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
 def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices (B, count) of points (B, D, S) to start k-means from: the pivots of a random Cholesky decomposition.
 
-    Each is drawn by what the ones before leave unexplained of the kernel's unit diagonal (Chen, Epperly, Tropp and
+    Each is drawn by what the ones before do not capture of the kernel's unit diagonal (Chen, Epperly, Tropp and
     Webber, 2022). Patches that are rare but unlike all others get a landmark, which a uniform draw would miss, and
     k-means would never move one there. The fourth power is greedier than the residual itself: at h_y = 40/255 the
     error of W y on the small astronaut of benchmarks.accuracy is 0.55 grey levels with it, 0.79 with the first power,
@@ -152,7 +153,7 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         offsets = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points.device)
         images = points.split(1) if points.device.type == "cpu" else [points]  # columns of one at a time
         return torch.cat([_pivots_by_blocks(image, draws, offsets) for image in images])
-    return pivots(points, draws, EXPLAINED)
+    return pivots(points, draws, CAPTURED)
 
 
 def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
@@ -170,15 +171,15 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
     for block, offset in zip(draws.split(BLOCK), offsets, strict=False):
         first = sum(pivot.shape[2] for pivot in found)
         before = columns[:, :first]
-        odds = chance(residual, EXPLAINED)
+        odds = chance(residual, CAPTURED)
         odds += odds.mean(2, keepdim=True)
         summed = odds.cumsum(2, dtype=torch.float64)
         ticks = (torch.arange(PROPOSED * len(block), device=points.device) + offset) / (PROPOSED * len(block))
         proposed = torch.searchsorted(summed, summed[:, :, -1:] * ticks).clamp_(max=size - 1)  # (B, 1, P)
         few, lengths, known = (pick(planes, proposed) for planes in (points, norms, before))
-        among = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
+        shared = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
         chosen, rows, scales = draw_pivots(
-            partial(_row, among), pick(residual, proposed), pick(odds, proposed), block, EXPLAINED
+            partial(_row, shared), pick(residual, proposed), pick(odds, proposed), block, CAPTURED
         )
         found.append(proposed.gather(2, chosen))  # (B, 1, n)
         few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))

@@ -1,8 +1,8 @@
 """Features and landmarks to a factor of the affinity matrix: ``K ~ factor^T factor + diag(diagonal)``.
 
-Paper: Sec. II-C. The paper takes square roots and pseudo-inverses of the sampled block; here it is whitened by its
-Cholesky factor, and what the landmarks miss is put back on the diagonal (``completion``), so that K keeps its unit
-diagonal and a pixel like no other keeps its value. The plain method gives such a pixel a row of about zero.
+Paper: Sec. II-C. Where the paper takes square roots and pseudo-inverses of the landmark block, the inverse of its
+Cholesky factor is used here. ``completion`` restores the unit diagonal of K, so that a pixel unlike all landmarks keeps
+its value; without it the row of such a pixel is nearly zero.
 """
 
 from typing import Any, Literal
@@ -17,11 +17,11 @@ from nlfilter_torch.core.kernels.columns import columns, columns_backward
 Completion = Literal["diagonal", "none"]
 
 CANCELLATION = 1e-7  # error of a squared distance between landmarks from which the products are avoided
-JITTER = 1e-5  # bounds the amplification of rounding by the whitening at 316, which float32 can bear
+JITTER = 1e-5  # added to the landmark block; the inverse Cholesky factor then amplifies rounding at most 316 times
 
 
-def whitener(landmarks: Tensor) -> Tensor:
-    """Inverse Cholesky factor (B, M, M) of the affinities between ``landmarks`` (B, D, M), worked out in float64."""
+def inverse_cholesky(landmarks: Tensor) -> Tensor:
+    """Inverse Cholesky factor (B, M, M) of the affinities between ``landmarks`` (B, D, M), computed in float64."""
     points = landmarks.double()
     points = points - points.mean(dim=2, keepdim=True)
     squared = _squared_distances(points)
@@ -43,34 +43,34 @@ def _squared_distances(points: Tensor) -> Tensor:
 
 
 def nystrom_factor(
-    features: Tensor, landmarks: Tensor, whitening: Tensor, completion: Completion
+    features: Tensor, landmarks: Tensor, inverse: Tensor, completion: Completion
 ) -> tuple[Tensor, Tensor]:
     """Nystrom factor of the affinities of every pixel, and the diagonal that completes it.
 
     Args:
         features: (B, D, N).
         landmarks: (B, D, M).
-        whitening: (B, M, M) of :func:`whitener`.
+        inverse: (B, M, M) of :func:`inverse_cholesky`.
         completion: ``"diagonal"`` or ``"none"``.
 
     Returns:
         factor (B, M, N) with columns of norm at most 1, and diagonal (B, N) in [0, 1] (zero without completion).
         Differentiable once in the three tensors; the backward pass recomputes the affinities block by block.
     """
-    factor, diagonal, _ = _NystromFactor.apply(features, landmarks, whitening, completion == "diagonal")  # type: ignore[no-untyped-call]
+    factor, diagonal, _ = _NystromFactor.apply(features, landmarks, inverse, completion == "diagonal")  # type: ignore[no-untyped-call]
     return factor, diagonal
 
 
 class _NystromFactor(torch.autograd.Function):
-    """u = A c(x, z), scaled to norm at most 1, and 1 - |u|^2; the third output is the scale, kept for the backward."""
+    """u = A c(x, z), scaled to norm at most 1, and 1 - |u|^2; the third output is the scale, for the backward pass."""
 
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, landmarks: Tensor, whitening: Tensor, complete: bool
+        ctx: Any, features: Tensor, landmarks: Tensor, inverse: Tensor, complete: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        factor, norms = columns(features, landmarks, whitening, limited=complete)
+        factor, norms = columns(features, landmarks, inverse, limited=complete)
         diagonal, scale = (1.0 - norms).clamp_(min=0.0), norms.clamp_(min=1.0).rsqrt_()
-        ctx.save_for_backward(features, landmarks, whitening, factor, scale)
+        ctx.save_for_backward(features, landmarks, inverse, factor, scale)
         ctx.complete = complete
         ctx.mark_non_differentiable(scale)
         return factor, diagonal, scale
@@ -78,11 +78,11 @@ class _NystromFactor(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        features, landmarks, whitening, factor, scale = ctx.saved_tensors
+        features, landmarks, inverse, factor, scale = ctx.saved_tensors
         gradients = columns_backward(
             features,
             landmarks,
-            whitening,
+            inverse,
             limited=ctx.complete,
             factor=factor,
             scale=scale,

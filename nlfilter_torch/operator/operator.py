@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import fold_batch, unfold_batch
+from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
 from nlfilter_torch.core.checks import (
     check_count,
     check_features,
@@ -13,14 +13,14 @@ from nlfilter_torch.core.checks import (
     check_order,
     check_same_size,
 )
-from nlfilter_torch.core.communicator import Shard, check_whole, reduce_max, reduce_sum
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling, root_mass, weighted
 from nlfilter_torch.operator.products import apply_powers
+from nlfilter_torch.operator.scaling import PixelScaling, moment_of
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
@@ -28,7 +28,7 @@ DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """What an operator knows of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i and j are one.
+    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
 
     Attributes:
         factor: u, (B, M, n).
@@ -43,20 +43,20 @@ class Columns:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Figures that tell how good an operator is; those of shape (B,) are lists with one entry per image.
+    """Measures of the quality of an operator; lists have one entry per image.
 
     Attributes:
         pixels: N.
         num_landmarks: M.
-        rank: eigenvectors that rise above rounding.
+        rank: number of eigenvectors above rounding.
         photometric_bandwidth: h_y in units of the guide; 1 for an operator that was made from features.
-        balancing_steps: sweeps over the factor that balancing took.
+        balancing_steps: number of sweeps over the factor in balancing.
         row_sum_residual: largest deviation of a row sum from 1.
-        smallest_row_sum: the least row sum of the kernel before balancing; the plain method fails as it nears zero.
+        smallest_row_sum: smallest row sum of the kernel before balancing; without completion W fails as it nears zero.
         largest_eigenvalue: an upper bound, as :meth:`NonlocalOperator.certify` has it.
         eigenvector_residual: largest ||W v - lambda v|| over the unit eigenvectors.
         orthogonality: largest deviation of V V^T from the identity.
-        diagonal_share: mean of the diagonal part r of W: how much of a pixel the landmarks leave to itself.
+        diagonal_share: mean of the diagonal part r of W, the weight with which a pixel keeps its own value.
     """
 
     pixels: int
@@ -74,7 +74,7 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What an operator keeps of its promises, measured; lists with one entry per image.
+    """Measured properties of an operator; lists have one entry per image.
 
     Attributes:
         symmetry: difference of ``x^T W y`` and ``y^T W x`` for random images x and y, relative to their lengths.
@@ -100,17 +100,17 @@ class NonlocalOperator:
 
     Attributes:
         factor: U, (B, M, N), pixels last.
-        diagonal: c, (B, N), what the landmarks miss of the kernel's unit diagonal; zeros without completion.
+        diagonal: c, (B, N), the diagonal correction that gives the kernel its unit diagonal; zeros without completion.
         scaling: d, (B, N), positive.
         size: (H, W).
-        kernel: the recipe of factor and diagonal, for the pixels of other guides.
+        kernel: computes factor and diagonal of the pixels of other guides.
         remainder: r, (B, N), the diagonal part of W.
         weights: how many pixels each point stands for, (B, N); None is one each. ``W y`` is then
             ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points stand for.
-        balancing: what the scaling of other pixels is a function of.
+        balancing: computes the scaling of other pixels.
         residual: largest deviation of a row sum of W from 1, (B,).
-        balancing_steps: sweeps over the factor that balancing took.
-        shard: of the image, where other ranks have the rest of it; everything above is then what is here.
+        balancing_steps: number of sweeps over the factor in balancing.
+        among: ranks that the rows of the image are spread over; all attributes are then of the rows here.
     """
 
     factor: Tensor
@@ -123,10 +123,10 @@ class NonlocalOperator:
     residual: Tensor
     balancing_steps: int
     weights: Tensor | None = None
-    shard: Shard | None = None
+    among: Communicator = ALONE
 
     def at(self, features: Tensor) -> Columns:
-        """What W knows of any points: their columns, as functions of their own features and of sums over the image.
+        """The columns of any points, computed from their own features and from sums over the image.
 
         Args:
             features: (B, D, n), of points of the image or of another one, with the meaning and scale of the features
@@ -164,16 +164,16 @@ class NonlocalOperator:
         check_image(image, "image")
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
-        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.shard, self.weights)
+        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.among, self.weights)
         return unfold_batch(planes, image.shape[0], self.size)
 
     @property
     def diagonal_share(self) -> Tensor:
-        """What W takes of a pixel's own value for want of pixels like it, r in [0, 1] as (B, 1, H, W)."""
+        """The weight r in [0, 1] with which a pixel keeps its own value where few pixels are similar, (B, 1, H, W)."""
         return self.remainder.unflatten(1, self.size).unsqueeze(1)
 
     def row_sums(self) -> Tensor:
-        """(B, 1, H, W), one everywhere to :attr:`residual`."""
+        """Row sums of W, (B, 1, H, W): one everywhere, with an error of at most :attr:`residual`."""
         batch = self.factor.shape[0]
         return self.matmul(self.factor.new_ones(batch, 1, *self.size))
 
@@ -184,16 +184,14 @@ class NonlocalOperator:
         Raises:
             ValueError: if the image has more than 16384 pixels, or not all of them are here.
         """
-        check_whole(self.shard, "to_dense")
+        self.among.check_whole("to_dense")
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
                 f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
             )
         scaled = self.factor * self.scaling.unsqueeze(1)  # F first: without completion U may be too small to square
-        matrix = scaled.mT @ scaled
-        matrix = matrix if self.weights is None else matrix * self.weights.unsqueeze(1)
-        return matrix + torch.diag_embed(self.remainder)
+        return weighted(scaled.mT @ scaled, self.weights) + torch.diag_embed(self.remainder)
 
     @uncompiled
     @full_precision
@@ -209,12 +207,12 @@ class NonlocalOperator:
         if rank is not None:
             check_count(rank, "rank")
         remainder = self.remainder if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.shard, self.weights)
+        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.among, self.weights)
 
     @full_precision
     @torch.no_grad()
     def certify(self) -> "Certificate":
-        """Measure whether W is what it promises to be, for the price of a spectrum's Gram matrix and three products.
+        """Measure symmetry, row sums and eigenvalue bounds of W, at the cost of a Gram matrix and three products.
 
         Example:
             >>> from nlfilter_torch import nonlocal_operator
@@ -230,13 +228,13 @@ class NonlocalOperator:
         x, y = images.expand(batch, -1, -1, -1).split(1, dim=1)
         products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().flatten(2)
         products = weighted(products, self.weights).sum(2)
-        inner = reduce_sum(products, self.shard)
-        lengths = reduce_sum(images.double().square().sum((0, 2, 3)), self.shard)
-        highest, lowest = (reduce_max((sign * self.remainder).amax(1), self.shard) for sign in (1, -1))
-        gram = shifted_gram(self.factor, root_mass(self.scaling, self.weights), self.remainder, self.shard)
+        inner = self.among.sum(products)
+        lengths = self.among.sum(images.double().square().sum((0, 2, 3)))
+        highest, lowest = (self.among.max((sign * self.remainder).amax(1)) for sign in (1, -1))
+        gram = shifted_gram(self.factor, root_weighted(self.scaling, self.weights), self.remainder, self.among)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
-            row_sums=reduce_max((self.row_sums() - 1).abs().amax((1, 2, 3)), self.shard).tolist(),
+            row_sums=self.among.max((self.row_sums() - 1).abs().amax((1, 2, 3))).tolist(),
             smallest_eigenvalue=(-lowest).tolist(),
             largest_eigenvalue=largest_eigenvalue(gram, highest, self.factor.dtype).tolist(),
         )
@@ -244,19 +242,18 @@ class NonlocalOperator:
     @full_precision
     @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
-        """Measure how good the operator is. Costs several times as much as the spectrum."""
+        """Measure the quality of the operator. Costs several times as much as the spectrum."""
         spectrum, certificate = self.spectrum(), self.certify()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]
         image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
         error = (image - spectrum.eigenvalues[:, :, None, None] * vectors).square().flatten(2)
         error = weighted(error, self.weights).sum(2)
-        residual = reduce_sum(error, self.shard).sqrt()
+        residual = self.among.sum(error).sqrt()
         flat = vectors.flatten(2)
-        inner = reduce_sum(weighted(flat, self.weights) @ flat.mT, self.shard)
+        inner = self.among.sum(weighted(flat, self.weights) @ flat.mT)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
-        ones = weighted(torch.ones_like(self.scaling), self.weights).unsqueeze(1)
-        total = moment(self.factor, ones, self.shard).to(self.factor)
+        total = moment_of(self.factor, torch.ones_like(self.scaling), self.among, self.weights).to(self.factor)
         kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
         recipe = self.kernel.features
         bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)
@@ -267,11 +264,9 @@ class NonlocalOperator:
             photometric_bandwidth=bandwidth.expand(self.factor.shape[0]).tolist(),
             balancing_steps=self.balancing_steps,
             row_sum_residual=certificate.row_sums,
-            smallest_row_sum=(-reduce_max(-kernel_sums.amin(1), self.shard)).tolist(),
+            smallest_row_sum=(-self.among.max(-kernel_sums.amin(1))).tolist(),
             largest_eigenvalue=certificate.largest_eigenvalue,
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(
-                reduce_sum(weighted(self.remainder, self.weights).sum(1), self.shard) / spectrum.pixels
-            ).tolist(),
+            diagonal_share=(self.among.sum(weighted(self.remainder, self.weights).sum(1)) / spectrum.pixels).tolist(),
         )

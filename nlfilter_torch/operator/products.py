@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable, outer_product
-from nlfilter_torch.core.communicator import Shard
+from nlfilter_torch.core.blocks import weighted
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 
 
@@ -16,7 +17,7 @@ def apply_powers(
     remainder: Tensor,
     image: Tensor,
     order: int,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
     """``W y, W^2 y, ..., W^k y``.
@@ -27,17 +28,17 @@ def apply_powers(
         remainder: r, (B, N).
         image: y, (B, C, N).
         order: k, at least 1.
-        shard: of the image, where other ranks have the rest of it.
-        weights: how many equal pixels each point stands for, (B, N); None is one each.
+        among: ranks that the rows of the image are spread over.
+        weights: number of equal pixels that each point stands for, (B, N); None is one each.
 
     Returns:
-        (B, k, C, N). Differentiable in everything; in the image any number of times and in forward mode, too, as long
-        as the operator needs no gradient.
+        (B, k, C, N). Differentiable in everything. If the operator needs no gradient, differentiable any number of
+        times in the image, and in forward mode.
     """
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
-        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, shard, weights)  # type: ignore[no-untyped-call]
+        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, among, weights)  # type: ignore[no-untyped-call]
         return result
-    images, _ = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard, weights)
+    images, _ = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, among, weights)
     return torch.stack(images[1:], dim=1)
 
 
@@ -47,21 +48,21 @@ def _powers(
     remainder: Tensor,
     image: Tensor,
     order: int,
-    shard: Shard | None,
+    among: Communicator,
     weights: Tensor | None,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """The k + 1 images from y to W^k y, and the k moments (B, M, C) that they passed through."""
+    """The k + 1 images from y to W^k y, and the k moments (B, M, C) of the images from y to W^(k-1) y."""
     images, moments = [image], []
-    each = scaling if weights is None else scaling * weights.unsqueeze(1)
+    each = weighted(scaling, weights)
     for _ in range(order):
-        moments.append(moment(factor, each * images[-1], shard).to(factor))
+        moments.append(among.sum(moment(factor, each * images[-1])).to(factor))
         smooth = spread(moments[-1].mT, factor, scaling.squeeze(1))
         images.append(torch.addcmul(smooth, remainder, images[-1]))
     return images, moments
 
 
 class _Powers(torch.autograd.Function):
-    """All products share one gradient of the factor: a single matrix product, where autograd would write 2k full ones.
+    """All products share one gradient of the factor, a single matrix product; autograd would form 2k full matrices.
 
     With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W^T A_i`` backwards, the loss changes by ``sum_i A_i^T dW
     P_(i-1)``. Weights are on the right of W: they multiply its columns.
@@ -75,11 +76,11 @@ class _Powers(torch.autograd.Function):
         remainder: Tensor,
         image: Tensor,
         order: int,
-        shard: Shard | None,
+        among: Communicator,
         weights: Tensor | None,
     ) -> Tensor:
-        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, shard, weights)
-        ctx.shard = shard
+        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, among, weights)
+        ctx.among = among
         ctx.save_for_backward(factor, scaling, remainder, weights, *images, *moments)
         return torch.stack(images[1:], dim=1)
 
@@ -96,15 +97,14 @@ class _Powers(torch.autograd.Function):
         for i in range(order, 0, -1):
             adjoint = adjoint + grad[:, i - 1]
             before = images[i - 1]
-            total = moment(factor, d * adjoint, ctx.shard).to(factor)
+            total = ctx.among.sum(moment(factor, d * adjoint)).to(factor)
             affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
-            summed = before if weights is None else before * weights.unsqueeze(1)
+            summed = weighted(before, weights)
             # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
             grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
             grad_remainder += (adjoint * before).sum(1)
             left += [moments[i - 1], total]
             right += [d * adjoint, d * summed]
-            pulled = d * affinity
-            adjoint = (pulled if weights is None else pulled * weights.unsqueeze(1)) + r * adjoint
+            adjoint = weighted(d * affinity, weights) + r * adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
         return grad_factor, grad_scaling, grad_remainder, adjoint, None, None, None

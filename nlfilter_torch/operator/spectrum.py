@@ -1,9 +1,8 @@
 """Operator to spectrum, by Rayleigh and Ritz in the span of the factor. Paper: Sec. II-A to II-C, eq. (3), (4).
 
-With ``F`` (M, N) the scaled factor, ``G = F F^T`` is m x m. The rows of ``G^(-1/2) F`` are orthonormal, and W seen by
-them is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. All of it lives in m x m matrices, in float64; pixels are
-touched twice: once for G, once to form or apply eigenvectors. No square root of a sampled block, no permutation of
-pixels.
+With ``F`` (M, N) the scaled factor and ``G = F F^T``, the rows of ``G^(-1/2) F`` are orthonormal, and W projected on
+their span is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. G and T are m x m matrices in float64. The pixels are
+read twice: once for G, and once to form or apply eigenvectors.
 """
 
 from collections.abc import Callable
@@ -20,18 +19,20 @@ from nlfilter_torch.core.blocks import (
     buffered_blocks,
     fold_batch,
     pixel_blocks,
+    root_weighted,
     unfold_batch,
+    weighted,
 )
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
-from nlfilter_torch.core.communicator import Shard, reduce_sum
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
 
-# Directions of G below this are rounding.
+# Eigenvalues of G below this, relative to the largest, are rounding.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
-# Where the inverse eigenvalues of G sum to more, some are so small that sums in float32 cost orthogonality.
+# If the inverse eigenvalues of G sum to more, eigenvectors from sums in float32 are not orthogonal enough.
 WEAK = 3e3
 # Eigenvalues this close to 1 count as 1 when the constant vector is picked out of their eigenspace.
 CLUSTER = {torch.float32: 1e-3, torch.float64: 1e-8}
@@ -41,12 +42,12 @@ Response = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class RitzPairs:
-    """All that functions of W need beside the factor itself: sums over pixels, and no pixel.
+    """What functions of W need besides the factor: matrices that are sums over pixels.
 
     Attributes:
         ritz: T, (B, M, M), float64.
         root: G^(-1/2), (B, M, M), float64.
-        support: (B, M) bool, which of the eigenvalues of T count.
+        support: (B, M) bool, which eigenvalues of T are above rounding.
     """
 
     ritz: SymmetricMatrix
@@ -55,8 +56,8 @@ class RitzPairs:
 
     @staticmethod
     def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
-        """From the sums that :func:`whiten_gram` takes."""
-        root, inner, ranks = whiten_gram(grams, dtype)
+        """From the sums that :func:`rayleigh_ritz` takes."""
+        root, inner, ranks = rayleigh_ritz(grams, dtype)
         ritz = SymmetricMatrix.of(inner)
         ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
         return RitzPairs(ritz, root, torch.arange(inner.shape[1], device=inner.device) < ranks.unsqueeze(1))
@@ -84,22 +85,22 @@ class RitzPairs:
 class Spectrum(RitzPairs):
     """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
 
-    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first asked for; filters and masks never
-    need them, since :meth:`gain` applies any f(W) through m x m matrices.
+    Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first used. Filters and masks do not need
+    them, since :meth:`gain` applies any f(W) through m x m matrices.
 
     Attributes:
         eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
-            gradient is exact, also where they meet.
+            gradient is exact, also for repeated eigenvalues.
         ritz: T, (B, M, M), float64.
         root: G^(-1/2), (B, M, M), float64.
-        support: (B, M) bool, which of the eigenvalues of T count.
+        support: (B, M) bool, which eigenvalues of T are above rounding.
         factor: (B, M, N), before scaling.
         scaling: d, (B, N).
         size: (H, W).
         largest: the first eigenvalue before it was clamped to 1, (B,).
-        weights: how many pixels each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum over
-            points with these weights.
-        shard: of the image, where other ranks have the rest of it.
+        weights: number of pixels that each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum
+            over points with these weights.
+        among: ranks that the rows of the image are spread over.
     """
 
     eigenvalues: Tensor
@@ -108,19 +109,19 @@ class Spectrum(RitzPairs):
     size: tuple[int, int]
     largest: Tensor
     weights: Tensor | None = None
-    shard: Shard | None = None
+    among: Communicator = ALONE
 
     @property
     def pixels(self) -> int:
         """N, of the whole image; of weighted points the sum of their weights."""
         if self.weights is not None:
-            return round(float(reduce_sum(self.weights[0].sum(), self.shard)))
-        return self.scaling.shape[1] if self.shard is None else self.shard.pixels
+            return round(float(self.among.sum(self.weights[0].sum())))
+        return self.among.pixels(self.scaling.shape[1])
 
     @property
     def mass(self) -> Tensor:
-        """D times the weights of the points, (B, N), by which values are summed up."""
-        return self.scaling if self.weights is None else self.scaling * self.weights
+        """The scaling d times the weights of the points, (B, N): the weights of sums over points."""
+        return weighted(self.scaling, self.weights)
 
     @property
     def eigenvectors(self) -> Tensor:
@@ -128,8 +129,8 @@ class Spectrum(RitzPairs):
 
         The first is the constant one as far as the landmarks span it (exactly so for W; without completion to the
         tolerance of the balancing), positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
-        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues meet. What does not depend on the
-        choice of eigenvectors (:func:`spectral_filter`, masks) has an exact gradient always.
+        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues are equal. Results that do not depend
+        on the choice of eigenvectors (:func:`spectral_filter`, masks) always have an exact gradient.
         """
         return self._recorded if torch.is_grad_enabled() and self.ritz.matrix.requires_grad else self._constant
 
@@ -140,7 +141,7 @@ class Spectrum(RitzPairs):
     @cached_property
     @torch.no_grad()
     def _constant(self) -> Tensor:
-        """Kept apart: who looks at the eigenvectors without a gradient must not take it from who needs it."""
+        """Cached apart from eigenvectors with a gradient, so that a call without gradients does not replace those."""
         return self._form(self.ritz.vectors)
 
     def _form(self, vectors: Tensor) -> Tensor:
@@ -153,9 +154,9 @@ class Spectrum(RitzPairs):
 
     @full_precision
     def coefficients(self, image: Tensor) -> Tensor:
-        """``F y``, all that a response needs to know of an image: one read of the factor.
+        """``F y``, the only thing that a response depends on in an image: one read of the factor.
 
-        Whoever tries several responses on one image, or learns one, keeps them: see :func:`spectral_filter`.
+        To apply several responses to one image, or to learn one, compute them once: see :func:`spectral_filter`.
 
         Args:
             image: y, (B, C, H, W).
@@ -169,7 +170,7 @@ class Spectrum(RitzPairs):
         check_image(image, "image")
         check_same_size(image, self.size, "image", "spectrum")
         planes = fold_batch(image.to(self.factor), self.factor.shape[0])
-        total = moment(self.factor, self.mass.unsqueeze(1) * planes, self.shard)  # (B, M, C)
+        total = self.among.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
@@ -177,21 +178,21 @@ class Spectrum(RitzPairs):
         check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
-        weighted = total @ self.gain(response).mT
-        planes = spread(weighted.to(self.factor), self.factor, self.scaling)
+        filtered = total @ self.gain(response).mT
+        planes = spread(filtered.to(self.factor), self.factor, self.scaling)
         return unfold_batch(planes.unsqueeze(1), count, self.size)[:, 0]
 
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
         with torch.no_grad():
-            ones = moment(self.factor, self.mass.unsqueeze(1), self.shard)  # F 1, (B, M, 1)
+            ones = self.among.sum(moment(self.factor, self.mass.unsqueeze(1)))  # F 1, (B, M, 1)
             cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
             cluster[:, :1] = True
             target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
             mirror = target / target.norm(dim=1, keepdim=True).clamp(min=1e-12)
             mirror[:, :1] -= 1.0
             length = mirror.square().sum(1, keepdim=True).unsqueeze(2)
-            # However short the mirror is, the reflection in it keeps lengths; none at all is divided by something tiny.
+            # A reflection preserves lengths however short the mirror is; the clamp only avoids 0 / 0.
             reflection = (
                 2 * mirror.unsqueeze(2) * mirror.unsqueeze(1) / length.clamp(min=torch.finfo(length.dtype).tiny)
             )
@@ -204,18 +205,18 @@ def compute_spectrum(
     remainder: Tensor | None,
     size: tuple[int, int],
     rank: int | None,
-    shard: Shard | None = None,
+    among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Spectrum:
     """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
-    each = scaling if weights is None else scaling * weights.sqrt()
-    pairs = RitzPairs.of_sums(reduce_sum(compute_grams(factor, each, remainder, count), shard), factor.dtype)
+    each = root_weighted(scaling, weights)
+    pairs = RitzPairs.of_sums(among.sum(compute_grams(factor, each, remainder, count)), factor.dtype)
     checked = factor.dtype == torch.float32 and factor.device.type == "cpu"
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
         grams = compute_grams(factor, each, remainder, count, exact=True)
-        pairs = RitzPairs.of_sums(reduce_sum(grams, shard), factor.dtype)
+        pairs = RitzPairs.of_sums(among.sum(grams), factor.dtype)
     shown = int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
@@ -224,16 +225,16 @@ def compute_spectrum(
     values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
     return Spectrum(
-        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, shard
+        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, among
     )
 
 
-def whiten_gram(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels and nothing else.
+def rayleigh_ritz(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels.
 
     Args:
         grams: ``F F^T`` and, where W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
-        dtype: of the factor, whose rounding they hold.
+        dtype: of the factor, which determines their rounding error.
     """
     gram = SymmetricMatrix.of(grams[:, 0])
     kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
@@ -248,7 +249,7 @@ def compute_grams(
 ) -> Tensor:
     """:func:`sum_grams`, differentiable; ``exact`` works in float64."""
     recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else _exact_or_quick  # transforms of torch.func know no such class
+    sums = _Grams.apply if recorded else _exact_or_quick  # transforms of torch.func do not support such a class
     grams: Tensor = sums(factor, scaling, remainder, count, exact)
     return grams
 
@@ -279,14 +280,14 @@ class _Grams(torch.autograd.Function):
         grad_factor, grad_scaling = torch.empty_like(factor), torch.empty_like(scaling)
         grad_remainder = None if remainder is None else torch.empty_like(remainder)
         symmetric = (grad + grad.mT).to(factor)  # (B, J, M, M)
-        for block, (rows, pulled, weighted, product) in buffered_blocks(factor, 4):
+        for block, (rows, pulled, inner, product) in buffered_blocks(factor, 4):
             d = scaling[:, None, block]
             torch.mul(factor[:, :, block], d, out=rows)
             torch.bmm(symmetric[:, 0], rows, out=pulled)
             if remainder is not None and grad_remainder is not None:
-                torch.bmm(symmetric[:, 1], rows, out=weighted)
-                grad_remainder[:, block] = torch.mul(weighted, rows, out=product).sum(1) / 2
-                pulled.addcmul_(weighted, remainder[:, None, block])
+                torch.bmm(symmetric[:, 1], rows, out=inner)
+                grad_remainder[:, block] = torch.mul(inner, rows, out=product).sum(1) / 2
+                pulled.addcmul_(inner, remainder[:, None, block])
             grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
             grad_factor[:, :, block] = pulled.mul_(d)
         return grad_factor, grad_scaling, grad_remainder, None, None

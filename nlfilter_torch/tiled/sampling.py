@@ -25,9 +25,9 @@ from nlfilter_torch.operator.features import (
 )
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.operator.newton import PixelScaling, scaling_from_moment
-from nlfilter_torch.operator.nystrom import Completion, whitener
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
 from nlfilter_torch.operator.spectrum import CUT
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
@@ -159,7 +159,7 @@ def take_pilot(
     recipe = (window, photometric_bandwidth, spatial_bandwidth)
     features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
     points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
-    kernel = Kernel(points, whitener(points), completion, features=GuideFeatures(*recipe, guide_channels))
+    kernel = Kernel(points, inverse_cholesky(points), completion, features=GuideFeatures(*recipe, guide_channels))
     weight = picture.pixels / len(even)
     sample = Sample(
         features[:, :, len(candidates) :],
@@ -305,7 +305,7 @@ class Influence:
             values, vectors = torch.linalg.eigh(gram)
             values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
             measures.append(values.rsqrt()[:, None] * vectors.mT)
-        whitening = kernel.whitening[0].double()
+        whitening = kernel.inverse_cholesky[0].double()
         draws = torch.randn(SKETCHED, marks, generator=generator, dtype=torch.float64) / SKETCHED**0.5
         sketches = torch.cat([draws @ measure @ whitening for measure in measures]).to(kernel.landmarks)
         direction = (whitening.mT @ pilot.balancing).to(kernel.landmarks)  # u . t = c . direction

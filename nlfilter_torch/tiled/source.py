@@ -19,8 +19,8 @@ from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, sq
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel
-from nlfilter_torch.operator.newton import PixelScaling
 from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.intermediate import intermediate

@@ -19,8 +19,9 @@ from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
-from nlfilter_torch.operator.newton import LARGEST, PixelScaling, scaling_from_moment
+from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
 
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
 MAX_PASSES = 12

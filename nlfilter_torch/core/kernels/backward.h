@@ -11,13 +11,13 @@ INLINE void NAME(column_gradients)(const struct backward *task, long start, long
                PIXELS * sizeof(float));
     }
     if (task->left)
-        NAME(apply)(task->left, columns->marks, right, task->rank, gradient);
+        NAME(apply)(task->left, columns->num_landmarks, right, task->rank, gradient);
     if (!columns->limited)
         return;
     FLOATS along[VECTORS], scale[VECTORS];
     for (int v = 0; v < VECTORS; v++)
         along[v] = (FLOATS){0};
-    for (long m = 0; m < columns->marks; m++) {
+    for (long m = 0; m < columns->num_landmarks; m++) {
         const float *column = NAME(fetch)(columns->factor + m * columns->factor_stride + start, width, 0.0f, edge);
         for (int v = 0; v < VECTORS; v++)
             along[v] += *(const FLOATS *)(column + v * LANES) * *(const FLOATS *)(gradient + m * PIXELS + v * LANES);
@@ -32,7 +32,7 @@ INLINE void NAME(column_gradients)(const struct backward *task, long start, long
         scale[v] = *(const FLOATS *)(edge + v * LANES);
         along[v] = *(const FLOATS *)(right + v * LANES);
     }
-    for (long m = 0; m < columns->marks; m++) {
+    for (long m = 0; m < columns->num_landmarks; m++) {
         const float *column = NAME(fetch)(columns->factor + m * columns->factor_stride + start, width, 0.0f, edge);
         for (int v = 0; v < VECTORS; v++) {
             FLOATS *target = (FLOATS *)(gradient + m * PIXELS + v * LANES);
@@ -46,7 +46,7 @@ INLINE void NAME(feature_gradients)(const struct backward *task, long start, lon
                                     const float *features, float *moved)
 {
     const long size = task->columns.size;
-    NAME(apply)(task->points, size + 1, slopes, task->columns.marks, moved);
+    NAME(apply)(task->points, size + 1, slopes, task->columns.num_landmarks, moved);
     for (long k = 0; k < size; k++) {
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(moved + k * PIXELS + v * LANES) -= *(const FLOATS *)(features + k * PIXELS + v * LANES) *
@@ -75,7 +75,7 @@ INLINE void NAME(add_products)(const float *left, long left_step, const float *r
  * as many tiles at a time as fit the cache. */
 static TARGET void NAME(backward)(const struct backward *task, long first, long last, float *scratch, double *totals)
 {
-    const long size = task->columns.size, marks = task->columns.marks;
+    const long size = task->columns.size, num_landmarks = task->columns.num_landmarks;
     const long step = task->rows * PIXELS, features_step = task->feature_rows * PIXELS;
     float *gradients = scratch, *affinities = gradients + task->tiles * step;
     float *features = affinities + task->tiles * step, *spare = features + task->tiles * features_step;
@@ -88,23 +88,23 @@ static TARGET void NAME(backward)(const struct backward *task, long first, long 
             NAME(affinities)(&task->columns, features + t * features_step, affinities + t * step);
             NAME(column_gradients)(task, at, width, gradients + t * step, spare);
         }
-        NAME(add_products)(gradients, step, affinities, step, tiles, marks, marks, task->lower, totals);
+        NAME(add_products)(gradients, step, affinities, step, tiles, num_landmarks, num_landmarks, task->lower, totals);
         for (long t = 0; t < tiles; t++) {
             const long at = start + t * PIXELS, width = end - at < PIXELS ? end - at : PIXELS;
-            const float *rows = task->columns.whitening, *gradient = gradients + t * step;
+            const float *rows = task->columns.inverse_cholesky, *gradient = gradients + t * step;
             float *slopes = affinities + t * step; /* gradient of the exponents, overwriting the affinities */
-            for (long m = 0; m < marks; m += ROWS) {
+            for (long m = 0; m < num_landmarks; m += ROWS) {
                 const long skipped = task->lower ? m : 0;
                 FLOATS sums[ROWS][VECTORS];
-                NAME(multiply)(rows, gradient + skipped * PIXELS, marks - skipped, sums);
-                rows += (marks - skipped) * ROWS;
+                NAME(multiply)(rows, gradient + skipped * PIXELS, num_landmarks - skipped, sums);
+                rows += (num_landmarks - skipped) * ROWS;
                 for (int r = 0; r < ROWS; r++)
                     for (int v = 0; v < VECTORS; v++)
                         *(FLOATS *)(slopes + (m + r) * PIXELS + v * LANES) *= sums[r][v];
             }
             NAME(feature_gradients)(task, at, width, slopes, features + t * features_step, spare);
         }
-        NAME(add_products)(affinities, step, features, features_step, tiles, marks, size + 1, 0,
-                           totals + marks * marks);
+        NAME(add_products)(affinities, step, features, features_step, tiles, num_landmarks, size + 1, 0,
+                           totals + num_landmarks * num_landmarks);
     }
 }

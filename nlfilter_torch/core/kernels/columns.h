@@ -24,7 +24,7 @@ INLINE void NAME(load_features)(const struct columns *task, long start, long wid
 /* Affinities of a tile of pixels to the landmarks. */
 INLINE void NAME(affinities)(const struct columns *task, const float *features, float *affinities)
 {
-    for (long m = 0; m < task->marks; m += ROWS) {
+    for (long m = 0; m < task->num_landmarks; m += ROWS) {
         FLOATS exponents[ROWS][VECTORS];
         NAME(multiply)(task->landmarks + m * (task->size + 2), features, task->size + 2, exponents);
         for (int r = 0; r < ROWS; r++)
@@ -38,10 +38,10 @@ INLINE void NAME(affinities)(const struct columns *task, const float *features, 
  * to norm at most 1. */
 static TARGET void NAME(columns)(const struct columns *task, long first, long last, float *scratch)
 {
-    const long marks = task->marks;
+    const long num_landmarks = task->num_landmarks;
     float *features = scratch, *affinities = features + (task->size + 2) * PIXELS;
-    float *whitened = affinities + padded(marks, ROWS) * PIXELS;
-    float *edge = whitened + padded(marks, ROWS) * PIXELS; /* a row of the last, partial tile */
+    float *solutions = affinities + padded(num_landmarks, ROWS) * PIXELS;
+    float *edge = solutions + padded(num_landmarks, ROWS) * PIXELS; /* a row of the last, partial tile */
     for (long start = first; start < last; start += PIXELS) {
         const long width = last - start < PIXELS ? last - start : PIXELS;
         FLOATS norm[VECTORS];
@@ -49,14 +49,14 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
             norm[v] = (FLOATS){0};
         NAME(load_features)(task, start, width, features, edge);
         NAME(affinities)(task, features, affinities);
-        const float *rows = task->whitening;
-        for (long m = 0, block = 0; m < marks; m += ROWS, block++) {
+        const float *rows = task->inverse_cholesky;
+        for (long m = 0, block = 0; m < num_landmarks; m += ROWS, block++) {
             FLOATS sums[ROWS][VECTORS];
             NAME(multiply)(rows, affinities, task->depths[block], sums);
             rows += task->depths[block] * ROWS;
             for (int r = 0; r < ROWS; r++) /* padding rows are zero */
                 for (int v = 0; v < VECTORS; v++) {
-                    *(FLOATS *)(whitened + (m + r) * PIXELS + v * LANES) = sums[r][v];
+                    *(FLOATS *)(solutions + (m + r) * PIXELS + v * LANES) = sums[r][v];
                     norm[v] += sums[r][v] * sums[r][v];
                 }
         }
@@ -70,9 +70,9 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
             edge[i] = task->limited && edge[i] > 1.0f ? 1.0f / sqrtf(edge[i]) : 1.0f;
         for (int v = 0; v < VECTORS; v++)
             scale[v] = *(const FLOATS *)(edge + v * LANES);
-        for (long m = 0; m < marks; m++) {
+        for (long m = 0; m < num_landmarks; m++) {
             float *target = task->factor + m * task->factor_stride + start;
-            const float *row = whitened + m * PIXELS;
+            const float *row = solutions + m * PIXELS;
             const int streamed = width == PIXELS && (uintptr_t)target % sizeof(FLOATS) == 0;
             for (int v = 0; v < VECTORS; v++) {
                 const FLOATS value = *(const FLOATS *)(row + v * LANES) * scale[v];

@@ -3,12 +3,12 @@
 /* totals (J, M, M) += F diag(r^j) F^T over pixels first to last, with F = factor diag(d). Lower triangles only. */
 static TARGET void NAME(grams)(const struct grams *task, long first, long last, float *scratch, double *totals)
 {
-    const long marks = task->marks, step = task->step;
+    const long num_landmarks = task->num_landmarks, step = task->step;
     float *weight = scratch, *weighted = weight + step, *scaled = weighted + ROWS * step;
-    memset(scaled + marks * step, 0, (task->rows - marks) * step * sizeof(float));
+    memset(scaled + num_landmarks * step, 0, (task->rows - num_landmarks) * step * sizeof(float));
     for (long start = first; start < last; start += step) {
         const long width = last - start < step ? last - start : step, whole = padded(width, LANES);
-        for (long m = 0; m < marks; m++) {
+        for (long m = 0; m < num_landmarks; m++) {
             const float *column = task->factor + m * task->factor_stride + start;
             for (long i = 0; i < width; i++)
                 scaled[m * step + i] = column[i] * task->scaling[start + i];
@@ -20,7 +20,7 @@ static TARGET void NAME(grams)(const struct grams *task, long first, long last, 
         for (long j = 0; j < task->count; j++) {
             for (long i = 0; j && i < width; i++)
                 weight[i] *= task->remainder[start + i];
-            for (long m = 0; m < marks; m += ROWS) {
+            for (long m = 0; m < num_landmarks; m += ROWS) {
                 const float *left = scaled + m * step;
                 if (j) {
                     for (long r = 0; r < ROWS; r++)
@@ -28,15 +28,15 @@ static TARGET void NAME(grams)(const struct grams *task, long first, long last, 
                             weighted[r * step + i] = left[r * step + i] * weight[i];
                     left = weighted;
                 }
-                for (long n = 0; n < m + ROWS && n < marks; n += VECTORS) {
+                for (long n = 0; n < m + ROWS && n < num_landmarks; n += VECTORS) {
                     FLOATS sums[ROWS][VECTORS];
                     NAME(correlate)(left, 0, scaled + n * step, 0, 1, step, whole, sums);
 #pragma GCC unroll 8
                     for (int r = 0; r < ROWS; r++)
 #pragma GCC unroll 8
                         for (int v = 0; v < VECTORS; v++)
-                            if (m + r < marks && n + v <= m + r)
-                                totals[(j * marks + m + r) * marks + n + v] += NAME(total)(sums[r][v]);
+                            if (m + r < num_landmarks && n + v <= m + r)
+                                totals[(j * num_landmarks + m + r) * num_landmarks + n + v] += NAME(total)(sums[r][v]);
                 }
             }
         }

@@ -25,7 +25,7 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
                 slack[v] += *(FLOATS *)(tile + k * PIXELS + v * LANES) * *(FLOATS *)(tile + k * PIXELS + v * LANES);
             slack[v] *= task->margin;
         }
-        for (long m = 0; m < task->marks; m += ROWS) {
+        for (long m = 0; m < task->num_landmarks; m += ROWS) {
             FLOATS scores[ROWS][VECTORS];
             NAME(multiply)(centres + m * (size + 1), tile, size + 1, scores);
             for (int r = 0; r < ROWS; r++)
@@ -47,9 +47,9 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
 }
 
 /* Weight of a residual in the random draw: its fourth power. */
-INLINE float NAME(pivot_weight)(float residual, float explained)
+INLINE float NAME(pivot_weight)(float residual, float captured)
 {
-    const float rest = residual > explained ? residual : explained;
+    const float rest = residual > captured ? residual : captured;
     return (rest * rest) * (rest * rest);
 }
 
@@ -81,13 +81,13 @@ static TARGET void NAME(pivots)(const struct pivots *task, const float *points, 
             norms[i] += points[k * count + i] * points[k * count + i];
     for (long i = 0; i < count; i++)
         residual[i] = 1.0f;
-    for (long m = 0; m < task->marks; m++) {
+    for (long m = 0; m < task->num_landmarks; m++) {
         double total = 0.0, reached = 0.0;
         for (long i = 0; i < task->used; i++)
-            total += NAME(pivot_weight)(residual[i], task->explained);
+            total += NAME(pivot_weight)(residual[i], task->captured);
         long pivot = 0;
         for (; pivot < task->used - 1; pivot++) {
-            reached += NAME(pivot_weight)(residual[pivot], task->explained);
+            reached += NAME(pivot_weight)(residual[pivot], task->captured);
             if (reached >= task->draws[m] * total)
                 break;
         }
@@ -99,7 +99,7 @@ static TARGET void NAME(pivots)(const struct pivots *task, const float *points, 
             *(FLOATS *)(column + i) =
                 NAME(exp2)(NAME(clamp)(*(FLOATS *)(column + i), -60.0f, 0.0f) * 1.4426950408889634f);
         NAME(accumulate)(columns + pivot, count, columns, m, count, -1.0f, column);
-        const float scale = 1.0f / sqrtf(column[pivot] > task->explained ? column[pivot] : task->explained);
+        const float scale = 1.0f / sqrtf(column[pivot] > task->captured ? column[pivot] : task->captured);
         for (long i = 0; i < count; i++) {
             column[i] *= scale;
             residual[i] -= column[i] * column[i];

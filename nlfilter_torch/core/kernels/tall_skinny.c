@@ -3,11 +3,11 @@
 #include "tasks.h"
 
 /* The task of a single image of the batch. */
-static struct thin part(const struct work *work, long image)
+static struct tall_skinny part(const struct work *work, long image)
 {
-    struct thin task = *(const struct thin *)work->task;
+    struct tall_skinny task = *(const struct tall_skinny *)work->task;
     task.factor += image * task.factor_step;
-    task.rows = task.rows ? task.rows + image * task.count * task.marks : NULL;
+    task.rows = task.rows ? task.rows + image * task.count * task.num_landmarks : NULL;
     task.images = task.images ? task.images + image * task.images_step : NULL;
     task.out = task.out ? task.out + image * task.count * task.pixels : NULL;
     task.scaling = task.scaling ? task.scaling + image * task.pixels : NULL;
@@ -17,54 +17,58 @@ static struct thin part(const struct work *work, long image)
 
 static void run_spread(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
-    const struct thin task = part(work, image);
+    const struct tall_skinny task = part(work, image);
     (void)piece, (void)scratch;
     SETS[work->level].spread(&task, first, last);
 }
 
-int nlfilter_spread(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
-                    long factor_stride, long count, const float *rows, const float *scaling, float *out)
+int nlfilter_spread(int level, int threads, long pixels, long images, long num_landmarks,
+                    const float *factor, long factor_step, long factor_stride, long count, const float *rows,
+                    const float *scaling, float *out)
 {
-    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
-                        .count = count, .rows = rows, .scaling = scaling, .out = out, .pixels = pixels};
+    struct tall_skinny task = {
+        .factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .num_landmarks = num_landmarks,
+        .count = count, .rows = rows, .scaling = scaling, .out = out, .pixels = pixels};
     struct work work = {.run = run_spread, .task = &task, .level = level, .images = images, .pixels = pixels};
     return divide(&work, threads, CHUNK);
 }
 
 static void run_gather(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
-    const struct thin task = part(work, image);
+    const struct tall_skinny task = part(work, image);
     (void)scratch;
-    SETS[work->level].gather(&task, first, last, work->totals + piece * task.count * task.marks);
+    SETS[work->level].gather(&task, first, last, work->totals + piece * task.count * task.num_landmarks);
 }
 
-int nlfilter_gather(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
-                    long factor_stride, long count, const float *planes, long planes_step, long planes_stride,
-                    double *out)
+int nlfilter_gather(int level, int threads, long pixels, long images, long num_landmarks,
+                    const float *factor, long factor_step, long factor_stride, long count, const float *planes,
+                    long planes_step, long planes_stride, double *out)
 {
-    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
-                        .count = count, .images = planes, .images_step = planes_step, .images_stride = planes_stride,
-                        .pixels = pixels};
+    struct tall_skinny task = {
+        .factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .num_landmarks = num_landmarks,
+        .count = count, .images = planes, .images_step = planes_step, .images_stride = planes_stride,
+        .pixels = pixels};
     struct work work = {.run = run_gather, .task = &task, .level = level, .images = images, .pixels = pixels};
-    return add_up(&work, threads, count * marks, out);
+    return add_up(&work, threads, count * num_landmarks, out);
 }
 
 static void run_sweep(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
-    const struct thin task = part(work, image);
+    const struct tall_skinny task = part(work, image);
     (void)scratch;
-    SETS[work->level].sweep(&task, first, last, work->totals + piece * task.marks);
+    SETS[work->level].sweep(&task, first, last, work->totals + piece * task.num_landmarks);
 }
 
 /* With `diagonal`: out = the scaling d and moment = factor d, where row is half of the guess of the moment.
  * Without: moment = factor diag(scaling) factor^T row, with out as working memory. */
-int nlfilter_sweep(int level, int threads, long pixels, long images, long marks, const float *factor, long factor_step,
-                   long factor_stride, const float *row, const float *scaling, const float *diagonal, float most,
-                   float *out, double *moment)
+int nlfilter_sweep(int level, int threads, long pixels, long images, long num_landmarks,
+                   const float *factor, long factor_step, long factor_stride, const float *row,
+                   const float *scaling, const float *diagonal, float most, float *out, double *moment)
 {
-    struct thin task = {.factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .marks = marks,
-                        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .most = most, .images = out,
-                        .images_step = pixels, .out = out, .pixels = pixels};
+    struct tall_skinny task = {
+        .factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .num_landmarks = num_landmarks,
+        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .most = most, .images = out,
+        .images_step = pixels, .out = out, .pixels = pixels};
     struct work work = {.run = run_sweep, .task = &task, .level = level, .images = images, .pixels = pixels};
-    return add_up(&work, threads, marks, moment);
+    return add_up(&work, threads, num_landmarks, moment);
 }

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
-from nlfilter_torch.core.communicator import Shard, reduce_sum
 from nlfilter_torch.core.kernels.library import (
     by_rows,
     place,
@@ -74,20 +73,20 @@ def gather(images: Tensor, factor: Tensor) -> Tensor:
     return torch.bmm(_parts(images), _parts(factor).mT).sum(0, keepdim=True)
 
 
-def moment(factor: Tensor, images: Tensor, shard: Shard | None = None) -> Tensor:
-    """``factor @ images^T``, the sum over all pixels to which W reduces them; gathered in float64.
+def moment(factor: Tensor, images: Tensor) -> Tensor:
+    """``factor @ images^T``, a sum over pixels, added up in float64.
 
     In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
 
     Args:
         factor: (B, M, N).
         images: (B, C, N).
-        shard: of the image, where other ranks have the rest of it.
 
     Returns:
         (B, M, C) in float64.
     """
-    return reduce_sum(_moment(factor, images), shard)
+    found: Tensor = _moment(factor, images)
+    return found
 
 
 def _define_moment(factor: Tensor, images: Tensor) -> Tensor:

@@ -19,36 +19,36 @@
 
 static inline long padded(long count, long step) { return (count + step - 1) / step * step; }
 
-/* U = whitening exp2(landmarks (x, 1, |x|^2)), x = features - centre; whitening is the inverse Cholesky factor of the
- * landmark block. */
+/* U = inverse_cholesky exp2(landmarks (x, 1, |x|^2)), x = features - centre; inverse_cholesky is the inverse Cholesky
+ * factor of the landmark block. */
 struct columns {
     const float *features, *centre; /* (D, N), (D) */
     float *factor, *norms;          /* (M, N), (N): |u|^2 before scaling, written if `limited` */
-    long size, marks, pixels;
+    long size, num_landmarks, pixels;
     long features_stride, factor_stride;
     long features_step, factor_step; /* from one image of a batch to the next; other arrays are contiguous */
     float floor;                     /* lower limit of the exponents */
     int limited;                     /* scale columns to norm at most 1 */
     /* Packed in blocks of ROWS rows, each stored by columns without trailing zero columns. */
-    const float *landmarks, *whitening;
-    const long *depths; /* number of columns of each block of the whitening */
+    const float *landmarks, *inverse_cholesky;
+    const long *depths; /* number of columns of each block of the inverse */
 };
 
 /* Gradients of the columns' inputs. The gradient of the columns is left right, or right itself if left is NULL. */
 struct backward {
-    struct columns columns;        /* with the whitening transposed; if triangular, blocks begin at the diagonal */
+    struct columns columns;        /* with the inverse transposed; if triangular, blocks begin at the diagonal */
     const float *left, *right;     /* (M, R) in blocks, (R, N) */
     const float *scale, *diagonal; /* (N): scale of the columns, and the gradient of 1 - |u|^2 */
     const float *points;           /* (D + 1, M) in blocks: derivative of the exponents by the features */
     float *moved;                  /* (D, N), gradient of the features */
     long rank, right_stride, right_step;
     long tiles, rows, feature_rows; /* tiles processed together, and their rows */
-    int lower;                      /* the whitening is a lower triangle */
+    int lower;                      /* the inverse is a lower triangle */
 };
 
-struct thin {
+struct tall_skinny {
     const float *factor; /* (M, N) */
-    long factor_stride, marks, count;
+    long factor_stride, num_landmarks, count;
     const float *rows, *images; /* (R, M), (R, N) */
     float *out;                 /* (R, N) */
     long images_stride;
@@ -61,21 +61,21 @@ struct thin {
 
 struct grams {
     const float *factor, *scaling, *remainder; /* (M, N), (N), (N) */
-    long factor_stride, factor_step, marks, count;
+    long factor_stride, factor_step, num_landmarks, count;
     long rows, step; /* padded rows and pixels of a tile of F that fits the cache */
 };
 
 struct pivots {
     const float *points, *draws; /* (B, D, S), (M) */
     long *pivots;                /* (B, M) */
-    long size, used, count, marks; /* used = S; count = S padded to a multiple of LINE */
-    float explained;
+    long size, used, count, num_landmarks; /* used = S; count = S padded to a multiple of LINE */
+    float captured;
 };
 
 struct lloyd {
     const float *points, *start; /* (B, D, S), (B, D, M) */
     int *nearest;                /* (B, S) */
-    long size, count, marks, iterations;
+    long size, count, num_landmarks, iterations;
     float margin; /* scores closer than this, relative to their terms, are ties */
 };
 
@@ -84,9 +84,9 @@ struct set {
     long rows; /* rows in a block of a packed matrix */
     void (*columns)(const struct columns *, long first, long last, float *scratch);
     void (*backward)(const struct backward *, long first, long last, float *scratch, double *totals);
-    void (*spread)(const struct thin *, long first, long last);
-    void (*gather)(const struct thin *, long first, long last, double *totals);
-    void (*sweep)(const struct thin *, long first, long last, double *totals);
+    void (*spread)(const struct tall_skinny *, long first, long last);
+    void (*gather)(const struct tall_skinny *, long first, long last, double *totals);
+    void (*sweep)(const struct tall_skinny *, long first, long last, double *totals);
     void (*grams)(const struct grams *, long first, long last, float *scratch, double *totals);
     void (*assign)(const struct lloyd *, const float *points, const float *centres, float *tile, int *nearest,
                    float *sums);

@@ -1,0 +1,100 @@
+"""The scaling d of points: its moment, row sums of W, and d of any point as a function of the moment.
+
+Given the moment ``t = sum_i w_i d_i u_i`` over all points, w their weights, the equation of a point is
+``d (u . t + c d) = 1``. Its one positive root d(t) depends on the point's own column u and diagonal c only.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.blocks import weighted
+from nlfilter_torch.core.communicator import Communicator
+from nlfilter_torch.core.kernels.sweeps import positive_root
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+
+EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # by which rounding may take the d of a pixel above 1
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of balancing.
+
+    Attributes:
+        scaling: d, (B, N), positive.
+        moment: t of this scaling, (B, M, 1) in float64.
+        residual: largest deviation of a row sum from 1 with this scaling, (B,).
+        sweeps: number of sweeps over the factor.
+        inverse: approximate inverse of the Jacobian J, (B, M, M) in float64.
+    """
+
+    scaling: Tensor
+    moment: Tensor
+    residual: Tensor
+    sweeps: int
+    inverse: Tensor
+
+
+def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
+    """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
+
+    It is the positive root of ``d (u . total + diagonal d) = 1``, computed without cancellation. The sign of
+    ``u . total`` may be either, since approximate affinities may be negative.
+    """
+    return positive_root(spread((total / 2).mT, factor).squeeze(1), diagonal)
+
+
+def moment_of(factor: Tensor, values: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
+    """``factor @ (weights * values)`` of values (B, N), summed over the ranks: (B, M, 1) in float64."""
+    return among.sum(moment(factor, weighted(values, weights).unsqueeze(1)))
+
+
+def row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor, found: Tensor) -> Tensor:
+    """Row sums (B, N) of W for any scaling d whose moment ``factor @ d`` is ``found``."""
+    return scaling * (spread(found.to(factor).mT, factor).squeeze(1) + diagonal * scaling)
+
+
+def largest_magnitude(values: Tensor, among: Communicator) -> Tensor:
+    """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of them is not finite."""
+    return among.max(values.abs().nan_to_num(nan=torch.inf).amax(1))
+
+
+def isolated(scaling: Tensor, residual: float) -> Tensor:
+    """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
+
+    The diagonal entry of W is then d^2, and the other entries of the row sum to 1 - d^2, so d exceeds 1. It must do so
+    by more than ``residual``, the error of row sums.
+    """
+    return scaling > 1 + max(EXCESS[scaling.dtype], residual)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelScaling:
+    """The scaling of any pixel as a function of the pixel's own column.
+
+    Attributes:
+        moment: t, (B, M, 1).
+        completed: the kernel has a unit diagonal.
+        residual: largest deviation of a row sum from 1.
+        before: moments at which pixels were found to be isolated and then removed, one for each round of balancing.
+    """
+
+    moment: Tensor
+    completed: bool
+    residual: float = 0.0
+    before: tuple[Tensor, ...] = ()
+
+    def __call__(self, factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
+        """Scaling d and diagonal part r of W, (B, n), of pixels with columns (B, M, n) and (B, n).
+
+        A pixel that is isolated has d = 0 and r = 1.
+        """
+        scaling = scaling_from_moment(factor, diagonal, self.moment.to(factor))
+        remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
+        if not self.completed:
+            return scaling, remainder
+        alone = isolated(scaling, self.residual)
+        for total in self.before:
+            alone = alone | isolated(scaling_from_moment(factor, diagonal, total.to(factor)), self.residual)
+        return torch.where(alone, 0.0, scaling), torch.where(alone, 1.0, remainder)
