@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import with_options
+from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
+from nlfilter_torch.edits.parameters import EDITS, FILTER
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from nlfilter_torch.edits.steps import Step
     from nlfilter_torch.operator.operator import NonlocalOperator
     from nlfilter_torch.operator.spectrum import Spectrum
 
@@ -38,30 +40,18 @@ MEANINGS = {
 }
 
 
-@with_options("alpha")
-def inspect(
-    source: options.Source,
-    folder: Folder,
-    bandwidth: options.Bandwidth = "auto",
-    spatial_bandwidth: options.SpatialBandwidth = None,
-    patch_size: options.PatchSize = 5,
-    landmarks: options.Landmarks = 100,
-    sampling: options.LandmarkSampling = options.Sampling.kmeans,
-    seed: options.Seed = 0,
-    **given: str,
-) -> None:
+@with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
+def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **given: Any) -> None:
     """Show how the filter sees a photograph: the patterns it finds, how strong they are, and what sliders do to them.
 
     Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table.
 
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
-    sliders = options.parse_alpha(given["alpha"])
-    grey_levels = options.parse_bandwidth(bandwidth)
+    step = step_of(EDITS["detail"], given)
 
     import torch
 
-    from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.io.photographs import check_folder, open_beside, read_photograph
     from nlfilter_torch.operator.features import reduce_channels
@@ -70,18 +60,11 @@ def inspect(
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
-        photograph = read_photograph(source, bytes_per_pixel=working_bytes(landmarks, patch_size, factors=5))
+        memory = working_bytes(step["landmarks"], step["patch_size"], factors=5)
+        photograph = read_photograph(source, bytes_per_pixel=memory)
         guide = reduce_channels(photograph.pixels, "luminance")
         begin("Comparing patches")
-        operator = editing.build_operator(
-            guide,
-            bandwidth=grey_levels,
-            spatial_bandwidth=spatial_bandwidth,
-            patch_size=patch_size,
-            landmarks=landmarks,
-            sampling=sampling,
-            seed=seed,
-        )
+        operator = build_operator(guide, step, seed)
         begin("Finding patterns")
         spectrum = operator.spectrum()
         figures = summarize(operator, spectrum, guide)
@@ -89,11 +72,20 @@ def inspect(
         folder.mkdir(exist_ok=True)
         save_figure(show_eigenvectors(spectrum), folder / "eigenvectors.png")
         save_figure(plot_eigenvalues(spectrum), folder / "eigenvalues.png")
-        save_figure(plot_response(torch.tensor(sliders), spectrum), folder / "response.png")
+        save_figure(plot_response(torch.tensor(step["alpha"]), spectrum), folder / "response.png")
         report = {**figures, "eigenvalues": spectrum.eigenvalues[0].tolist()}
         with open_beside(folder / "diagnostics.json") as stream:
             stream.write(json.dumps(report, indent=2).encode() + b"\n")
     print_table(figures, f"The filter of {source}")
+
+
+def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
+    """The operator of a guide (1, 1, H, W), with the filter's parameters of a step."""
+    from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.operator.build import nonlocal_operator
+
+    parameters = {name: value for name, value in step.arguments((0, 0)).items() if name in FILTER}
+    return nonlocal_operator(guide, **parameters, generator=seeded(seed))
 
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:
