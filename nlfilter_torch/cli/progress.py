@@ -40,7 +40,7 @@ def stages() -> Iterator[Callable[[str, int, int], None]]:
 
         def report(stage: str, done: int, total: int) -> None:
             if stage != bar.tasks[0].description:
-                bar.reset(task, description=stage, total=total)
-            bar.update(task, completed=done)
+                bar.reset(task, description=stage)
+            bar.update(task, completed=done, total=total)
 
         yield report

@@ -68,6 +68,11 @@ class Photograph:
     icc: bytes | None = None
     exif: bytes | None = None
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.pixels.shape[-2], self.pixels.shape[-1]
+
     def with_pixels(self, pixels: Tensor) -> "Photograph":
         """The same photograph with other pixels, (1, C, H, W) on any device."""
         return replace(self, pixels=pixels.detach().to(self.pixels))
