@@ -1,4 +1,4 @@
-"""``nlfilter-torch demo``: every step of the way on one photograph, as pictures."""
+"""``nlfilter-torch demo``: pictures of each step of the filter on one photograph."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ from nlfilter_torch.cli import options
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
-# Found by eye: half the usual width keeps the mask on the suit, three times the usual time fills its folds.
+# Chosen by eye: half the default width keeps the mask on the suit, three times the default time fills its folds.
 SELECTION_WIDTH = 2.0
 SELECTION_TIME = 3.0
 SELECTION_BANDWIDTH = 25 / options.LEVELS
@@ -17,13 +17,13 @@ SELECTION_BANDWIDTH = 25 / options.LEVELS
 
 def demo(
     folder: Annotated[
-        Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
+        Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
     ] = Path("out"),
 ) -> None:
     """Show what this program does, on a photograph that comes with it.
 
     Writes pictures of the photograph before and after, of its layers, of the patterns that the filter finds, of the
-    sliders and of a region that spreads to all that looks like it, and prints a table.
+    response of the sliders and of a region extended to everything that looks like it, and prints a table.
     """
     import skimage.data
     import torch

@@ -1,4 +1,4 @@
-"""``nlfilter-torch inspect``: look into the filter of a photograph."""
+"""``nlfilter-torch inspect``: pictures and figures of the filter of a photograph."""
 
 import json
 from dataclasses import asdict
@@ -20,29 +20,29 @@ if TYPE_CHECKING:
     from nlfilter_torch.operator.spectrum import Spectrum
 
 Folder = Annotated[
-    Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
+    Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
 ]
-# What each figure of the diagnostics tells, for someone who has not read the paper.
+# What each figure of the diagnostics means, for someone who has not read the paper.
 MEANINGS = {
     "height": "pixels from top to bottom",
     "width": "pixels from left to right",
-    "landmarks": "typical patches that stand for all others",
+    "landmarks": "typical patches that represent all others",
     "rank": "independent patterns found",
-    "bandwidth": "grey levels of 255 within which spots count as alike",
+    "bandwidth": "grey levels of 255 within which places count as alike",
     "balancing_steps": "passes until every pixel got the same total weight",
-    "row_sum_residual": "how far the total weight of a pixel is from 1, at worst",
-    "smallest_row_sum": "least total weight before balancing; 1 is a pixel with no partner at all",
-    "largest_eigenvalue": "1 for a sound filter",
-    "eigenvector_residual": "error of the eigenvectors, at worst",
-    "orthogonality": "deviation of the eigenvectors from a right angle, at worst",
-    "diagonal_share": "part of a pixel that only itself explains, on average",
-    "captured_energy": "part of the picture that the patterns explain (beta in the paper)",
+    "row_sum_residual": "largest deviation of the total weight of a pixel from 1",
+    "smallest_row_sum": "least total weight before balancing; 1 is a pixel that resembles no other",
+    "largest_eigenvalue": "1 for a correct filter",
+    "eigenvector_residual": "largest error of an eigenvector",
+    "orthogonality": "largest deviation of the eigenvectors from a right angle",
+    "diagonal_share": "share of a pixel in its own filtered value, on average",
+    "captured_energy": "share of the picture that the patterns capture (beta in the paper)",
 }
 
 
 @with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
 def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **given: Any) -> None:
-    """Show how the filter sees a photograph: the patterns it finds, how strong they are, and what sliders do to them.
+    """Show how the filter sees a photograph: the patterns it finds, how strong they are, and how sliders change them.
 
     Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table.
 
@@ -109,7 +109,7 @@ def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor
 
 
 def print_table(figures: dict[str, Any], title: str) -> None:
-    """Print diagnostics with what each of them tells."""
+    """Print diagnostics with the meaning of each."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -117,7 +117,7 @@ def print_table(figures: dict[str, Any], title: str) -> None:
     table = Table(title=Text(title), title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
-    table.add_column("what it tells")
+    table.add_column("meaning")
     for name, value in figures.items():
         table.add_row(name.replace("_", " "), f"{value:.4g}", MEANINGS.get(name, ""))
     Console().print(table)
