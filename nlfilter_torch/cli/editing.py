@@ -53,11 +53,9 @@ def edit_file(
             edited = photograph if depth is None else replace(photograph, depth=options.DEPTHS[depth])
             check_output(target, edited)
             begin("Editing")
-            pixels = edit(photograph)
+            edited = edited.with_pixels(edit(photograph))
             begin("Writing")
-            if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
-                edited = replace(edited, icc=None)
-            write_photograph(edited.with_pixels(pixels), target)
+            write_photograph(edited, target)
             return
     if allowed is not None and by_rows is not None:
         kind = None if depth is None else options.DEPTHS[depth]

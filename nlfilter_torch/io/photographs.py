@@ -75,8 +75,9 @@ class Photograph:
         return self.pixels.shape[-2], self.pixels.shape[-1]
 
     def with_pixels(self, pixels: Tensor) -> "Photograph":
-        """The same photograph with other pixels, (1, C, H, W) on any device."""
-        return replace(self, pixels=pixels.detach().to(self.pixels))
+        """The same photograph with other pixels (1, C, H, W) on any device; a new number C drops the profile."""
+        icc = self.icc if pixels.shape[1] == self.pixels.shape[1] else None
+        return replace(self, pixels=pixels.detach().to(self.pixels), icc=icc)
 
 
 class TooLarge(MemoryError):
@@ -180,15 +181,14 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
 
 def encode(stream: BinaryIO, kind: str, channels: Pixels, alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
     """Write channels (H, W, S) of the stored dtype as an image file of a type in :data:`DEPTHS`."""
-    if channels.shape[2] == 1:
-        channels = channels[..., 0]
+    channels = channels[..., 0] if channels.shape[2] == 1 else channels
     if kind == "TIFF":
         tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif)
     elif channels.dtype == np.uint16:
         stream.write(_encode_deep_png(channels, icc, exif))
     else:
-        options: dict[str, object] = ENCODING.get(kind, {})
-        Image.fromarray(channels).save(stream, format=kind, icc_profile=icc, exif=exif or b"", **options)
+        options: dict[str, object] = {"icc_profile": icc, "exif": exif or b""} | ENCODING.get(kind, {})
+        Image.fromarray(channels).save(stream, format=kind, **options)
 
 
 def check_output(path: str | Path, photograph: Photograph) -> str:
