@@ -1,7 +1,4 @@
-"""TIFF files by tifffile, of any depth, with profile and EXIF; whole, or a few rows at a time.
-
-Reading rows decodes strips or tiles as they are needed.
-"""
+"""TIFF files of any depth, with profile and EXIF, by tifffile; whole, or a few rows at a time."""
 
 import logging
 import os
