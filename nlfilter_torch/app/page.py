@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nicegui import events, ui
+from nicegui import background_tasks, events, ui
 
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.canvas import Canvas
@@ -33,7 +33,6 @@ class Editor:
         self._token = secrets.token_urlsafe(16)
         self._wanted: list[str | None] = []  # at most one: the last step of the picture to draw next
         self._drawing = False
-        self._jobs: set[asyncio.Future[None]] = set()
 
     def build(self, image: Path | None) -> None:
         """Lay the page out, and open a photograph if there is one."""
@@ -219,18 +218,16 @@ class Editor:
 
     def _start(self, work: Awaitable[None]) -> None:
         """Run a task in the background, and report its failure."""
-        job = asyncio.ensure_future(work)
-        self._jobs.add(job)
-        job.add_done_callback(self._finish)
+        background_tasks.create(self._reported(work))
 
-    def _finish(self, job: asyncio.Future[None]) -> None:
-        self._jobs.discard(job)
-        error = None if job.cancelled() else job.exception()
-        if isinstance(error, EXPECTED):
+    async def _reported(self, work: Awaitable[None]) -> None:
+        try:
+            await work
+        except EXPECTED as error:
             self._show_error(str(error))
-        elif error is not None:
+        except Exception:
             self._show_error("this failed, and it is not your fault; the terminal that runs the editor shows more")
-            raise error  # for the log
+            raise  # for the log
 
     def _show_error(self, sentence: str) -> None:
         with self._client:
@@ -245,7 +242,7 @@ class Editor:
             self._working.set_visibility(True)
             await asyncio.wait({task})
             self._working.set_visibility(False)
-        return task.result()
+        return await task
 
 
 def _button(
