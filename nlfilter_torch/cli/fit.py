@@ -80,7 +80,7 @@ def fit(before: Before, after: After, preset: Result = Path("preset.json"), laye
 
 def spacing(photograph: "Photograph") -> float:
     """Difference of neighbouring values in the file; 0 for floats."""
-    from nlfilter_torch.io.photographs import WHITE
+    from nlfilter_torch.tiled.sources import WHITE
 
     return 1 / WHITE[photograph.depth] if photograph.depth in WHITE else 0.0
 

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
+from nlfilter_torch.tiled.sources import WHITE, stored_as
 
 if sys.platform != "win32":
     import fcntl
@@ -35,7 +36,6 @@ if sys.platform != "win32":
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
 
-WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
 # Depths that each file type supports. JPEG and WebP have 8 bits only, JPEG has no alpha, PNG no floats.
 DEPTHS: dict[str, tuple[str, ...]] = {
@@ -171,10 +171,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     path = Path(path)
     kind = check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
-    values = torch.cat(planes, dim=1)[0].permute(1, 2, 0).numpy(force=True)  # (H, W, S)
-    if photograph.depth in WHITE:
-        values = np.rint(values.clip(0, 1) * WHITE[photograph.depth])
-    channels = np.ascontiguousarray(values.astype(photograph.depth))
+    channels = stored_as(torch.cat(planes, dim=1), photograph.depth)  # (H, W, S)
     with open_beside(path) as stream:
         encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif)
 
