@@ -1,11 +1,11 @@
 """``nlfilter-torch demo``: pictures of each step of the filter on one photograph."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.cli.inspect import Folder, print_table, summarize
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
@@ -15,11 +15,7 @@ SELECTION_TIME = 3.0
 SELECTION_BANDWIDTH = 25 / options.LEVELS
 
 
-def demo(
-    folder: Annotated[
-        Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
-    ] = Path("out"),
-) -> None:
+def demo(folder: Folder = Path("out")) -> None:
     """Show what this program does, on a photograph that comes with it.
 
     Writes pictures of the photograph before and after, of its layers, of the patterns that the filter finds, of the
@@ -28,7 +24,6 @@ def demo(
     import skimage.data
     import torch
 
-    from nlfilter_torch.cli.inspect import print_table, summarize
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.colour import edit_luminance
     from nlfilter_torch.filtering.filters import detail_layers, polynomial_filter

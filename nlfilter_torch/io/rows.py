@@ -45,7 +45,7 @@ class StoredPicture:
     Attributes:
         rows: upright, (H, W, S) or (H, W).
         alpha: whether the last channel is transparency.
-        held: bytes of it that are cached in memory.
+        held: bytes that are cached in memory while it is read.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
         attributes: of a zarr array.
@@ -107,12 +107,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
 
 
 def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> None:
-    """Raise unless the picture can be written to ``path`` at that depth.
-
-    Raises:
-        ValueError: as :func:`check_output`.
-        MemoryError: if encoding a file of that type takes more than ``memory`` bytes.
-    """
+    """Raise unless the picture can be written to ``path`` at that depth, using at most ``memory`` bytes."""
     if path.suffix.lower() == ZARR:
         _zarr()
         if not path.is_dir():
@@ -132,11 +127,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
 
 
 def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> None:
-    """Write rows as they arrive, with the profile and metadata of another picture of that shape.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write rows as they arrive, with the shape, profile and metadata of another picture."""
     shape, dtype = like.shape, np.dtype(depth)
     if path.suffix.lower() == ZARR:
         _write_zarr(path, rows, dtype, like)

@@ -6,7 +6,6 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -251,11 +250,7 @@ class TiffRows:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the header.
-
-        Raises:
-            UnhandledImage: if the picture is of an unsupported kind.
-        """
+        """Read the header; raises UnhandledImage if the picture is of an unsupported kind."""
         self.path = path
         self.stream: BinaryIO = path.open("rb")
         try:
@@ -279,9 +274,7 @@ class TiffRows:
     def __enter__(self) -> "TiffRows":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stream.close()
 
     @property
