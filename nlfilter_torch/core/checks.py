@@ -7,7 +7,8 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from types import FrameType
+from itertools import takewhile
+from traceback import walk_stack
 from typing import Any
 
 import torch
@@ -389,12 +390,5 @@ def called_by_edit() -> bool:
 
 def _modules_inside() -> list[str]:
     """The module of every frame from the caller's to the one that called this package, which is left out."""
-    modules: list[str] = []
-    frame: FrameType | None = sys._getframe(1)
-    while frame is not None:
-        module = str(frame.f_globals.get("__name__", ""))
-        if module.split(".")[0] not in ("nlfilter_torch", "torch"):
-            break
-        modules.append(module)
-        frame = frame.f_back
-    return modules
+    modules = (str(frame.f_globals.get("__name__", "")) for frame, _ in walk_stack(sys._getframe(1)))
+    return list(takewhile(lambda module: module.split(".")[0] in ("nlfilter_torch", "torch"), modules))
