@@ -1,7 +1,7 @@
 """Labelled figures of images, layers, eigenvectors, masks and responses. Needs the ``cli`` extra (matplotlib).
 
-Every function returns a matplotlib figure that belongs to no window and no global state; :func:`save_figure` writes it.
-``side`` is the length in pixels of the longer side of each picture in it.
+Every function returns a matplotlib figure outside of pyplot's global state; :func:`save_figure` writes it. ``side`` is
+the length in pixels of the longer side of each picture.
 """
 
 import math
@@ -37,13 +37,13 @@ def show_images(images: Mapping[str, Tensor], *, columns: int | None = None, sid
 
 
 def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
-    """Detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the smooth rest as it is."""
+    """Detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the last layer unchanged."""
     stack = layers[0].mean(1).numpy(force=True)  # (k+1, H, W)
     figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))), side=side)
     for number, (axis, layer) in enumerate(zip(axes, stack[:-1], strict=False), start=1):
-        reach = _reach(layer)
+        limit = _limit(layer)
         name = {1: " (finest)", len(stack) - 1: " (coarsest)"}.get(number, "")
-        _draw(axis, f"Layer {number}{name}, ±{255 * reach:.0f} levels of 255", layer, reach=reach)
+        _draw(axis, f"Layer {number}{name}, ±{255 * limit:.0f} levels of 255", layer, limit=limit)
     _draw(axes[-1], f"Layer {len(stack)}: the smooth rest", stack[-1].clip(0, 1))
     return figure
 
@@ -61,7 +61,7 @@ def show_eigenvectors(
     for axis, number in zip(axes, shown, strict=True):
         vector = vectors[number - 1]
         title = f"Eigenvector {number}, eigenvalue {float(spectrum.eigenvalues[0, number - 1]):.4f}"
-        _draw(axis, title, vector, reach=_reach(vector), colours="RdBu_r")
+        _draw(axis, title, vector, limit=_limit(vector), colours="RdBu_r")
     return figure
 
 
@@ -87,20 +87,17 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) 
 
 
 def plot_eigenvalues(spectrum: Spectrum) -> Figure:
-    """Eigenvalues against their number; the faster they fall, the fewer patterns the image consists of."""
-    figure = Figure(figsize=(8, 5), dpi=DPI, layout="constrained")
-    axis = figure.subplots()
+    """Eigenvalues against their number; they fall faster for images of fewer patterns."""
+    figure, axis = _plot()
     values = spectrum.eigenvalues[0].numpy(force=True)
     axis.plot(np.arange(1, len(values) + 1), values, marker="o", markersize=3)
     axis.set(xlabel="number", ylabel="eigenvalue λ", ylim=(-0.02, 1.05), title="Eigenvalues of the filter")
-    axis.grid(alpha=0.3)
     return figure
 
 
 def plot_response(alpha: Tensor, spectrum: Spectrum) -> Figure:
-    """What the sliders do to each eigenvalue, eq. (14), with the image's own eigenvalues marked on the curve."""
-    figure = Figure(figsize=(8, 5), dpi=DPI, layout="constrained")
-    axis = figure.subplots()
+    """Gain of the sliders for each eigenvalue, eq. (14), with the eigenvalues of the image marked on the curve."""
+    figure, axis = _plot()
     line = torch.linspace(0, 1, 401, dtype=torch.float64)
     values = spectrum.eigenvalues[0].double().cpu()
     sliders = alpha.double().cpu()
@@ -108,12 +105,8 @@ def plot_response(alpha: Tensor, spectrum: Spectrum) -> Figure:
     axis.axhline(1, color="grey", linewidth=1, linestyle="--", label="untouched")
     axis.plot(line, polynomial_response(line, sliders), label=f"f(λ) for alpha = ({names})")
     axis.plot(values, polynomial_response(values, sliders), "o", markersize=4, label="eigenvalues of this image")
-    axis.set(
-        xlabel="eigenvalue λ (0: finest detail, 1: smooth shading)",
-        ylabel="gain f(λ)",
-        title="Response of the sliders",
-    )
-    axis.grid(alpha=0.3)
+    xlabel = "eigenvalue λ (0: finest detail, 1: smooth shading)"
+    axis.set(xlabel=xlabel, ylabel="gain f(λ)", title="Response of the sliders")
     axis.legend()
     return figure
 
@@ -124,13 +117,20 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         figure.savefig(stream, format="png")
 
 
+def _plot() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(8, 5), dpi=DPI, layout="constrained")
+    axis = figure.subplots()
+    axis.grid(alpha=0.3)
+    return figure, axis
+
+
 def _picture(image: Tensor) -> NDArray[Any]:
     """(1, C, H, W) or (C, H, W) as (H, W, 3) in [0, 1]."""
     channels = image.detach().reshape(-1, *image.shape[-2:]).clamp(0, 1)
     return channels.expand(3, -1, -1).permute(1, 2, 0).numpy(force=True)
 
 
-def _reach(values: NDArray[Any]) -> float:
+def _limit(values: NDArray[Any]) -> float:
     """Limit of a symmetric colour scale; positive even for a plane of zeros."""
     return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
 
@@ -150,9 +150,9 @@ def _panels(shape: tuple[int, ...], count: int, columns: int | None, side: int) 
     return figure, axes
 
 
-def _draw(axis: Axes, title: str, picture: NDArray[Any], *, reach: float | None = None, colours: str = "gray") -> None:
-    """One titled picture, with the colour scale ±reach if given and [0, 1] otherwise."""
-    lowest, highest = (0.0, 1.0) if reach is None else (-reach, reach)
+def _draw(axis: Axes, title: str, picture: NDArray[Any], *, limit: float | None = None, colours: str = "gray") -> None:
+    """One titled picture, with the colour scale ±limit if given and [0, 1] otherwise."""
+    lowest, highest = (0.0, 1.0) if limit is None else (-limit, limit)
     axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
     axis.set_title(title, fontsize=min(11.0, max(6.0, axis.get_window_extent().width / 28)))  # fits 36 letters
     axis.set_axis_off()

@@ -1,4 +1,4 @@
-"""The easel: the large picture, what lies over it, and the brush that paints on it."""
+"""The large picture with its overlays, and the brush that draws on it."""
 
 from collections.abc import Callable
 
@@ -10,18 +10,18 @@ from nlfilter_torch.app.session import Opened, Session
 from nlfilter_torch.edits.scribbles import Stroke
 
 
-class Easel:
-    """A photograph with its mask, its strokes and a look at how it was; built into the element that is open.
+class Canvas:
+    """A photograph with its mask, its scribbles and the version before the edit, built into the open element.
 
     Args:
-        session: whose photograph it is.
-        brush: to paint with.
+        session: of the photograph.
+        brush: to draw with.
         token: in the addresses of the pictures.
-        painted: called when a stroke is complete.
-        complain: called with a sentence for the user.
+        drawn: called when a stroke is complete.
+        show_error: called with a sentence for the user.
 
     Attributes:
-        pictures: files of what is shown, by their kind.
+        pictures: image files, by their kind.
     """
 
     def __init__(
@@ -29,17 +29,17 @@ class Easel:
         session: Session,
         brush: Brush,
         token: str,
-        painted: Callable[[], None],
-        complain: Callable[[str], None],
+        drawn: Callable[[], None],
+        show_error: Callable[[str], None],
     ) -> None:
         self.pictures: dict[str, bytes] = {}
         self._session = session
         self._brush = brush
         self._token = token
-        self._painted = painted
+        self._drawn = drawn
         self._frame = 0
-        self._step = "detail"  # whose strokes are shown
-        self._line: list[tuple[float, float]] = []  # of the stroke that is being painted
+        self._step = "detail"  # the step whose strokes are shown
+        self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
         with ui.element("div").classes("canvas"):
             with ui.element("div").classes("welcome") as self._welcome:
                 ui.icon("photo", size="64px")
@@ -53,7 +53,7 @@ class Easel:
                 self._before = ui.element("img").classes("over before").props('alt="before"')
                 ui.element("div").classes("edge")
                 ui.label("before").classes("tag")
-            # A pointer that hovers is no news; one that paints is.
+            # Moves without a pressed button are not sent.
             self._photo.on(
                 "mouse",
                 lambda event: self._pointer(*event.args),
@@ -61,7 +61,7 @@ class Easel:
                 "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
             )
         self._photo.set_visibility(False)
-        self._welcome.on("pointerdown", lambda: complain("open a photograph first; there is nothing to paint on"))
+        self._welcome.on("pointerdown", lambda: show_error("open a photograph first; there is nothing to paint on"))
         with ui.row().classes("bar"):
             ui.label("Before").classes("hint")
             wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
@@ -74,8 +74,8 @@ class Easel:
 
     def open(self, opened: Opened) -> None:
         """Show a photograph that was opened."""
-        preview = self._session.preview
-        height, width = opened.photograph.pixels.shape[-2:]
+        preview = opened.preview
+        height, width = opened.photograph.size
         self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
         self._photo.style(f"width: min(100%, calc((100vh - 130px) * {preview.size[1] / preview.size[0]:.4f}))")
         self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
@@ -85,30 +85,30 @@ class Easel:
         self._photo.set_visibility(True)
 
     def switch(self, step: str) -> None:
-        """Show another step's strokes."""
+        """Show the strokes of another step."""
         self._step = step
         self.draw_strokes()
         self.draw_mask()
 
     def draw(self, upto: str | None) -> None:
-        """Work the picture out, up to a step or with all of them, and its mask; this may be done in a thread."""
+        """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
         self.pictures["after"] = drawing.picture(self._session.render(upto))
         mask = self._session.preview.mask(self._session.recipe.last("detail"))
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
 
     def show(self) -> None:
-        """Show the picture that was worked out."""
+        """Show the picture that was computed."""
         self._show("after", self._photo)
 
     def draw_mask(self, *, moving: bool = False) -> None:
-        """Show the mask, but not over a picture that someone is looking at while moving a slider."""
+        """Show the mask, except while a slider is moving."""
         shown = bool(self._show_mask.value and self._step == "detail" and self.pictures.get("mask")) and not moving
         if shown:
             self._show("mask", self._mask)
         self._mask.set_visibility(shown)
 
     def draw_strokes(self) -> None:
-        """Show the strokes of the step, with the one that is being painted, or none of them."""
+        """Show the strokes of the step and the one being drawn, unless strokes are hidden."""
         strokes: tuple[Stroke, ...] = ()
         if self._session.opened is not None and self._show_strokes.value:
             strokes = self._session.recipe.last(self._step).strokes
@@ -119,7 +119,7 @@ class Easel:
             self._photo.set_content(drawing.strokes_svg(strokes, self._session.preview.size))
 
     def _pointer(self, kind: str, x: float, y: float) -> None:
-        """A stroke begins, goes on, or ends."""
+        """Begin, continue or end a stroke."""
         if self._step not in BRUSHES or self._session.opened is None:
             return
         if kind == "pointerdown":
@@ -131,7 +131,7 @@ class Easel:
         else:
             line, self._line = self._line, []
             self._session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
-            self._painted()
+            self._drawn()
         self.draw_strokes()
 
     def _show(self, kind: str, element: ui.element) -> None:

@@ -1,4 +1,4 @@
-"""The controls of the editor, told in a few words each, and how they become widgets that follow the edit."""
+"""The sliders of the editor: what each of them sets, and the widget that shows and changes it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,8 +12,6 @@ from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
 
 Change = Callable[[str, dict[str, Any], bool], None]  # step, entries, whether the change is complete
-
-
 UNITS = {"gain": "\u00d7", "%": "%"}
 
 
@@ -22,11 +20,11 @@ class Control:
     """A slider for a parameter of a step.
 
     Attributes:
-        edit: its name.
-        parameter: that it sets.
+        edit: name of the step.
+        parameter: what it sets.
         slider: its range and label.
         help: a sentence.
-        index: of the number that the slider is for, where the parameter is a list of them.
+        index: which number the slider sets, if the parameter is a list of them.
     """
 
     edit: str
@@ -36,7 +34,7 @@ class Control:
     index: int | None = None
 
     def read(self, recipe: Recipe) -> float:
-        """The slider's value under an edit."""
+        """The slider's value for an edit."""
         value = self._value(recipe)
         if self.index is not None:
             value = value[self.index]
@@ -49,7 +47,7 @@ class Control:
         return step.sliders_inside if self.parameter.name == "inside" else step[self.parameter.name]
 
     def entries(self, recipe: Recipe, value: float) -> dict[str, Any]:
-        """What the step takes for a value of the slider."""
+        """The entries of the step for a value of the slider."""
         name = self.parameter.name
         if self.slider.none is not None:
             return {name: None if value == self.slider.none else round(value)}
@@ -68,15 +66,14 @@ class Control:
         """
         if value == self.slider.none:
             return "all"
-        places = max(0, len(f"{self.slider.step:g}".partition(".")[2]))
-        unit = UNITS.get(self.parameter.unit)
-        return f"{value:.{places}f}{' ' + unit if unit else ''}"
+        places = len(f"{self.slider.step:g}".partition(".")[2])
+        return f"{value:.{places}f} {UNITS.get(self.parameter.unit, '')}".rstrip()
 
 
 LAYERS = (
     ("Texture", "The finest detail: hair, cloth, grain."),
     ("Fine detail", "Small shapes: wrinkles, leaves, letters."),
-    ("Large detail", "Light and shade within things."),
+    ("Large detail", "Light and shade within objects."),
 )
 
 
@@ -85,10 +82,10 @@ def detail_sliders(name: str, count: int) -> tuple[Control, ...]:
     layers = LAYERS if count == 4 else tuple((f"Layer {i + 1}", "Fine to coarse.") for i in range(count - 1))
     parameter = EDITS["detail"][name]
     finer = [
-        Control("detail", parameter, declaration.Slider(label, 0, 5, 0.05), text + " 1 leaves it, 0 takes it away.", i)
+        Control("detail", parameter, declaration.Slider(label, 0, 5, 0.05), text + " 1 leaves it, 0 removes it.", i)
         for i, (label, text) in enumerate(layers)
     ]
-    shading = "The smooth rest: brightness and contrast as a whole. 1 leaves it."
+    shading = "The smooth rest: overall brightness and contrast. 1 leaves it."
     last = declaration.Slider("Shading", 0.7, 1.3, 0.01)
     return (*finer, Control("detail", parameter, last, shading, count - 1))
 
@@ -101,19 +98,19 @@ OF_EDIT: dict[str, tuple[Control, ...]] = {
 
 
 class SteadySlider(ui.slider):
-    """A slider that the server does not answer: an answer that comes late would move it back under the pointer."""
+    """A slider to which the server does not send values back: a late one would move it away from the pointer."""
 
     LOOPBACK = False
 
 
 class Slider:
-    """A slider on the page that follows the edit and changes it.
+    """A slider on the page that shows and changes the edit.
 
     Args:
-        control: what it is for.
-        recipe: gives the edit as it is.
-        change: takes changes.
-        suffix: behind the label for readers of the page's structure, where two sliders have one name.
+        control: what it sets.
+        recipe: returns the current edit.
+        change: called with changes.
+        suffix: appended to the label for screen readers, where two sliders have the same one.
     """
 
     def __init__(self, control: Control, recipe: Callable[[], Recipe], change: Change, suffix: str = "") -> None:
@@ -133,7 +130,7 @@ class Slider:
         self._value.set_text(control.show(value))
 
     def follow(self) -> None:
-        """Show the edit as it is."""
+        """Show the current edit."""
         value = self._control.read(self._recipe())
         self._following = True
         self._slider.set_value(value)

@@ -1,4 +1,4 @@
-"""What the page shows, as a browser takes it: pictures as files, strokes and curves as SVG."""
+"""Pictures as image files, strokes and curves as SVG, for the browser."""
 
 import io
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ from nlfilter_torch.filtering.filters import polynomial_response
 
 QUALITY = 95
 TINT, OPACITY = (255, 40, 80), 120  # of the mask
-WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes that have none
+WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes that have a meaning instead
 
 
 def picture(image: Tensor) -> bytes:
@@ -53,12 +53,7 @@ def strokes_svg(strokes: Iterable[Stroke], size: tuple[int, int]) -> str:
 
 
 def response_svg(eigenvalues: Tensor, curves: Sequence[tuple[str, Sequence[float]]]) -> str:
-    """The sliders' gain over the eigenvalues of the filter, f(lambda), as a drawing.
-
-    Args:
-        eigenvalues: (R,) in [0, 1], marked on the axis.
-        curves: colour and sliders of each.
-    """
+    """SVG of the sliders' gain f(lambda), with the eigenvalues (R,) of the filter marked; curves: (colour, sliders)."""
     left, right, top, bottom = 26, 292, 10, 112
     steps = torch.linspace(0, 1, 101)
     gains = [polynomial_response(steps, torch.tensor(tuple(alpha))).tolist() for _, alpha in curves]
@@ -94,6 +89,6 @@ def response_svg(eigenvalues: Tensor, curves: Sequence[tuple[str, Sequence[float
 
 
 def _levels(low: float, high: float) -> list[float]:
-    """Gains to draw lines at: whole ones, or every other where there are many."""
+    """Gains at which to draw lines: 1 and about five whole numbers."""
     step = max(1, round((high - low) / 5))
     return sorted({float(v) for v in range(int(low) - 1, int(high) + 1) if v >= low and v % step == 0} | {1.0})

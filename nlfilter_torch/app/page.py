@@ -1,4 +1,4 @@
-"""The editor's page: the easel, the controls beside it, and what happens when one of them is moved."""
+"""The editor's page: the canvas, the controls beside it, and the reactions to them."""
 
 import asyncio
 import secrets
@@ -7,23 +7,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nicegui import events, ui
+from nicegui import background_tasks, events, ui
 
 from nlfilter_torch.app import drawing
-from nlfilter_torch.app.canvas import Easel
+from nlfilter_torch.app.canvas import Canvas
 from nlfilter_torch.app.panel import Brush, Panel
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
-from nlfilter_torch.edits.recipe import Recipe
 
-EXPECTED = (ValueError, OSError, MemoryError)  # of a file or a value that cannot be used; their text says why
-PATIENCE = 0.3  # seconds until the page says that it is at work
-INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # response of the sliders in the region, and elsewhere
+EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
+PATIENCE = 0.3  # seconds until the page shows that it is working
+INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 
 
 class Editor:
-    """One tab of the browser and the session that it shows.
+    """One tab of the browser and its session.
 
     Args:
         session: of editing.
@@ -31,11 +30,9 @@ class Editor:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.brush = Brush()
         self._token = secrets.token_urlsafe(16)
-        self._wanted: list[str | None] = []  # the last step of the picture to draw next; the newest counts
+        self._wanted: list[str | None] = []  # at most one: the last step of the picture to draw next
         self._drawing = False
-        self._jobs: set[asyncio.Future[None]] = set()
 
     def build(self, image: Path | None) -> None:
         """Lay the page out, and open a photograph if there is one."""
@@ -44,24 +41,20 @@ class Editor:
         self._client.on_delete(lambda: EDITORS.pop(self._token, None))
         ui.add_css(CSS)
         self._build_header()
-        with ui.element("div").classes("desk"):
-            with ui.element("div").classes("easel"):
-                self._easel = Easel(self.session, self.brush, self._token, self._painted, self._complain)
+        brush = Brush()
+        with ui.element("div").classes("editor"):
+            with ui.element("div").classes("viewer"):
+                self._canvas = Canvas(self.session, brush, self._token, self._changed, self._show_error)
             with ui.column().classes("panel"):
-                self._panel = Panel(self)
+                self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
         ui.keyboard(on_key=self._key)
         if image is not None:
             self._client.on_connect(lambda: self._begin(image))
 
     @property
-    def recipe(self) -> Recipe:
-        """The edit as it is."""
-        return self.session.recipe
-
-    @property
     def pictures(self) -> dict[str, bytes]:
         """Files of the pictures that the page shows, by their kind."""
-        return self._easel.pictures
+        return self._canvas.pictures
 
     # Layout
 
@@ -79,7 +72,7 @@ class Editor:
             _button("Open", "folder_open", "A PNG, JPEG, TIFF or WebP file", js=_pick(photographs))
             _button("Undo", "undo", "Ctrl+Z", self._undo)
             _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
-            _button("Load edit", "tune", "An edit saved before, or sliders that fit found", js=_pick(presets))
+            _button("Load edit", "tune", "A saved edit, or sliders found by nlfilter-torch fit", js=_pick(presets))
             _button("Save edit", "bookmark_add", "For other photographs, and for the command line", self._ask_edit_name)
             _button("Save photo", "save", "At full size, into a file", self._ask_photo_name).props(
                 "color=primary unelevated", remove="flat"
@@ -92,32 +85,27 @@ class Editor:
 
     # Changes
 
-    def change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
-        """Change entries of a step; ``complete`` when the pointer has let go."""
+    def _change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
+        """Change entries of a step; ``complete`` when the pointer is released."""
         self.session.set(step, **entries)
         if complete:
             self.session.commit()
-            self._panel.follow()
-        self._redraw(None if complete else step)
+            self._changed()
+        else:
+            self._redraw(step)
 
-    def switch(self, step: str) -> None:
-        """Show another step's strokes."""
-        self._easel.switch(step)
-
-    def _painted(self) -> None:
-        """A stroke is complete."""
+    def _changed(self) -> None:
+        """Show the edit after a complete change."""
         self._panel.follow()
         self._redraw()
 
     def _undo(self) -> None:
         if self.session.undo():
-            self._panel.follow()
-            self._redraw()
+            self._changed()
 
     def _redo(self) -> None:
         if self.session.redo():
-            self._panel.follow()
-            self._redraw()
+            self._changed()
 
     def _key(self, event: events.KeyEventArguments) -> None:
         if event.action.keydown and event.modifiers.ctrl and str(event.key).lower() == "z":
@@ -126,8 +114,8 @@ class Editor:
     # Pictures
 
     def _redraw(self, upto: str | None = None) -> None:
-        """Draw the picture anew, as soon as the one that is being drawn is done."""
-        self._easel.draw_strokes()
+        """Draw the picture again, once the drawing in progress is done."""
+        self._canvas.draw_strokes()
         if self.session.opened is None:
             return
         self._wanted = [upto]
@@ -139,22 +127,22 @@ class Editor:
         try:
             while self._wanted:
                 upto = self._wanted.pop()
-                await self._run("Working", partial(self._easel.draw, upto))
-                self._easel.show()
+                await self._run("Working", partial(self._canvas.draw, upto))
+                self._canvas.show()
                 self._draw_response()
-                self._easel.draw_mask(moving=upto is not None)
+                self._canvas.draw_mask(moving=upto is not None)
         finally:
             self._drawing = False
 
     def _draw_response(self) -> None:
-        detail = self.recipe.last("detail")
+        detail = self.session.recipe.last("detail")
         curves = [(OUTSIDE, detail["alpha"]), *([(INSIDE, detail.sliders_inside)] if detail.has_region() else [])]
         self._panel.draw_response(drawing.response_svg(self.session.preview.layers(detail).eigenvalues, curves))
 
     # Files
 
     def _begin(self, image: Path) -> None:
-        if self.session.opened is None:  # a browser that comes back finds its edit as it was
+        if self.session.opened is None:  # a browser that reconnects keeps its edit
             self._start(self._open(lambda: self.session.open(image)))
 
     async def _take_photograph(self, event: events.UploadEventArguments) -> None:
@@ -168,9 +156,8 @@ class Editor:
         if opened is None:
             return
         self._title.set_text(opened.name)
-        self._easel.open(opened)
-        self._panel.follow()
-        self._redraw()
+        self._canvas.open(opened)
+        self._changed()
 
     async def _take_preset(self, event: events.UploadEventArguments) -> None:
         content = await event.file.read()
@@ -178,14 +165,13 @@ class Editor:
         try:
             self.session.load_preset(content, event.file.name)
         except EXPECTED as error:
-            self._complain(str(error))
-            return
-        self._panel.follow()
-        self._redraw()
+            self._show_error(str(error))
+        else:
+            self._changed()
 
     async def _ask_photo_name(self) -> None:
         if self.session.opened is None:
-            self._complain("open a photograph first; there is nothing to save")
+            self._show_error("open a photograph first; there is nothing to save")
             return
         await self._ask("Save the photograph", self.session.suggested_name(), self.session.save)
 
@@ -194,7 +180,7 @@ class Editor:
         await self._ask("Save the edit", f"{name}.json", self.session.save_preset)
 
     async def _ask(self, title: str, name: str, save: Callable[[str], Path]) -> None:
-        """Ask for a name, and whether a file of that name may go, and save."""
+        """Ask for a name, and whether to replace a file of that name, and save."""
         with self._client, ui.dialog() as dialog, ui.card().classes("dialog"):
             ui.label(title).classes("text-h6")
             field = ui.input("Name", value=name).props("outlined autofocus").classes("w-full")
@@ -231,26 +217,24 @@ class Editor:
     # Work
 
     def _start(self, work: Awaitable[None]) -> None:
-        """Do something beside what the page does, and say so if it fails."""
-        job = asyncio.ensure_future(work)
-        self._jobs.add(job)
-        job.add_done_callback(self._finish)
+        """Run a task in the background, and report its failure."""
+        background_tasks.create(self._reported(work))
 
-    def _finish(self, job: asyncio.Future[None]) -> None:
-        self._jobs.discard(job)
-        error = None if job.cancelled() else job.exception()
-        if isinstance(error, EXPECTED):
-            self._complain(str(error))
-        elif error is not None:
-            self._complain("this failed, and it is not your fault; the terminal that runs the editor shows more")
-            raise error  # for the log
+    async def _reported(self, work: Awaitable[None]) -> None:
+        try:
+            await work
+        except EXPECTED as error:
+            self._show_error(str(error))
+        except Exception:
+            self._show_error("this failed, and it is not your fault; the terminal that runs the editor shows more")
+            raise  # for the log
 
-    def _complain(self, sentence: str) -> None:
+    def _show_error(self, sentence: str) -> None:
         with self._client:
             ui.notify(sentence, type="negative", position="bottom", timeout=10000, close_button="OK", multi_line=True)
 
     async def _run(self, doing: str, work: Callable[[], Any]) -> Any:
-        """Do something in a thread; the page says so if it takes its time."""
+        """Run something in a thread; the page shows ``doing`` if it takes long."""
         task = asyncio.ensure_future(asyncio.to_thread(work))
         done, _ = await asyncio.wait({task}, timeout=PATIENCE)
         if not done:
@@ -258,7 +242,7 @@ class Editor:
             self._working.set_visibility(True)
             await asyncio.wait({task})
             self._working.set_visibility(False)
-        return task.result()
+        return await task
 
 
 def _button(
@@ -267,9 +251,7 @@ def _button(
     button = ui.button(label, icon=icon, on_click=action).props("flat no-caps dense color=white").classes("q-px-sm")
     if js is not None:
         button.on("click", js_handler=js)
-    with button:
-        ui.tooltip(tip)
-    return button
+    return button.tooltip(tip)
 
 
 def _pick(upload: ui.upload) -> str:

@@ -2,29 +2,29 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from functools import partial
 
 from nicegui import ui
 
 from nlfilter_torch.app import controls
-from nlfilter_torch.app.controls import Control, Slider
+from nlfilter_torch.app.controls import Change, Control, Slider
+from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, PURPOSES
-from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 
 COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
 BRUSHES: dict[str, dict[str, str]] = {edit.name: dict(edit.brushes) for edit in EDITS.values() if edit.brushes}
 TABS = ("detail", *(edit for edit in EDITS if edit != "detail"))
-BANDWIDTH = 20.0  # grey levels, to begin with where the photograph is not asked
+BANDWIDTH = 20.0  # grey levels, the start when the bandwidth is not automatic
 
 
 @dataclass
 class Brush:
-    """What the pointer paints with, for each step.
+    """The settings of the brush, for each step.
 
     Attributes:
-        word: of the stroke; ``colour`` paints with :attr:`colour`.
+        word: meaning of the strokes; ``colour`` stands for :attr:`colour`.
         radius: as a share of the short side.
         colour: for all steps that take one.
     """
@@ -34,42 +34,26 @@ class Brush:
     colour: str = COLOURS[0]
 
     def paint(self, step: str) -> str:
-        """What a stroke for a step says."""
+        """The meaning or colour of a stroke for a step."""
         return self.colour if self.word[step] == "colour" else self.word[step]
 
 
-class Desk(Protocol):
-    """What the panel needs of the page."""
-
-    brush: Brush
-
-    @property
-    def recipe(self) -> Recipe:
-        """The edit as it is."""
-        ...
-
-    def change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
-        """Change entries of a step; ``complete`` when the pointer has let go."""
-        ...
-
-    def switch(self, step: str) -> None:
-        """Show another step's strokes."""
-        ...
-
-
 class Panel:
-    """Tabs with sliders, brushes and presets; built into the element that is open.
+    """Tabs with sliders, brushes and presets, built into the open element.
 
     Args:
-        desk: the page.
+        session: of the photograph.
+        brush: whose settings are shown.
+        change: called with changes of a step.
+        switch: called with the step of a tab that was opened.
     """
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+    def __init__(self, session: Session, brush: Brush, change: Change, switch: Callable[[str], None]) -> None:
+        self._session, self._brush, self._change = session, brush, change
         self._following = False
         self._sliders: list[Slider] = []
         self._layout: tuple[int, bool] = (0, False)
-        with ui.tabs(on_change=lambda event: desk.switch(event.value)).classes("w-full") as tabs:
+        with ui.tabs(on_change=lambda event: switch(event.value)).classes("w-full") as tabs:
             tabs.props("dense no-caps align=justify")
             for step in TABS:
                 ui.tab(step, label=step.capitalize())
@@ -85,8 +69,8 @@ class Panel:
         self.follow()
 
     def follow(self) -> None:
-        """Show the edit as it is."""
-        detail = self._desk.recipe.last("detail")
+        """Show the current edit."""
+        detail = self._session.recipe.last("detail")
         self._following = True
         if self._layout != (len(detail["alpha"]), detail.has_region()):
             self._layout = (len(detail["alpha"]), detail.has_region())
@@ -105,7 +89,7 @@ class Panel:
         self._response.set_content(svg)
 
     def _slider(self, control: Control, suffix: str = "") -> Slider:
-        return Slider(control, lambda: self._desk.recipe, self._desk.change, suffix)
+        return Slider(control, lambda: self._session.recipe, self._change, suffix)
 
     def _build_detail(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
@@ -117,8 +101,8 @@ class Panel:
         with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):
             label = ui.label("Detail is").classes("text-no-wrap")
             label.tooltip(
-                "How different two spots may be and still count as alike, in grey levels of 255. Small values touch "
-                "fine texture only, large ones treat much as detail."
+                "How different two places may be and still count as alike, in grey levels of 255. Small values affect "
+                "only fine texture, large ones treat much as detail."
             )
             self._automatic = ui.checkbox("as the photo suggests", value=True).props("dense")
             self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
@@ -143,7 +127,7 @@ class Panel:
     def _build_brush(self, step: str) -> None:
         if step not in BRUSHES:
             return
-        brush = self._desk.brush
+        brush = self._brush
         ui.label("Brush").classes("group")
         if step == "detail":
             ui.label(EDITS[step].hint).classes("hint")
@@ -151,7 +135,7 @@ class Panel:
             words = ui.toggle(BRUSHES[step], value=brush.word[step]).props("dense no-caps unelevated")
             words.on_value_change(lambda event: brush.word.update({step: event.value}))
             ui.space()
-            clear = ui.button("Clear strokes", on_click=lambda: self._desk.change(step, {"strokes": ()}, True))
+            clear = ui.button("Clear strokes", on_click=lambda: self._change(step, {"strokes": ()}, True))
             clear.props("flat dense no-caps")
         if "colour" in BRUSHES[step]:
             self._build_colours(brush)
@@ -171,7 +155,7 @@ class Panel:
         field.props("dense outlined").classes("w-full q-mt-xs")
         with ui.row().classes("gap-2 q-mt-xs"):
             for colour in COLOURS:
-                ui.button(on_click=_setter(field.set_value, colour)).props(
+                ui.button(on_click=partial(field.set_value, colour)).props(
                     f'round dense unelevated size=sm aria-label="{colour}"'
                 ).style(f"background: {colour} !important")
 
@@ -179,15 +163,11 @@ class Panel:
         if name is None:
             return
         self._presets.set_value(None)  # so that the same one can be chosen again
-        preset, inside = PRESETS[name], self._desk.recipe.last("detail")["inside"]
+        preset, inside = PRESETS[name], self._session.recipe.last("detail")["inside"]
         entries = {entry: getattr(preset, entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
         entries["inside"] = inside if inside is not None and len(inside) == len(preset.alpha) else None
-        self._desk.change("detail", entries, True)
+        self._change("detail", entries, True)
 
     def _set_bandwidth(self, value: float | str) -> None:
         if not self._following:
-            self._desk.change("detail", {"bandwidth": value}, True)
-
-
-def _setter(function: Callable[[str], object], value: str) -> Callable[[], object]:
-    return lambda: function(value)
+            self._change("detail", {"bandwidth": value}, True)

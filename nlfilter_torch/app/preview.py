@@ -1,11 +1,12 @@
-"""A small picture that shows what an edit makes of a large photograph, quickly enough to move a slider by.
+"""A reduced picture under an edit, fast enough to follow a slider.
 
-A filter of a reduced picture is another filter: its patches are larger parts of the scene, and neighbouring pixels
-differ by more. The preview therefore takes every n-th patch of the photograph itself, and filters the reduced picture
-by how alike those are. Against the reduced result of the whole photograph, that halves the error of the other way.
+The filter of a reduced picture differs from that of the photograph: its patches are larger parts of the scene, and
+neighbouring pixels differ by more. The preview therefore compares every n-th patch of the photograph itself, and
+filters the reduced picture with the resulting operator. This halves the error against the reduced result of the whole
+photograph.
 
-Whatever is slow is held here, each with the settings that it came from: the layers that the sliders weigh, the spectrum
-that masks come from, the filter of the step that is being worked on, and the picture after each step.
+Slow results are cached with the settings they depend on: the layers that the sliders weigh, the spectrum for masks, the
+filter of the step that is being changed, and the picture after each step.
 """
 
 import math
@@ -28,13 +29,12 @@ from nlfilter_torch.operator.kernel import GuideFeatures
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Spectrum
 
-Key = tuple[object, ...]  # the settings that something was worked out from
-
+Key = tuple[object, ...]  # the settings on which a cached result depends
 PIXELS = 1_000_000  # of a preview, at most
 
 
 def stride_for(height: int, width: int, pixels: int = PIXELS) -> int:
-    """Every how many pixels a preview has one, so that it has no more than ``pixels``.
+    """The reduction of a preview that has at most ``pixels``.
 
     >>> stride_for(4000, 6000), stride_for(600, 800)
     (5, 1)
@@ -50,9 +50,9 @@ def reduce(image: Tensor, stride: int) -> Tensor:
 def sampled_operator(
     guide: Tensor, stride: int, detail: Step, *, bandwidth: float | Tensor, channels: GuideChannels, patch_size: int
 ) -> NonlocalOperator:
-    """The filter of every ``stride``-th pixel of a guide, by the patches around it in the guide itself.
+    """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution.
 
-    With ``stride`` 1 it is :func:`nonlocal_operator`, and with any other a sample of it: the same pixels are alike.
+    With ``stride`` 1 it is :func:`nonlocal_operator`, else a sample of it.
     """
     generator = torch.Generator().manual_seed(0)
     if stride == 1:
@@ -79,7 +79,7 @@ def sampled_operator(
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What the detail sliders weigh: layers (1, k+1, 1, h, w) of the luminance, and the filter's eigenvalues (R,)."""
+    """Layers (1, k+1, 1, h, w) of the luminance, which the detail sliders weigh, and the eigenvalues (R,)."""
 
     key: Key
     layers: Tensor
@@ -87,10 +87,10 @@ class Layers:
 
 
 class MaskMaker:
-    """:func:`diffusion_mask` for one region after the other of the same picture, at a fraction of its time.
+    """:func:`diffusion_mask` for many regions of the same picture, in a fraction of the time.
 
-    The squared distance of pixels to a region's mean is a quadratic form of their columns of the factor: with the norms
-    held, a new region costs one product of the factor with a vector.
+    The squared distance of pixels to a region's mean is a quadratic form of their columns of the factor. With cached
+    norms, a new region costs one product of the factor with a vector.
     """
 
     def __init__(self, spectrum: Spectrum, key: Key) -> None:
@@ -99,7 +99,7 @@ class MaskMaker:
         self._time: float | None = None
 
     def _prepare(self, time: float) -> None:
-        """Hold the quadratic form and the norms for a diffusion time."""
+        """Cache the quadratic form and the norms for a diffusion time."""
         if time == self._time:
             return
         spectrum = self._spectrum
@@ -132,11 +132,11 @@ class MaskMaker:
 
 
 class Preview:
-    """A photograph, reduced, under any edit.
+    """A reduced photograph under any edit.
 
     Args:
-        photograph: (1, C, H, W), in [0, 1] but for files of floats.
-        pixels: of the preview, at most.
+        photograph: (1, C, H, W), in [0, 1] except for files of floats.
+        pixels: largest number of pixels of the preview.
     """
 
     def __init__(self, photograph: Tensor, pixels: int = PIXELS) -> None:
@@ -155,7 +155,7 @@ class Preview:
         return (self.pixels.shape[-2], self.pixels.shape[-1])
 
     def layers(self, detail: Step) -> Layers:
-        """The layers for a filter's settings; slow when these have changed."""
+        """The layers for the filter of a step; slow if its settings have changed."""
         order = len(detail["alpha"]) - 1
         key = (*shared(detail), order)
         if self._layers is None or self._layers.key != key:
@@ -174,20 +174,16 @@ class Preview:
         return self._layers
 
     def mask(self, detail: Step) -> Tensor | None:
-        """Where the sliders inside hold, (1, 1, h, w), or None without strokes; slow the first time only."""
+        """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""
         if not detail.has_region():
             return None
         key = (detail.strokes, detail["time"], detail["landmarks"], detail["spatial_bandwidth"])
         if self._mask is None or self._mask[0] != key:
             if self._masks is None or self._masks.key != key[2:]:
                 plain = Step("detail", landmarks=detail["landmarks"], spatial_bandwidth=detail["spatial_bandwidth"])
+                guide = self.photograph.float()
                 operator = sampled_operator(
-                    self.photograph.float(),
-                    self.stride,
-                    plain,
-                    bandwidth=MASK_BANDWIDTH,
-                    channels="all",
-                    patch_size=5,
+                    guide, self.stride, plain, bandwidth=MASK_BANDWIDTH, channels="all", patch_size=5
                 )
                 self._masks = MaskMaker(operator.spectrum(), key[2:])
             (inner,), others = scribbles_of(detail, self.size)
@@ -199,7 +195,7 @@ class Preview:
 
         Args:
             recipe: the edit.
-            upto: name of the last step that counts; None is all of them.
+            upto: name of the last step to apply; None is all of them.
         """
         result, drawn = self.pixels, False
         key: Key = ()
@@ -213,7 +209,7 @@ class Preview:
                 continue
             cached = self._pictures.get(i)
             if cached is None or cached[0] != key:
-                # The first picture to be drawn anew is that of the step someone works on: its filter is kept.
+                # The first picture to be computed again is that of the step being changed: its filter is cached.
                 edit = self._filter_of(step, result, before, keep=not drawn)
                 cached = self._pictures[i] = (key, edit(step))
                 drawn = True
@@ -228,12 +224,12 @@ class Preview:
         return edit_luminance(self.pixels, lambda _: edited)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
-        """What the filter of a step makes of the picture before it; slow, unless it is cached."""
+        """The edit of a step on the picture before it; slow unless its filter is cached."""
         key = (*before, step.edit, *shared(step))
         if self._filter is not None and self._filter[0] == key:
             return self._filter[1]
         if keep:
-            self._filter = None  # two of them would take twice the memory
+            self._filter = None  # first, since two of them would take twice the memory
         edit = prepare(step, image.clamp(0, 1), stride=self.stride)
         if keep:
             self._filter = (key, edit)
@@ -241,5 +237,5 @@ class Preview:
 
 
 def is_of_layers(step: Step) -> bool:
-    """Whether a step weighs layers of luminance, from which the picture follows its sliders at once."""
+    """Whether a step weighs layers of luminance, which are cached."""
     return step.edit == "detail" and step["residual"] is None and step["channels"] == "luminance"

@@ -1,9 +1,8 @@
-"""The editor's server: one page, one session for each tab, pictures by an address that only that tab knows.
+"""The editor's server: one page, one session per tab, pictures at an address that only that tab knows.
 
-NiceGUI carries the page rather than Gradio. Gradio 6.31 refuses Pillow 13, which this package reads pictures with; its
-ImageEditor sends whole bitmaps, and in a trial with headless Chromium its change event had not come three seconds after
-a stroke. NiceGUI gives the pointer's events in pixels of the picture, which is all that a brush needs, takes a slider's
-moves in order over one connection, and ships every script and font that it uses.
+Why NiceGUI and not Gradio: Gradio 6.31 excludes Pillow 13, its ImageEditor sends whole bitmaps, and in a trial with
+headless Chromium its change event had not arrived three seconds after a stroke. NiceGUI reports the pointer in pixels
+of the picture, keeps the moves of a slider in order, and includes every script and font that it uses.
 """
 
 import socket
@@ -36,7 +35,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     """
     port = _check_address(host, port)
     if host in LOCAL:
-        # A page from elsewhere must not reach the editor by a name of its own for this machine.
+        # Against DNS rebinding: other sites must not reach the editor by a host name of their own.
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost", "[::1]"])
 
     @app.get("/picture/{token}/{kind}")
@@ -70,7 +69,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
 
 
 def _check_address(host: str, port: int) -> int:
-    """The port to listen on; raises ValueError where that is not possible."""
+    """The port to listen on; raises ValueError if that is not possible."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as probe:
         if sys.platform != "win32":

@@ -1,7 +1,7 @@
-"""One person's editing of one photograph: what is open, what was done, and what can be undone. Knows of no page."""
+"""The editing of one photograph: what is open, the edit, and what can be undone. Independent of the page."""
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +24,13 @@ from nlfilter_torch.io.photographs import (
     write_photograph,
 )
 
-SPACING = 0.2  # of the points that a stroke keeps, as a share of its radius
+SPACING = 0.2  # of the points of a stroke, as a share of its radius
 UNDOS = 100
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A photograph at hand.
-
-    Attributes:
-        name: of its file.
-        photograph: as it was read.
-        preview: of it.
-    """
+    """An open photograph, the name of its file, and its preview."""
 
     name: str
     photograph: Photograph
@@ -44,11 +38,11 @@ class Opened:
 
 
 class Session:
-    """What one page edits; a second page has another one.
+    """The state of one page.
 
     Args:
         folder: where files are saved.
-        pixels: of the preview, at most.
+        pixels: largest number of pixels of the preview.
     """
 
     def __init__(self, folder: Path, pixels: int = PIXELS) -> None:
@@ -58,20 +52,20 @@ class Session:
         self._pixels = pixels
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
-        self._shown = Recipe()  # what the last committed edit is
+        self._shown = Recipe()  # the last committed edit
 
     def open(self, path: Path, name: str | None = None) -> None:
-        """Read a photograph and begin a new edit; on any failure all stays as it was.
+        """Read a photograph and begin a new edit; a failure changes nothing.
 
         Args:
             path: of the file.
-            name: of it, if ``path`` is not where it belongs.
+            name: of the file, if ``path`` is a copy of it.
 
         Raises:
             ValueError, OSError, MemoryError: see :func:`read_photograph`; the message names the file as ``name``.
         """
         try:
-            # As much as saving takes at least: better to hear of it now.
+            # At least as much memory as saving will need.
             photograph = read_photograph(path, bytes_per_pixel=working_bytes(100, 5))
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
@@ -80,7 +74,7 @@ class Session:
         self._past, self._future = [], []
 
     def open_bytes(self, content: bytes, name: str) -> None:
-        """The same with a file's content, such as a browser sends."""
+        """:meth:`open` with a file's content, as a browser sends it."""
         with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
             path = Path(folder) / "photograph"
             path.write_bytes(content)
@@ -88,58 +82,53 @@ class Session:
 
     @property
     def preview(self) -> Preview:
-        """The preview of what is open.
-
-        Raises:
-            ValueError: if nothing is.
-        """
+        """The preview; raises ValueError if no photograph is open."""
         if self.opened is None:
             raise ValueError("open a photograph first")
         return self.opened.preview
 
     def set(self, edit: str, **values: Any) -> None:
-        """Change the last step of an edit, or add one; :meth:`commit` makes it a change that can be undone."""
+        """Change the last step of an edit, or add one; :meth:`commit` completes the change."""
         self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(**values))
 
     def commit(self) -> None:
-        """End a change, so that undo goes back to before it."""
+        """Complete a change, which can then be undone."""
         if self.recipe != self._shown:
             self._past = [*self._past[-UNDOS + 1 :], self._shown]
             self._future = []
             self._shown = self.recipe
 
     def load(self, recipe: Recipe) -> None:
-        """Take another edit, as one change."""
+        """Replace the edit, as one change."""
         self.recipe = recipe
         self.commit()
 
     def undo(self) -> bool:
-        """Take the last change back; False if there is none."""
-        if not self._past:
-            return False
-        self._future.append(self._shown)
-        self.recipe = self._shown = self._past.pop()
-        return True
+        """Undo the last change; False if there is none."""
+        return self._go(self._past, self._future)
 
     def redo(self) -> bool:
-        """Make the last change that was taken back again; False if there is none."""
-        if not self._future:
+        """Redo the last change that was undone; False if there is none."""
+        return self._go(self._future, self._past)
+
+    def _go(self, there: list[Recipe], back: list[Recipe]) -> bool:
+        if not there:
             return False
-        self._past.append(self._shown)
-        self.recipe = self._shown = self._future.pop()
+        back.append(self._shown)
+        self.recipe = self._shown = there.pop()
         return True
 
     def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
-        """Paint for a step.
+        """Add a stroke to a step.
 
         Args:
-            step: its name.
+            step: name of the step.
             points: (x, y) in pixels of the preview.
             radius: of the brush, as a share of the short side.
-            paint: what it says.
+            paint: its meaning or colour.
 
         Raises:
-            ValueError: if no photograph is open, or the step takes no such strokes.
+            ValueError: if no photograph is open, or the step takes no such stroke.
         """
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
@@ -149,7 +138,7 @@ class Session:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = Stroke.from_entries(entries, words, step)
         last = self.recipe.last(step)
-        if step == "detail" and paint == "in" and not last.has_region():  # what was set for all is meant for it
+        if step == "detail" and paint == "in" and not last.has_region():  # the sliders move into the region
             self.set("detail", inside=last["alpha"], alpha=(1.0,) * len(last["alpha"]))
         self.set(step, strokes=(*last.strokes, stroke))
         self.commit()
@@ -159,11 +148,7 @@ class Session:
         return self.preview.render(self.recipe, upto)
 
     def target(self, name: str) -> Path:
-        """The file of that name in the folder.
-
-        Raises:
-            ValueError: if ``name`` leads out of it, or is none.
-        """
+        """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
         path = Path(name.strip())
         if not path.name or path.name != name.strip() or path.name.startswith(".") or "\0" in name:
             raise ValueError(
@@ -172,7 +157,7 @@ class Session:
         return self.folder / path
 
     def suggested_name(self) -> str:
-        """A name to save under: that of the photograph with ``-edited``, and an ending that can hold it."""
+        """The name of the photograph with ``-edited``, and an extension of a file type that can hold it."""
         if self.opened is None:
             return ""
         path, photograph = Path(self.opened.name), self.opened.photograph
@@ -187,27 +172,24 @@ class Session:
         """Edit the photograph at its full size and write it; the file appears complete or not at all.
 
         Raises:
-            ValueError, OSError, MemoryError: if nothing is open, or it cannot be written or edited here.
+            ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
         """
         target = self.target(name)
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to save")
         recipe, photograph = self.recipe, self.opened.photograph
         check_output(target, photograph)
-        height, width = photograph.pixels.shape[-2:]
+        height, width = photograph.size
         needed = working_bytes(recipe.landmarks, recipe.patch_size, factors=recipe.factors)
         check_memory(Path(self.opened.name), width, height, needed)
-        pixels = recipe.apply(photograph.pixels)
-        if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
-            photograph = replace(photograph, icc=None)
-        write_photograph(photograph.with_pixels(pixels), target)
+        write_photograph(photograph.with_pixels(recipe.apply(photograph.pixels)), target)
         return target
 
     def save_preset(self, name: str) -> Path:
         """Write the edit as a file for :meth:`load_preset` and the command line.
 
         Raises:
-            ValueError, OSError: if it cannot be written there.
+            ValueError, OSError: if it cannot be written.
         """
         target = self.target(name)
         if target.suffix.lower() != ".json":
@@ -217,9 +199,5 @@ class Session:
         return target
 
     def load_preset(self, content: bytes, name: str) -> None:
-        """Take the edit that a file holds.
-
-        Raises:
-            ValueError: if it holds none.
-        """
+        """Load the edit in the content of a file; raises ValueError if there is none."""
         self.load(Recipe.from_json(content.decode("utf-8", errors="replace"), name))

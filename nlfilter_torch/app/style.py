@@ -1,4 +1,4 @@
-"""How the page looks; everything comes from here and from what NiceGUI ships, nothing from the network."""
+"""The style of the page; everything comes from here and from NiceGUI, nothing from the network."""
 
 CSS = """
 :root { --wipe: 0; }
@@ -6,8 +6,8 @@ body { background: #17181b; }
 .nicegui-content { padding: 0 !important; gap: 0 !important; }
 .topbar { background: #101114; height: 52px; gap: 6px; }
 .dialog { min-width: 460px; background: #2a2d33; }
-.desk { display: flex; width: 100vw; height: calc(100vh - 52px); }
-.easel { flex: 1; min-width: 0; display: flex; flex-direction: column; padding: 16px 20px 8px; gap: 10px; }
+.editor { display: flex; width: 100vw; height: calc(100vh - 52px); }
+.viewer { flex: 1; min-width: 0; display: flex; flex-direction: column; padding: 16px 20px 8px; gap: 10px; }
 .canvas { flex: 1; min-height: 0; width: 100%; display: flex; align-items: center; justify-content: center; }
 .photo { position: relative; box-shadow: 0 2px 24px #0009; user-select: none; touch-action: none; cursor: crosshair; }
 .photo.still { cursor: default; }

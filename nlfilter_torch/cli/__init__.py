@@ -1,6 +1,6 @@
-"""The command line ``nlfilter-torch``. Each verb has its own file; options that verbs share are in ``options``.
+"""The command line ``nlfilter-torch``. Options that commands share are in ``options``.
 
-Bad input of any kind is one sentence on the standard error stream and exit status 2.
+Bad input of any kind is reported in one sentence on the standard error stream and exit status 2.
 """
 
 import sys
@@ -11,7 +11,7 @@ from nlfilter_torch.cli import interrupts
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status."""
     try:
-        with interrupts.heeded():
+        with interrupts.handled():
             from nlfilter_torch.cli.application import run
 
             return run(arguments)

@@ -1,10 +1,10 @@
-"""The verbs put together, and what happens when one of them is given something it cannot use."""
+"""The command line put together from its commands, and how it reports bad input."""
 
 import math
 import reprlib
 import sys
 import warnings
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -27,7 +27,7 @@ NAME = "nlfilter-torch"
 
 
 class Verb(TyperCommand):
-    """A command that says what a wrong number was, and takes no number that is NaN or infinite."""
+    """A command whose errors show a wrong number, and that refuses NaN and infinity."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Raise ValueError where an option is NaN or infinite, BadParameter where it is beyond its range."""
@@ -75,14 +75,14 @@ def _common(
             "--version",
             callback=_print_version,
             is_eager=True,
-            help="Print the version, and whether compiled kernels are at work.",
+            help="Print the version, and whether compiled kernels are used.",
         ),
     ] = False,
 ) -> None:
-    """Edit photographs with a filter that treats similar spots alike wherever they are.
+    """Edit photographs with a filter that treats similar places alike, wherever they are.
 
-    It compares small patches all over the picture, so that fine texture, larger details, edges and shading come apart,
-    and each can be made stronger or weaker. `nlfilter-torch COMMAND --help` explains each command.
+    It compares small patches all over the picture and separates fine texture, larger details and shading, so that each
+    can be made stronger or weaker. `nlfilter-torch COMMAND --help` explains each command.
     """
 
 
@@ -103,19 +103,12 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _refuse(message: str) -> int:
-    # Typer puts the class of an error before some of its own messages; a photographer has no use for it.
+    # Typer puts the class of an error before some of its messages.
     sentence = " ".join(message.replace("Value error, ", "").split())
     sys.stderr.write(f"{NAME}: {sentence}\n")
     return 2
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    """A warning as a reader of pictures wants it: without the place in the code."""
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Print a warning without its place in the code."""
     sys.stderr.write(f"{NAME}: note: {message}\n")

@@ -1,34 +1,29 @@
-"""``nlfilter-torch demo``: every step of the way on one photograph, as pictures."""
+"""``nlfilter-torch demo``: pictures of each step of the filter on one photograph."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from nlfilter_torch.cli import options
+from nlfilter_torch.cli.inspect import Folder, print_table, summarize
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
-# Found by eye: half the usual width keeps the mask on the suit, three times the usual time fills its folds.
+# Chosen by eye: half the default width keeps the mask on the suit, three times the default time fills its folds.
 SELECTION_WIDTH = 2.0
 SELECTION_TIME = 3.0
 SELECTION_BANDWIDTH = 25 / options.LEVELS
 
 
-def demo(
-    folder: Annotated[
-        Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
-    ] = Path("out"),
-) -> None:
+def demo(folder: Folder = Path("out")) -> None:
     """Show what this program does, on a photograph that comes with it.
 
     Writes pictures of the photograph before and after, of its layers, of the patterns that the filter finds, of the
-    sliders and of a region that spreads to all that looks like it, and prints a table.
+    response of the sliders and of a region extended to everything that looks like it, and prints a table.
     """
     import skimage.data
     import torch
 
-    from nlfilter_torch.cli.inspect import print_table, summarize
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.colour import edit_luminance
     from nlfilter_torch.filtering.filters import detail_layers, polynomial_filter

@@ -3,9 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-import torch
 from torch import Tensor
 
 from nlfilter_torch.cli import options
@@ -13,8 +11,6 @@ from nlfilter_torch.cli.progress import steps
 from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.io.photographs import Photograph, check_output, read_photograph, write_photograph
-from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.tiled.sources import Rows
 
 
@@ -57,35 +53,10 @@ def edit_file(
             edited = photograph if depth is None else replace(photograph, depth=options.DEPTHS[depth])
             check_output(target, edited)
             begin("Editing")
-            pixels = edit(photograph)
+            edited = edited.with_pixels(edit(photograph))
             begin("Writing")
-            if pixels.shape[1] != photograph.pixels.shape[1]:  # a profile for grey fits no colours
-                edited = replace(edited, icc=None)
-            write_photograph(edited.with_pixels(pixels), target)
+            write_photograph(edited, target)
             return
     if allowed is not None and by_rows is not None:
         kind = None if depth is None else options.DEPTHS[depth]
         edit_by_rows(Path(source), Path(target), kind, allowed, by_rows, coloured=coloured)
-
-
-def build_operator(
-    guide: Tensor,
-    *,
-    bandwidth: float | Literal["auto"],
-    spatial_bandwidth: float | None,
-    patch_size: int,
-    landmarks: int,
-    sampling: options.Sampling,
-    seed: int,
-) -> NonlocalOperator:
-    """The operator of a guide, from the values of the options above; three channels are compared in colour."""
-    return nonlocal_operator(
-        guide,
-        patch_size=patch_size,
-        photometric_bandwidth=bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        num_landmarks=landmarks,
-        landmarks=sampling.value,
-        guide_channels="all",
-        generator=torch.Generator().manual_seed(seed),
-    )

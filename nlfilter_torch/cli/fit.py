@@ -1,12 +1,13 @@
-"""``nlfilter-torch fit``: find the sliders that turn one photograph into another, and keep them for the next one."""
+"""``nlfilter-torch fit``: find the sliders that turn one photograph into another, and save them as a preset."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nlfilter_torch.cli import options
+from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
+from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import Preset
 
 if TYPE_CHECKING:
@@ -15,36 +16,27 @@ if TYPE_CHECKING:
     from nlfilter_torch.io.photographs import Photograph
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit.")]
-After = Annotated[str, typer.Argument(metavar="AFTER", help="The same photograph after it, of the same size.")]
-Result = Annotated[Path, typer.Argument(metavar="PRESET", help="The file for what is found, a small JSON text.")]
+After = Annotated[str, typer.Argument(metavar="AFTER", help="The same photograph after the edit, of the same size.")]
+Result = Annotated[Path, typer.Argument(metavar="PRESET", help="The JSON file in which the result is saved.")]
 Order = Annotated[
     int,
     typer.Option("--layers", min=2, max=10, metavar="N", help="Number of sliders, from the finest to the coarsest."),
 ]
 
 
-def fit(
-    before: Before,
-    after: After,
-    preset: Result = Path("preset.json"),
-    layers: Order = 4,
-    bandwidth: options.Bandwidth = "auto",
-    spatial_bandwidth: options.SpatialBandwidth = None,
-    patch_size: options.PatchSize = 5,
-    landmarks: options.Landmarks = 100,
-    sampling: options.LandmarkSampling = options.Sampling.kmeans,
-) -> None:
+@with_options("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
+def fit(before: Before, after: After, preset: Result = Path("preset.json"), layers: Order = 4, **given: Any) -> None:
     """Find the sliders that turn one photograph into another, whatever program made the edit.
 
-    Prints them, says how much of the edit they explain, and keeps them in a file for other photographs:
+    Prints them and how much of the edit they explain, and saves them in a file for other photographs:
 
     `nlfilter-torch fit before.jpg after.jpg look.json`
 
     `nlfilter-torch detail other.jpg out.jpg --preset look.json`
     """
-    grey_levels = options.parse_bandwidth(bandwidth)
+    step = step_of(EDITS["detail"], given)
 
-    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli.inspect import build_operator
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.colour import edit_luminance
     from nlfilter_torch.filtering.filters import polynomial_filter
@@ -55,7 +47,7 @@ def fit(
     check_file(preset)
     with steps(3) as begin:
         begin("Reading")
-        memory = working_bytes(landmarks, patch_size)
+        memory = working_bytes(step["landmarks"], step["patch_size"])
         source, target = (read_photograph(path, bytes_per_pixel=memory) for path in (before, after))
         image, edited = (reduce_channels(photograph.pixels, "luminance") for photograph in (source, target))
         if image.shape != edited.shape:
@@ -70,30 +62,15 @@ def fit(
             )
 
         begin("Comparing patches")
-        operator = editing.build_operator(
-            image,
-            bandwidth=grey_levels,
-            spatial_bandwidth=spatial_bandwidth,
-            patch_size=patch_size,
-            landmarks=landmarks,
-            sampling=sampling,
-            seed=0,
-        )
+        operator = build_operator(image, step)
 
         begin("Fitting")
         alpha = fit_alpha(
-            operator, image, edited, order=layers - 1, mask=unclipped(target, after), rounding=0.5 * step_of(target)
+            operator, image, edited, order=layers - 1, mask=unclipped(target, after), rounding=0.5 * spacing(target)
         )[0]
         filtered = edit_luminance(source.pixels, lambda planes: polynomial_filter(operator, planes, alpha))
         fitted = reduce_channels(stored(filtered, target), "luminance")
-        found = Preset(
-            alpha=tuple(round(a, 6) for a in alpha.tolist()),
-            bandwidth="auto" if grey_levels == "auto" else float(bandwidth),
-            spatial_bandwidth=spatial_bandwidth,
-            patch_size=patch_size,
-            landmarks=landmarks,
-            sampling=sampling.value,
-        )
+        found = Preset(**{**dict(step.values), "alpha": tuple(round(a, 6) for a in alpha.tolist())})
         with open_beside(preset) as stream:
             stream.write(found.to_json().encode())
     typer.echo("alpha: " + ", ".join(f"{a:.3f}" for a in found.alpha))
@@ -101,34 +78,31 @@ def fit(
     typer.echo(f"preset: {preset}")
 
 
-def step_of(photograph: "Photograph") -> float:
-    """Distance of two values that the file can tell apart."""
-    from nlfilter_torch.io.photographs import WHITE
+def spacing(photograph: "Photograph") -> float:
+    """Difference of neighbouring values in the file; 0 for floats."""
+    from nlfilter_torch.tiled.sources import WHITE
 
     return 1 / WHITE[photograph.depth] if photograph.depth in WHITE else 0.0
 
 
 def unclipped(photograph: "Photograph", name: str) -> "Tensor":
-    """Mask (1, 1, H, W) of the pixels of an edited file that tell how bright they were to be, those it could hold."""
-    import torch
-
-    if step_of(photograph) == 0.0:
-        return torch.ones_like(photograph.pixels[:, :1])
-    inside = ((photograph.pixels > 0) & (photograph.pixels < 1)).all(1, keepdim=True)
-    if not bool(inside.any()):
+    """Mask (1, 1, H, W) of the pixels of an edited file that are not clipped to black or white."""
+    values = photograph.pixels
+    inside = ((values > 0) & (values < 1)) | (spacing(photograph) == 0)  # floats are not clipped
+    if not bool(inside.all(1).any()):
         raise ValueError(
             f"{name} must have pixels that are not clipped to black or white, got none; edit less strongly"
         )
-    return inside.float()
+    return inside.all(1, keepdim=True).float()
 
 
 def stored(pixels: "Tensor", photograph: "Photograph") -> "Tensor":
-    """What is left of pixels after they were written to a file like ``photograph``."""
-    step = step_of(photograph)
-    return pixels if step == 0.0 else (pixels.clamp(0, 1) / step).round() * step
+    """Pixels clipped and rounded as a file like ``photograph`` stores them."""
+    step = spacing(photograph)
+    return (pixels.clamp(0, 1) / step).round() * step if step else pixels
 
 
 def explained(before: "Tensor", after: "Tensor", fitted: "Tensor") -> float:
-    """Share of the squared change that is not left over: R squared, 1 at best."""
+    """Coefficient of determination (R squared) of the fitted change, 1 at best."""
     left, change = ((after.double() - x.double()).square().sum() for x in (fitted, before))
     return 1.0 - float(left / change)

@@ -1,8 +1,8 @@
 """A folder of photographs edited by worker processes, on one machine or, by their ranks, on several.
 
-Needs the ``cli`` extra. A file is done when the folder for the output holds its name: names appear only with the whole
-file behind them (:func:`~nlfilter_torch.io.photographs.open_beside`), so an interrupted run is taken up by starting it
-again.
+Needs the ``cli`` extra. A file is done when the output folder has a file of its name, since a name appears only when
+its file is complete (:func:`~nlfilter_torch.io.photographs.open_beside`). An interrupted run continues when it is
+started again.
 """
 
 import contextlib
@@ -24,21 +24,21 @@ import torch
 
 from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, remove_stale
 
-RECORD = ".nlfilter-batch.json"  # in the folder for the output: the settings of what is in it
-DEATHS = 3  # deaths for each worker, without a file done in between, after which it is not the files' fault
+RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
+DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the files
 
-Edit = Callable[[str, str], object]  # reads the file of the first name, writes that of the second; can be pickled
+Edit = Callable[[str, str], object]  # from the name of the input to that of the output; can be pickled
 
 
 @dataclass
 class Tally:
-    """What became of some files.
+    """Counts of files.
 
     Attributes:
-        done: how many were edited now.
-        skipped: how many were there already.
-        failures: name to reason of those that could not be.
-        left: how many were not begun, because workers died one after the other.
+        done: edited in this run.
+        skipped: present before.
+        failures: from the name of a file that could not be edited to the reason.
+        left: not begun.
     """
 
     done: int = 0
@@ -47,7 +47,7 @@ class Tally:
     left: int = 0
 
     def add(self, other: "Tally") -> None:
-        """Take in the files of another tally."""
+        """Add the files of another tally."""
         self.done += other.done
         self.skipped += other.skipped
         self.failures |= other.failures
@@ -58,7 +58,7 @@ def pictures(folder: Path) -> list[Path]:
     """The image files of a folder, by name.
 
     Raises:
-        ValueError: if it is no folder, or holds none.
+        ValueError: if it is no folder, or has no image files.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; name the one that holds the photographs")
@@ -69,18 +69,18 @@ def pictures(folder: Path) -> list[Path]:
 
 
 def prepare(paths: Sequence[Path], target: Path, settings: Mapping[str, object]) -> None:
-    """Make the folder for the output, or see that an earlier run of the same settings began it.
+    """Create the output folder, or check that an earlier run with the same settings began it.
 
     Raises:
         ValueError: if ``target`` is the folder of ``paths``, is no folder, or holds files of these names that were made
-            with other settings, or not by this function's callers.
+            with other settings or by another program.
         OSError: if it cannot be written to.
     """
     if target.resolve() == paths[0].parent.resolve():
         raise ValueError(f"{target} must be another folder than that of the photographs; name a new one")
     check_folder(target)
     target.mkdir(exist_ok=True)
-    # In this order: another rank may be at work already, and the record precedes its first file.
+    # Look for files first: another rank may be running, which writes the record before its first file.
     present = next((path.name for path in paths if (target / path.name).exists()), None)
     record, text = target / RECORD, json.dumps(settings, indent=2, sort_keys=True) + "\n"
     if record.exists():
@@ -110,13 +110,13 @@ def edit_folder(
 
     Args:
         paths: image files, all in one folder.
-        target: folder of the edited ones, under the same names.
-        edit: does one of them in a worker; what it raises and warns is told.
-        workers: processes.
+        target: folder for the edited files, which keep their names.
+        edit: edits one of them in a worker; its errors and warnings are reported.
+        workers: number of processes.
         threads: of each process.
         tell: called with a sentence for every failure and warning, as they happen.
         begin: called with the name of every file that ended.
-        tally: counts the files as they end, so that it is right when this is interrupted, too.
+        tally: updated as each file ends, so that it is correct after an interrupt too.
     """
     remove_stale(target, {path.name for path in paths})
     jobs = [path for path in paths if not (target / path.name).exists()]
@@ -146,7 +146,7 @@ def _outcomes(
 ) -> Generator[tuple[Path, list[str] | Exception]]:
     """Each job with its warnings or its error, as they end.
 
-    Every worker is a pool of its own: where one dies, the file that it had is known and the others work on.
+    Every worker is a pool of its own: when one dies, its file is known and the others continue.
     """
 
     def hire() -> ProcessPoolExecutor:
@@ -160,8 +160,7 @@ def _outcomes(
     def run(path: Path) -> list[str]:
         worker = idle.get()
         try:
-            future = worker.submit(_work, edit, str(path), str(target / path.name))
-            return future.result()
+            return worker.submit(_work, edit, str(path), str(target / path.name)).result()
         except BrokenProcessPool:
             worker.shutdown()
             worker = hire()
@@ -178,18 +177,18 @@ def _outcomes(
                 raise error
             yield futures[future], future.result() if error is None else error
     finally:
-        lanes.shutdown(cancel_futures=True)  # files that are begun are ended
+        lanes.shutdown(cancel_futures=True)  # files that were begun are finished
         while not idle.empty():
             idle.get().shutdown()
 
 
 def _begin(threads: int) -> None:
-    """Set a worker up."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # it is for the main process to stop
+    """Initialise a worker."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the main process handles them
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     torch.set_num_threads(threads)
-    # A worker that waits for work would not notice that the main process was killed, and wait for ever.
+    # An idle worker would not notice that the main process was killed, and would wait for ever.
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -201,7 +200,7 @@ def _end_with_parent() -> None:
 
 
 def _work(edit: Edit, source: str, target: str) -> list[str]:
-    """Edit one file in a worker; the warnings that it gave rise to."""
+    """Edit one file in a worker; return its warnings."""
     with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(io.StringIO()):
         warnings.simplefilter("always", UserWarning)
         edit(source, target)

@@ -1,4 +1,4 @@
-"""``nlfilter-torch inspect``: look into the filter of a photograph."""
+"""``nlfilter-torch inspect``: pictures and figures of the filter of a photograph."""
 
 import json
 from dataclasses import asdict
@@ -8,60 +8,50 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import with_options
+from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
+from nlfilter_torch.edits.parameters import EDITS, FILTER
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from nlfilter_torch.edits.steps import Step
     from nlfilter_torch.operator.operator import NonlocalOperator
     from nlfilter_torch.operator.spectrum import Spectrum
 
 Folder = Annotated[
-    Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; it is made if it is not there.")
+    Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
 ]
-# What each figure of the diagnostics tells, for someone who has not read the paper.
+# What each figure of the diagnostics means, for someone who has not read the paper.
 MEANINGS = {
     "height": "pixels from top to bottom",
     "width": "pixels from left to right",
-    "landmarks": "typical patches that stand for all others",
+    "landmarks": "typical patches that represent all others",
     "rank": "independent patterns found",
-    "bandwidth": "grey levels of 255 within which spots count as alike",
+    "bandwidth": "grey levels of 255 within which places count as alike",
     "balancing_steps": "passes until every pixel got the same total weight",
-    "row_sum_residual": "how far the total weight of a pixel is from 1, at worst",
-    "smallest_row_sum": "least total weight before balancing; 1 is a pixel with no partner at all",
-    "largest_eigenvalue": "1 for a sound filter",
-    "eigenvector_residual": "error of the eigenvectors, at worst",
-    "orthogonality": "deviation of the eigenvectors from a right angle, at worst",
-    "diagonal_share": "part of a pixel that only itself explains, on average",
-    "captured_energy": "part of the picture that the patterns explain (beta in the paper)",
+    "row_sum_residual": "largest deviation of the total weight of a pixel from 1",
+    "smallest_row_sum": "least total weight before balancing; 1 is a pixel that resembles no other",
+    "largest_eigenvalue": "1 for a correct filter",
+    "eigenvector_residual": "largest error of an eigenvector",
+    "orthogonality": "largest deviation of the eigenvectors from a right angle",
+    "diagonal_share": "share of a pixel in its own filtered value, on average",
+    "captured_energy": "share of the picture that the patterns capture (beta in the paper)",
 }
 
 
-@with_options("alpha")
-def inspect(
-    source: options.Source,
-    folder: Folder,
-    bandwidth: options.Bandwidth = "auto",
-    spatial_bandwidth: options.SpatialBandwidth = None,
-    patch_size: options.PatchSize = 5,
-    landmarks: options.Landmarks = 100,
-    sampling: options.LandmarkSampling = options.Sampling.kmeans,
-    seed: options.Seed = 0,
-    **given: str,
-) -> None:
-    """Show how the filter sees a photograph: the patterns it finds, how strong they are, and what sliders do to them.
+@with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
+def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **given: Any) -> None:
+    """Show how the filter sees a photograph: the patterns it finds, how strong they are, and how sliders change them.
 
     Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table.
 
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
-    sliders = options.parse_alpha(given["alpha"])
-    grey_levels = options.parse_bandwidth(bandwidth)
+    step = step_of(EDITS["detail"], given)
 
     import torch
 
-    from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.io.photographs import check_folder, open_beside, read_photograph
     from nlfilter_torch.operator.features import reduce_channels
@@ -70,18 +60,11 @@ def inspect(
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
-        photograph = read_photograph(source, bytes_per_pixel=working_bytes(landmarks, patch_size, factors=5))
+        memory = working_bytes(step["landmarks"], step["patch_size"], factors=5)
+        photograph = read_photograph(source, bytes_per_pixel=memory)
         guide = reduce_channels(photograph.pixels, "luminance")
         begin("Comparing patches")
-        operator = editing.build_operator(
-            guide,
-            bandwidth=grey_levels,
-            spatial_bandwidth=spatial_bandwidth,
-            patch_size=patch_size,
-            landmarks=landmarks,
-            sampling=sampling,
-            seed=seed,
-        )
+        operator = build_operator(guide, step, seed)
         begin("Finding patterns")
         spectrum = operator.spectrum()
         figures = summarize(operator, spectrum, guide)
@@ -89,11 +72,20 @@ def inspect(
         folder.mkdir(exist_ok=True)
         save_figure(show_eigenvectors(spectrum), folder / "eigenvectors.png")
         save_figure(plot_eigenvalues(spectrum), folder / "eigenvalues.png")
-        save_figure(plot_response(torch.tensor(sliders), spectrum), folder / "response.png")
+        save_figure(plot_response(torch.tensor(step["alpha"]), spectrum), folder / "response.png")
         report = {**figures, "eigenvalues": spectrum.eigenvalues[0].tolist()}
         with open_beside(folder / "diagnostics.json") as stream:
             stream.write(json.dumps(report, indent=2).encode() + b"\n")
     print_table(figures, f"The filter of {source}")
+
+
+def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
+    """The operator of a guide (1, 1, H, W), with the filter's parameters of a step."""
+    from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.operator.build import nonlocal_operator
+
+    parameters = {name: value for name, value in step.arguments((0, 0)).items() if name in FILTER}
+    return nonlocal_operator(guide, **parameters, generator=seeded(seed))
 
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:
@@ -117,7 +109,7 @@ def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor
 
 
 def print_table(figures: dict[str, Any], title: str) -> None:
-    """Print diagnostics with what each of them tells."""
+    """Print diagnostics with the meaning of each."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -125,7 +117,7 @@ def print_table(figures: dict[str, Any], title: str) -> None:
     table = Table(title=Text(title), title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
-    table.add_column("what it tells")
+    table.add_column("meaning")
     for name, value in figures.items():
         table.add_row(name.replace("_", " "), f"{value:.4g}", MEANINGS.get(name, ""))
     Console().print(table)

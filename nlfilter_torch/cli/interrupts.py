@@ -1,4 +1,4 @@
-"""Ctrl-C and requests to end (SIGTERM, SIGHUP): no traceback, no unfinished file, and a status that tells.
+"""Ctrl-C, SIGTERM and SIGHUP end the work without a traceback or an unfinished file, and set the exit status.
 
 This module is imported before anything that takes time.
 """
@@ -13,16 +13,16 @@ from contextlib import contextmanager
 from types import FrameType
 
 INTERRUPTED = 128 + signal.SIGINT  # exit status, as shells have it for Ctrl-C
-PAUSE = 0.05  # seconds until a lost interrupt comes again: long enough for the callback that lost it to be over
+PAUSE = 0.05  # seconds until a lost interrupt is repeated, when the callback that lost it has returned
 SHOW_CURSOR = "\x1b[?25h"
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class Ended(SystemExit):
-    """Another process asked this one to end; raised where it works, so that unfinished files are removed."""
+    """SIGTERM or SIGHUP, raised in the main thread so that unfinished files are removed."""
 
     def __init__(self, number: int) -> None:
-        """Take the status that shells have for the signal of that number."""
+        """The exit status is the one that shells use for the signal of that number."""
         self.number, self.status = number, 128 + number
         super().__init__(self.status)
 
@@ -34,11 +34,11 @@ def tell() -> int:
 
 
 @contextmanager
-def heeded() -> Iterator[None]:
-    """Turn signals into exceptions that end the work, and never into a traceback of a module that is imported.
+def handled() -> Iterator[None]:
+    """Turn signals into exceptions that end the work.
 
-    An interrupt that comes while Python runs a destructor or a callback, such as those after each import, is repeated:
-    Python can raise nothing there. It would print "Exception ignored in" and go on with the work to its end.
+    An interrupt during a destructor or a callback, such as those after each import, is repeated: Python cannot raise it
+    there, but would print "Exception ignored in" and continue the work.
     """
     former = sys.unraisablehook
     repeats: list[threading.Timer] = []
@@ -48,7 +48,7 @@ def heeded() -> Iterator[None]:
             former(lost)
             return
         number = lost.exc_value.number if isinstance(lost.exc_value, Ended) else signal.SIGINT
-        repeats.append(threading.Timer(PAUSE, _thread.interrupt_main, [number]))  # here it would be lost once more
+        repeats.append(threading.Timer(PAUSE, _thread.interrupt_main, [number]))  # raised here, it would be lost again
         repeats[-1].daemon = True
         repeats[-1].start()
 
@@ -67,7 +67,8 @@ def heeded() -> Iterator[None]:
 def _install() -> dict[int, signal.Handlers]:
     """Handle the signals whose handlers are still Python's own; return these handlers.
 
-    A shell's background jobs ignore SIGINT, those of nohup SIGHUP, and programs around this one have their own plans.
+    Background jobs of a shell ignore SIGINT, jobs under nohup ignore SIGHUP, and a program that runs this one may have
+    handlers of its own; these are left alone.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -75,11 +76,11 @@ def _install() -> dict[int, signal.Handlers]:
     replaced = {number: handler for number, handler in own.items() if signal.getsignal(number) is handler}
     for number in replaced:
         signal.signal(number, _handle)
-    return replaced  # type: ignore[return-value]  # they are what signal.signal takes
+    return replaced  # type: ignore[return-value]
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    """Raise; or end at once where a module is imported, whose code may turn an exception into any other."""
+    """Raise an exception; during an import, whose code could replace it, end the process."""
     files = sys.modules.get("nlfilter_torch.io.photographs")
     if _importing(frame) and not getattr(files, "unfinished", None):
         if sys.stderr.isatty():

@@ -1,17 +1,16 @@
-"""Options that several verbs share, in a photographer's units.
+"""Options that several commands share, in a photographer's units.
 
-Modules of verbs, and this one, import neither torch nor what imports it until a verb runs, so that help, lists and
-wrong options take no seconds.
+The modules of commands import torch only inside the functions that run, so that help, lists and errors in options
+appear at once.
 """
 
 import math
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nlfilter_torch.edits.declaration import BANDWIDTHS, DISTANCES, GAINS, MAX_LANDMARKS, MAX_PATCH, MAX_SLIDERS
+from nlfilter_torch.edits.declaration import BANDWIDTHS, GAINS, MAX_SLIDERS
 
 if TYPE_CHECKING:
     from nlfilter_torch.io.photographs import Depth
@@ -19,40 +18,16 @@ if TYPE_CHECKING:
 LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
 
 
-class Sampling(StrEnum):
-    """How the landmarks are chosen."""
-
-    kmeans = "kmeans"
-    uniform = "uniform"
-    random = "random"
-
-
-class FileDepth(StrEnum):
-    """What a channel of the output file holds."""
-
-    eight = "8"
-    sixteen = "16"
-    floats = "float"
-
-
-DEPTHS: dict[FileDepth, "Depth"] = {
-    FileDepth.eight: "uint8",
-    FileDepth.sixteen: "uint16",
-    FileDepth.floats: "float32",
-}
-
-
-def parse_alpha(text: str) -> tuple[float, ...]:
-    """The sliders of ``--alpha``.
-
-    >>> parse_alpha("3, 3,4,1.05")
-    (3.0, 3.0, 4.0, 1.05)
-    """
-    return parse_sliders(text, "--alpha")
+FileDepth = Literal["8", "16", "float"]  # what a channel of the output file holds
+DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
 
 
 def parse_sliders(text: str, option: str) -> tuple[float, ...]:
-    """Sliders with commas between, as an option gives them."""
+    """Sliders separated by commas, as an option gives them.
+
+    >>> parse_sliders("3, 3,4,1.05", "--alpha")
+    (3.0, 3.0, 4.0, 1.05)
+    """
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -92,92 +67,40 @@ def parse_levels(text: str) -> float | Literal["auto"]:
     return levels
 
 
-def parse_bandwidth(text: str) -> float | Literal["auto"]:
-    """``--bandwidth`` in units of the picture.
-
-    >>> parse_bandwidth("51"), parse_bandwidth("auto")
-    (0.2, 'auto')
-    """
-    levels = parse_levels(text)
-    return levels if levels == "auto" else levels / LEVELS
-
-
 Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF or WebP file.")]
-Bandwidth = Annotated[
-    str,
-    typer.Option(
-        metavar="LEVELS",
-        help="How different two spots may be and still count as alike, in grey levels from 0 to 255. Small values (5) "
-        "touch fine texture only, large ones (40) treat much as detail. `auto` looks at the picture.",
-    ),
-]
-SpatialBandwidth = Annotated[
-    float | None,
-    typer.Option(
-        min=DISTANCES[0],
-        max=DISTANCES[1],
-        metavar="PIXELS",
-        help="How far apart two spots may be and still count as alike. Left out: as far as the picture goes.",
-    ),
-]
-PatchSize = Annotated[
-    int,
-    typer.Option(
-        max=MAX_PATCH,
-        metavar="PIXELS",
-        help="Width of the patch around each spot that is compared; an odd number. 1 compares single pixels.",
-    ),
-]
-Landmarks = Annotated[
-    int,
-    typer.Option(
-        "--landmarks",
-        min=1,
-        max=MAX_LANDMARKS,
-        metavar="N",
-        help="Number of typical patches that stand for the whole picture. More are truer, slower and take more memory.",
-    ),
-]
-LandmarkSampling = Annotated[
-    Sampling,
-    typer.Option(
-        "--sampling",
-        help="How the typical patches are found: by grouping similar ones, on a regular grid, or at random.",
-    ),
-]
 Seed = Annotated[
     int,
     typer.Option(
         min=0,
         max=2**63 - 1,
         metavar="N",
-        help="The same number gives the same picture again, another one a variation.",
+        help="Seed of the random numbers: the same number gives the same picture again, another one a variation.",
     ),
 ]
 Target = Annotated[
     str,
     typer.Argument(
-        metavar="OUT", help="The edited photograph; the ending of its name (.png, .jpg, .tif, .webp) gives the type."
+        metavar="OUT",
+        help="The edited photograph; the extension of its name (.png, .jpg, .tif, .webp) selects the type.",
     ),
 ]
 OutputDepth = Annotated[
     FileDepth | None,
-    typer.Option(help="Bits a channel of the output, or floats (TIFF only). Left out: as many as the input has."),
+    typer.Option(help="Bits per channel of the output, or floats (TIFF only). Left out: as in the input."),
 ]
 Memory = Annotated[
     float | None,
     typer.Option(
         metavar="GB",
-        help="Gigabytes of memory that may be used, beside the 0.3 of the program itself. "
-        "A larger photograph is worked out in tiles of rows, which takes "
-        "longer and shows no seams. Left out: four fifths of what is free.",
+        help="Gigabytes of memory that may be used, besides the 0.3 of the program itself. A photograph that needs "
+        "more is processed in tiles, which takes longer and leaves no seams. Left out: four fifths of the free memory.",
     ),
 ]
 Full = Annotated[
     bool,
     typer.Option(
         "--full",
-        help="In tiles: work from every pixel, not from a million of them. Takes two or three times as long.",
+        help="In tiles: learn from every pixel, not from a million of them. Takes two or three times as long.",
     ),
 ]
 StrokesFile = Annotated[
@@ -185,8 +108,8 @@ StrokesFile = Annotated[
     typer.Option(
         "--strokes",
         metavar="FILE",
-        help="Strokes painted over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where "
-        "nothing is painted.",
+        help="Scribbles over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where nothing is "
+        "drawn.",
     ),
 ]
 ColourRegions = Annotated[
@@ -194,7 +117,7 @@ ColourRegions = Annotated[
     typer.Option(
         "--region",
         metavar="X,Y,W,H:COLOUR",
-        help="A rectangle of colour in place of a stroke, or on top of them: column and row of its upper left corner, "
+        help="A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, "
         "width and height in pixels, and a colour such as red or #c04020. May be given several times; later ones cover "
         "earlier ones.",
     ),
@@ -202,7 +125,9 @@ ColourRegions = Annotated[
 Keeps = Annotated[
     list[str] | None,
     typer.Option(
-        "--keep", metavar="X,Y,W,H", help="A rectangle whose likes stay as they are. May be given several times."
+        "--keep",
+        metavar="X,Y,W,H",
+        help="A rectangle; whatever looks like it stays as it is. May be given several times.",
     ),
 ]
 Regions = Annotated[
@@ -220,8 +145,7 @@ SliderRegions = Annotated[
         "--region",
         metavar="X,Y,W,H[:SLIDERS]",
         help="Edit only what looks like a rectangle: column and row of its upper left corner, its width and height, "
-        "and sliders of its own if they are not those of --alpha, such as 60,300,20,20:3,3,4,1. May be given several "
-        "times.",
+        "and its own sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be given several times.",
     ),
 ]
 MaskFile = Annotated[
@@ -229,6 +153,6 @@ MaskFile = Annotated[
     typer.Option(
         "--mask",
         metavar="FILE",
-        help="A picture of the photograph's size, white where it is selected, black elsewhere.",
+        help="A picture of the size of the photograph, white where it is selected and black elsewhere.",
     ),
 ]

@@ -1,4 +1,4 @@
-"""``nlfilter-torch presets``: the looks that have a name."""
+"""``nlfilter-torch presets``: the presets that have a name."""
 
 from typing import Annotated
 
@@ -8,14 +8,14 @@ from nlfilter_torch.edits.presets import PRESETS, PURPOSES, find_preset
 
 Name = Annotated[
     str | None,
-    typer.Argument(metavar="NAME", help="Print this preset as a file to change and to give to `detail --preset`."),
+    typer.Argument(metavar="NAME", help="Print this preset as a file, to be changed and passed to `detail --preset`."),
 ]
 
 
 def presets(name: Name = None) -> None:
-    """List the looks that `nlfilter-torch detail --preset NAME` knows, or print one of them as a file.
+    """List the presets that `nlfilter-torch detail --preset NAME` knows, or print one of them as a file.
 
-    Start of your own: `nlfilter-torch presets crisp > mine.json`
+    To start one of your own: `nlfilter-torch presets crisp > mine.json`
     """
     if name is not None:
         typer.echo(find_preset(name).to_json(), nl=False)

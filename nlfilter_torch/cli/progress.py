@@ -1,4 +1,4 @@
-"""A bar on the standard error stream while something takes its time."""
+"""Progress bars on the standard error stream; nothing is drawn unless it is a terminal."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     Progress,
+    ProgressColumn,
     SpinnerColumn,
     TaskProgressColumn,
     TextColumn,
@@ -15,46 +16,31 @@ from rich.progress import (
 )
 
 
+def _bar(*columns: ProgressColumn) -> Progress:
+    """A bar that disappears when the work is done."""
+    console = Console(stderr=True)
+    console.quiet = not console.is_terminal  # older versions of rich end a disabled bar with an empty line
+    return Progress(*columns, console=console, transient=True, disable=console.quiet)
+
+
 @contextmanager
 def steps(total: int) -> Iterator[Callable[[str], None]]:
-    """A bar of ``total`` steps; calling what it gives ends a step and names the next one.
-
-    Nothing is drawn where the stream is no terminal, and the bar is gone when the work is done.
-    """
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda name: None
-        return
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("", total=total, completed=-1)
-
-        def begin(name: str) -> None:
-            progress.update(task, description=name, advance=1)
-
-        yield begin
+    """A bar of ``total`` steps; yields a function that begins the step of a name and ends the one before."""
+    with _bar(SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()) as bar:
+        task = bar.add_task("", total=total, completed=-1)
+        yield lambda name: bar.update(task, description=name, advance=1)
 
 
 @contextmanager
 def stages() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar that starts again with every stage; what it gives is called with a stage, what is done, and all there is.
-
-    Nothing is drawn where the stream is no terminal, and the bar is gone when the work is done.
-    """
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda stage, done, total: None
-        return
+    """A bar that starts again with every stage; yields a function of the stage, what is done, and the total."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("")
-        shown = ""
+    with _bar(*columns) as bar:
+        task = bar.add_task("")
 
         def report(stage: str, done: int, total: int) -> None:
-            nonlocal shown
-            if stage != shown:
-                progress.reset(task, description=stage, total=total)
-                shown = stage
-            progress.update(task, completed=done, total=total)
+            if stage != bar.tasks[0].description:
+                bar.reset(task, description=stage)
+            bar.update(task, completed=done, total=total)
 
         yield report

@@ -1,4 +1,4 @@
-"""Scribbles, masks and rectangles on a photograph, from the options that give them."""
+"""Scribbles, masks and rectangles on a photograph, from the options of a command."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,10 +13,12 @@ from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph
 
+Size = tuple[int, int]  # (height, width) of the photograph
+
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangle within a photograph, and what was written after its colon."""
+    """A rectangle in a photograph, and the text after its colon."""
 
     rows: slice
     columns: slice
@@ -49,20 +51,21 @@ class Rectangle:
 def of_edit(
     step: Step, photograph: Photograph, given: Mapping[str, Any]
 ) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
-    """What the options of an edit paint and mark on a photograph, as :func:`scribbles_of` has it for strokes."""
+    """Scribbles and masks from the options of an edit, in the form of :func:`scribbles_of`."""
+    size, mask, regions = photograph.size, given.get("mask"), given.get("region")
     if step.edit in ("recolor", "colorize"):
-        keep = selection(photograph, None, given.get("keep"), option="--keep")
-        strokes = colour_strokes(photograph, given.get("strokes"), given.get("region"))
+        keep = selection(size, None, given.get("keep"), "--keep")
+        strokes = colour_strokes(size, given.get("strokes"), regions)
         return strokes, {} if keep is None else {"keep": keep}
     if step.edit == "defocus":
-        focus = selection(photograph, given.get("mask"), given.get("region"), option="--region")
+        focus = selection(size, mask, regions, "--region")
         if focus is None:
             raise unfocused()
         return (focus,), {}
-    if step.edit != "detail":
+    if step.edit != "detail" or (mask is None and not regions):
         return (), {}
-    found = slider_regions(photograph, given.get("mask"), given.get("region"), torch.tensor(step["alpha"]))
-    return ((), {}) if found is None else (found[:1], {"alpha": found[1]})
+    masks, sliders = slider_regions(size, mask, regions, torch.tensor(step["alpha"]))
+    return (masks,), {"alpha": sliders}
 
 
 def unfocused() -> ValueError:
@@ -70,13 +73,17 @@ def unfocused() -> ValueError:
     return ValueError("give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60")
 
 
-def colour_strokes(photograph: Photograph, path: Path | None, regions: list[str] | None) -> tuple[Tensor, Tensor]:
-    """Strokes (1, 3, H, W) and their mask (1, 1, H, W) from ``--strokes`` and ``--region``."""
-    size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
-    strokes, painted = torch.zeros(1, 3, *size), torch.zeros(1, 1, *size)
+def colour_strokes(size: Size, path: Path | None, regions: list[str] | None) -> tuple[Tensor, Tensor]:
+    """Scribbles (1, 3, H, W) and their mask (1, 1, H, W) from ``--strokes`` and ``--region``."""
     check_strokes(path, regions)
+    strokes, painted = torch.zeros(1, 3, *size), torch.zeros(1, 1, *size)
     if path is not None:
-        strokes, painted = _read_strokes(path, size)
+        painting = _read(path, size)
+        if painting.alpha is None:
+            raise opaque(path)
+        if not bool((painting.alpha > 0).any()):
+            raise ValueError(f"{path} is transparent everywhere; paint at least one stroke")
+        strokes, painted = painting.pixels.float().expand(-1, 3, -1, -1).clone(), painting.alpha.float().clone()
     for rectangle, colour in coloured_rectangles(size, regions):
         strokes[0, :, rectangle.rows, rectangle.columns] = colour[:, None, None]
         painted[..., rectangle.rows, rectangle.columns] = 1
@@ -89,27 +96,26 @@ def check_strokes(path: Path | None, regions: list[str] | None) -> None:
         raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
 
 
-def coloured_rectangles(size: tuple[int, int], regions: list[str] | None) -> list[tuple[Rectangle, Tensor]]:
+def coloured_rectangles(size: Size, regions: list[str] | None) -> list[tuple[Rectangle, Tensor]]:
     """Rectangles of ``--region`` and their RGB colours (3,)."""
     found = []
     for text in regions or []:
         rectangle = Rectangle.parse(text, "--region", size)
         if rectangle.note is None:
             raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
-        found.append((rectangle, colour_named(rectangle.note, text)))
+        try:
+            colour = ImageColor.getrgb(rectangle.note)[:3]
+        except ValueError:
+            raise ValueError(
+                "--region must end in a colour, such as red, #c04020 or rgb(192,64,32), "
+                f"got {rectangle.note!r} in {text!r}"
+            ) from None
+        found.append((rectangle, torch.tensor(colour) / 255))
     return found
 
 
-def selection(photograph: Photograph, path: Path | None, regions: list[str] | None, *, option: str) -> Tensor | None:
-    """A mask (1, 1, H, W) from a mask file and rectangles, or None where neither is given.
-
-    Args:
-        photograph: that it is for.
-        path: of the mask.
-        regions: rectangles.
-        option: name of the option of the rectangles, for messages.
-    """
-    size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
+def selection(size: Size, path: Path | None, regions: list[str] | None, option: str) -> Tensor | None:
+    """A mask (1, 1, H, W) from a mask file and the rectangles of an option, or None if neither is given."""
     if path is None and not regions:
         return None
     mask = torch.zeros(1, 1, *size) if path is None else _read_mask(path, size)
@@ -118,8 +124,8 @@ def selection(photograph: Photograph, path: Path | None, regions: list[str] | No
     return mask
 
 
-def plain_rectangles(size: tuple[int, int], regions: list[str] | None, option: str) -> list[Rectangle]:
-    """Rectangles of an option that takes no more than them."""
+def plain_rectangles(size: Size, regions: list[str] | None, option: str) -> list[Rectangle]:
+    """Rectangles of an option that takes nothing after them."""
     found = []
     for text in regions or []:
         found.append(Rectangle.parse(text, option, size))
@@ -128,28 +134,21 @@ def plain_rectangles(size: tuple[int, int], regions: list[str] | None, option: s
     return found
 
 
-def slider_regions(
-    photograph: Photograph, path: Path | None, regions: list[str] | None, alpha: Tensor
-) -> tuple[Tensor, Tensor] | None:
-    """Regions (1, K, H, W) and their sliders (K, k+1) from ``--mask`` and ``--region``, or None where neither is given.
+def slider_regions(size: Size, path: Path | None, regions: list[str] | None, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Regions (1, K, H, W) and their sliders (K, k+1) from ``--mask`` and ``--region``, at least one of them given.
 
-    Args:
-        photograph: that they are for.
-        path: of a mask, a region with the sliders of ``--alpha``.
-        regions: rectangles, with sliders of their own or without.
-        alpha: sliders (k+1,) of ``--alpha``.
+    A mask, and a rectangle without its own sliders, has the sliders ``alpha`` (k+1,).
     """
-    size = (photograph.pixels.shape[-2], photograph.pixels.shape[-1])
     masks, sliders = ([], []) if path is None else ([_read_mask(path, size)], [alpha])
     for text in regions or []:
         rectangle, own = with_sliders(text, size, alpha)
         masks.append(torch.zeros(1, 1, *size))
         masks[-1][..., rectangle.rows, rectangle.columns] = 1
         sliders.append(own)
-    return (torch.cat(masks, dim=1), torch.stack(sliders)) if masks else None
+    return torch.cat(masks, dim=1), torch.stack(sliders)
 
 
-def with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Rectangle, Tensor]:
+def with_sliders(text: str, size: Size, alpha: Tensor) -> tuple[Rectangle, Tensor]:
     """A rectangle of ``--region`` and its sliders (k+1,)."""
     rectangle = Rectangle.parse(text, "--region", size)
     own = alpha if rectangle.note is None else torch.tensor(parse_sliders(rectangle.note, "--region"))
@@ -161,27 +160,20 @@ def with_sliders(text: str, size: tuple[int, int], alpha: Tensor) -> tuple[Recta
     return rectangle, own
 
 
-def _read_strokes(path: Path, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    painting = read_photograph(path)
-    check_size(path, (painting.pixels.shape[-2], painting.pixels.shape[-1]), size)
-    if painting.alpha is None:
-        raise opaque(path)
-    painted = painting.alpha.float()
-    if not bool((painted > 0).any()):
-        raise ValueError(f"{path} is transparent everywhere; paint at least one stroke")
-    return painting.pixels.float().expand(-1, 3, -1, -1).clone(), painted.clone()
-
-
-def _read_mask(path: Path, size: tuple[int, int]) -> Tensor:
-    picture = read_photograph(path)
-    check_size(path, (picture.pixels.shape[-2], picture.pixels.shape[-1]), size)
-    mask = picture.pixels.float().mean(1, keepdim=True).clamp(0, 1)
+def _read_mask(path: Path, size: Size) -> Tensor:
+    mask = _read(path, size).pixels.float().mean(1, keepdim=True).clamp(0, 1)
     if not bool((mask > 0).any()):
         raise ValueError(f"{path} is black everywhere; paint white what is to be selected")
     return mask
 
 
-def check_size(path: Path, found: tuple[int, int], size: tuple[int, int]) -> None:
+def _read(path: Path, size: Size) -> Photograph:
+    picture = read_photograph(path)
+    check_size(path, picture.size, size)
+    return picture
+
+
+def check_size(path: Path, found: Size, size: Size) -> None:
     """Raise unless a picture over a photograph of ``size`` has its height and width."""
     if found != size:
         raise ValueError(
@@ -190,19 +182,8 @@ def check_size(path: Path, found: tuple[int, int], size: tuple[int, int]) -> Non
 
 
 def opaque(path: Path) -> ValueError:
-    """What to raise where a picture of strokes has no transparency."""
+    """The error for a picture of scribbles without transparency."""
     return ValueError(
         f"{path} has no transparency, so that every pixel of it would be a stroke; "
         "paint on a transparent layer and save that"
     )
-
-
-def colour_named(name: str, text: str) -> Tensor:
-    """RGB (3,) of the colour with which a rectangle ends."""
-    try:
-        red, green, blue = ImageColor.getrgb(name)[:3]
-    except ValueError:
-        raise ValueError(
-            f"--region must end in a colour, such as red, #c04020 or rgb(192,64,32), got {name!r} in {text!r}"
-        ) from None
-    return torch.tensor([red, green, blue]) / 255

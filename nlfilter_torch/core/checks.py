@@ -7,11 +7,13 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from types import FrameType
+from itertools import takewhile
+from traceback import walk_stack
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Response = Callable[[Tensor], Tensor]
@@ -30,10 +32,11 @@ def check_tensor(value: object, name: str, remedy: str = "convert it with torch.
         raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call its to_dense()")
 
 
-def check_dtype(tensor: Tensor, name: str, remedy: str) -> None:
-    """Raise unless ``tensor`` is of a floating-point dtype."""
+def check_dtype(tensor: Tensor, name: str, remedy: str, *, values: str = "") -> None:
+    """Raise unless ``tensor`` is a tensor of a floating-point dtype; ``values`` describes them in the error."""
+    check_tensor(tensor, name)
     if tensor.dtype not in FLOATING:
-        raise TypeError(f"{name} must be of a floating-point dtype, got {tensor.dtype}; {remedy}")
+        raise TypeError(f"{name} must be of a floating-point dtype{values}, got {tensor.dtype}; {remedy}")
 
 
 def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
@@ -45,11 +48,7 @@ def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
 def check_image(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
     """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with at least one pixel."""
     check_tensor(image, name, "convert it with torch.as_tensor")
-    if image.dtype not in FLOATING:
-        raise TypeError(
-            f"{name} must be of a floating-point dtype with values in [0, 1], got {image.dtype}; "
-            "divide integer pixels by their largest value"
-        )
+    check_dtype(image, name, "divide integer pixels by their largest value", values=" with values in [0, 1]")
     if image.ndim != 4:
         raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
     if image.numel() == 0:
@@ -71,8 +70,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
     # The sum takes a tenth of the time of checking each value, but overflows for large finite values.
     if bool(values.sum().isfinite()):
         return
-    bad = int((~torch.isfinite(values)).sum())
-    if bad > 0:
+    if bad := int((~torch.isfinite(values)).sum()):
         raise ValueError(f"{name} must be finite, got {bad} NaN or infinite value(s); replace them first")
 
 
@@ -92,10 +90,10 @@ def check_photograph(image: Tensor, name: str, *, channels: int | None = None, b
 
 
 def warn_of_scale(image: Tensor, name: str) -> None:
-    """Warn of an image of 1 or 3 channels with values above 16: its pixels are probably integers made into floats.
+    """Warn of an image of 1 or 3 channels with values above 16: probably 8-bit pixels converted to floats.
 
-    Skipped where :func:`check_finite` is. Other numbers of channels are feature maps, which may have any values, and
-    HDR pictures stay below.
+    Skipped where :func:`check_finite` is. Images with other numbers of channels are feature maps, which may have any
+    values; HDR pictures stay below 16.
     """
     if is_hidden(image) or image.shape[1] not in (1, 3):
         return
@@ -107,13 +105,8 @@ def warn_of_scale(image: Tensor, name: str) -> None:
 
 
 def is_hidden(tensor: Tensor) -> bool:
-    """Whether the values of a tensor cannot be checked: on an accelerator, while compiling, or under a transform."""
-    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor)
-
-
-def is_transformed(tensor: Tensor) -> bool:
-    """True under ``torch.func`` transforms, where the values of a tensor cannot be read."""
-    return bool(torch._C._functorch.is_functorch_wrapped_tensor(tensor))
+    """Whether the values of a tensor cannot be checked: on an accelerator, while compiling, or in ``torch.func``."""
+    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_functorch_wrapped_tensor(tensor)
 
 
 def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str) -> None:
@@ -181,14 +174,16 @@ def check_share(value: float | Tensor, name: str, batch: int | None = None, *, b
 def _check_values(
     value: object, name: str, batch: int | None, wanted: str, inside: Callable[[Any], Any], remedy: str
 ) -> None:
-    """Raise unless ``value`` is a finite number ``inside`` a range, or a tensor of such with shape () or (batch,).
+    """Raise unless ``value`` is a finite number ``inside`` a range, or a tensor of them of shape () or (batch,).
 
     The values of a tensor are checked where :func:`check_finite` checks them.
     """
     if not isinstance(value, Tensor):
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number")
-        if not (inside(value) and _is_finite(value)):
+        # Integers of Python may exceed both floats and the 64 bits of torch.
+        finite = abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)
+        if not (inside(value) and finite):
             raise ValueError(f"{name} must be {wanted}, got {described(value)}; {remedy}")
         return
     check_tensor(value, name)
@@ -204,10 +199,6 @@ def _check_values(
         raise ValueError(f"{name} must be {wanted}, got {values.tolist()}; {remedy}")
 
 
-def _is_finite(value: float) -> bool:
-    return abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)  # torch's integers have 64 bits
-
-
 def check_pair(value: object, name: str) -> None:
     """Raise unless ``value`` is a pair of integers that are not negative."""
     if not isinstance(value, tuple | list) or not all(isinstance(v, int) and not isinstance(v, bool) for v in value):
@@ -221,10 +212,8 @@ def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
     """Raise if a blur radius of ``value`` pixels exceeds half the short side: time and memory grow with it."""
     most = max(min(size) / 2, 2.0)  # defaults must be valid for tiny images too
     if not value <= most:
-        raise ValueError(
-            f"{name} must be at most half the short side of the image, {most:g} pixels, got {described(value)}; "
-            "lower it"
-        )
+        limit = f"half the short side of the image, {most:g} pixels"
+        raise ValueError(f"{name} must be at most {limit}, got {described(value)}; lower it")
 
 
 def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str) -> None:
@@ -259,12 +248,12 @@ def check_count(value: int, name: str, *, least: int = 1, most: int | None = Non
 
 
 def check_order(order: int) -> None:
-    """Raise unless ``order`` is a valid number of products with W."""
+    """Raise unless ``order`` is a number of products with W from 1 to :data:`LARGEST_ORDER`."""
     check_count(order, "order", most=LARGEST_ORDER)
 
 
 def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) -> None:
-    """Raise unless ``tensor`` is one of that shape."""
+    """Raise unless ``tensor`` is a tensor of that shape."""
     check_tensor(tensor, name, remedy)
     if tensor.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}; {remedy}")
@@ -285,12 +274,7 @@ def check_coefficients(coefficients: Tensor, factor: Tensor) -> None:
 
 
 def checked_response(response: Response, support: Tensor) -> Response:
-    """An elementwise function of eigenvalues, with a check of what it returns.
-
-    Args:
-        response: from eigenvalues (B, R) to as many gains.
-        support: (B, M) bool, the eigenvalues in use.
-    """
+    """A function from eigenvalues (B, M) to gains, with a check of its results where ``support`` (B, M) is True."""
     if not callable(response):
         raise TypeError(
             f"response must be a function of the eigenvalues, got {type(response).__name__}; "
@@ -321,7 +305,6 @@ def checked_response(response: Response, support: Tensor) -> Response:
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
     """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, where allowed, (B, k+1, H, W)."""
-    check_tensor(alpha, "alpha")
     check_dtype(alpha, "alpha", "write 1.0 instead of 1")
     if alpha.ndim not in dimensions:
         shapes = {1: "(k+1,)", 2: "(B, k+1)", 4: "(B, k+1, H, W)"}
@@ -337,19 +320,19 @@ def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None
 
 def check_eigenvalues(values: Tensor) -> None:
     """Raise unless eigenvalues are floating-point and so close to [0, 1] that their powers stay finite."""
-    check_tensor(values, "eigenvalues")
     check_dtype(values, "eigenvalues", "convert them")
     check_finite(values, "eigenvalues")
-    if not is_hidden(values) and values.numel() and float(values.detach().abs().max()) > LARGEST_EIGENVALUE:
+    if is_hidden(values) or values.numel() == 0:
+        return
+    largest = float(values.detach().abs().max())
+    if largest > LARGEST_EIGENVALUE:
         raise ValueError(
-            f"eigenvalues must be in [0, 1] or near it, got values up to {float(values.detach().abs().max()):g}; "
-            "divide them by the largest"
+            f"eigenvalues must be in [0, 1] or near it, got values up to {largest:g}; divide them by the largest"
         )
 
 
 def check_features(features: Tensor, name: str, size: int | None = None) -> None:
     """Raise unless ``features`` is a finite floating-point (B, D, N) tensor, of ``size`` D if that is given."""
-    check_tensor(features, name)
     check_dtype(features, name, "convert them")
     if features.ndim != 3 or features.numel() == 0:
         raise ValueError(
@@ -365,11 +348,7 @@ def check_features(features: Tensor, name: str, size: int | None = None) -> None
 
 
 def check_size(size: object, points: int) -> tuple[int, int]:
-    """The size (H, W) of ``points`` pixels as two integers, from (H, W) or (N,).
-
-    Raises:
-        TypeError, ValueError: if ``size`` is no such tuple of positive integers with that product.
-    """
+    """The size (H, W) of ``points`` pixels, from (H, W) or (N,); raise unless these are integers of that product."""
     if not isinstance(size, tuple | list) or len(size) not in (1, 2) or any(type(length) is not int for length in size):
         raise TypeError(
             f"size must be integers (H, W) or (N,), got {size if isinstance(size, tuple) else described(size)}; "
@@ -388,11 +367,7 @@ LEAST_WEIGHT = 1e-6  # of a point; its inverse is the largest, beyond which sums
 
 
 def check_weights(weights: Tensor, features: Tensor) -> Tensor:
-    """Weights (B, N) in the dtype of the features (B, D, N), from (N,) or (B, N).
-
-    Raises:
-        TypeError, ValueError: if they are not positive and finite, or of another shape.
-    """
+    """Weights (B, N) in the dtype of features (B, D, N), from (N,) or (B, N); raise unless positive and finite."""
     check_tensor(weights, "weights")
     check_dtype(weights, "weights", "convert it with weights.float()")
     batch, _, points = features.shape
@@ -411,21 +386,16 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
 
 def warn(message: str) -> None:
     """Warn at the line that called this package, through any number of wrappers and modules."""
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(message, stacklevel=level)
+    warnings.warn(message, stacklevel=1 + len(_modules_inside()))
 
 
 def called_by_edit() -> bool:
     """Whether the caller is an edit of photographs, which has checked the image already."""
-    frame: FrameType | None = sys._getframe()
-    while frame is not None and _module(frame).split(".")[0] in ("nlfilter_torch", "torch"):
-        if _module(frame).startswith(("nlfilter_torch.edits", "nlfilter_torch.filtering.fitted")):
-            return True
-        frame = frame.f_back
-    return False
+    edits = ("nlfilter_torch.edits", "nlfilter_torch.filtering.fitted")
+    return any(module.startswith(edits) for module in _modules_inside())
 
 
-def _module(frame: FrameType) -> str:
-    return str(frame.f_globals.get("__name__", ""))
+def _modules_inside() -> list[str]:
+    """The module of every frame from the caller's to the one that called this package, which is left out."""
+    modules = (str(frame.f_globals.get("__name__", "")) for frame, _ in walk_stack(sys._getframe(1)))
+    return list(takewhile(lambda module: module.split(".")[0] in ("nlfilter_torch", "torch"), modules))

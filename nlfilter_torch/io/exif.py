@@ -8,18 +8,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
 PREFIX = b"Exif\0\0"
-FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point at a nested table
-# (transpose, turn upside down, mirror), in that order, for each orientation of the EXIF standard.
-_TURNS = {
-    1: (False, False, False),
-    2: (False, False, True),
-    3: (False, True, True),
-    4: (False, True, False),
-    5: (True, False, False),
-    6: (True, False, True),
-    7: (True, True, True),
-    8: (True, True, False),
-}
+FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point to a nested table
 
 
 def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -29,10 +18,9 @@ def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
     >>> upright(np.array([[[1], [2]]]), 6)[..., 0].tolist()
     [[1], [2]]
     """
-    transpose, upside_down, mirror = _TURNS.get(orientation, _TURNS[1])
-    if transpose:
+    if orientation >= 5:
         channels = channels.swapaxes(0, 1)
-    return channels[:: -1 if upside_down else 1, :: -1 if mirror else 1]
+    return channels[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
 def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
@@ -71,7 +59,7 @@ def orientation_of(value: Any) -> int:
     >>> orientation_of(6), orientation_of("upside down")
     (6, 1)
     """
-    return int(value) if isinstance(value, int) and value in _TURNS else 1
+    return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def _folder(exif: Image.Exif, code: int) -> dict[int, Any]:

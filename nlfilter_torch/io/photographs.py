@@ -9,9 +9,10 @@ import re
 import secrets
 import shutil
 import sys
+import time
 import warnings
 import zlib
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
+from nlfilter_torch.tiled.sources import WHITE, stored_as
 
 if sys.platform != "win32":
     import fcntl
@@ -34,7 +36,6 @@ if sys.platform != "win32":
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
 
-WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
 # Depths that each file type supports. JPEG and WebP have 8 bits only, JPEG has no alpha, PNG no floats.
 DEPTHS: dict[str, tuple[str, ...]] = {
@@ -68,9 +69,15 @@ class Photograph:
     icc: bytes | None = None
     exif: bytes | None = None
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.pixels.shape[-2], self.pixels.shape[-1]
+
     def with_pixels(self, pixels: Tensor) -> "Photograph":
-        """The same photograph with other pixels, (1, C, H, W) on any device."""
-        return replace(self, pixels=pixels.detach().to(self.pixels))
+        """The same photograph with other pixels (1, C, H, W) on any device; a new number C drops the profile."""
+        icc = self.icc if pixels.shape[1] == self.pixels.shape[1] else None
+        return replace(self, pixels=pixels.detach().to(self.pixels), icc=icc)
 
 
 class TooLarge(MemoryError):
@@ -98,20 +105,20 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     path = Path(path)
     channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
 
-    dtype = channels.dtype
-    if dtype.name not in BITS:
+    depth = channels.dtype.name
+    if depth not in BITS:
         raise ValueError(
-            f"{path} stores its channels as {dtype.name}, which is not handled; convert it to 8 or 16 bits or floats"
+            f"{path} stores its channels as {depth}, which is not handled; convert it to 8 or 16 bits or floats"
         )
-    values: NDArray[np.floating] = channels.astype(np.float64 if dtype == np.float64 else np.float32)
-    if dtype.name in WHITE:
-        values = values / np.float32(WHITE[dtype.name])
+    values: NDArray[np.floating] = channels.astype(depth if depth == "float64" else "float32")
+    if depth in WHITE:
+        values = values / np.float32(WHITE[depth])
     elif not np.isfinite(values).all():
         raise ValueError(f"{path} holds NaN or infinite pixels; replace them first")
     planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]  # (1, S, H, W)
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
-    return Photograph(planes[:, :colours], dtype.name, alpha, icc, exif)  # type: ignore[arg-type]
+    return Photograph(planes[:, :colours], depth, alpha, icc, exif)  # type: ignore[arg-type]
 
 
 def first_bytes(path: Path) -> bytes:
@@ -139,8 +146,15 @@ def first_bytes(path: Path) -> bytes:
 def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tuple[Pixels, bytes | None, bytes | None]:
     """Upright channels (H, W, S) as they are stored, profile and EXIF; see :func:`read_photograph`."""
     head = first_bytes(path)
-    read = _read_tiff if tiff.is_tiff(head) else _read_by_pillow
-    channels, orientation, icc, exif = read(path, head, bytes_per_pixel, memory)
+    if tiff.is_tiff(head):
+        channels, orientation, icc, exif = tiff.read(
+            path, lambda size, double: check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
+        )
+    else:
+        deep_png = head.startswith(b"\x89PNG") and head[24:25] == b"\x10"  # the bit depth in the header
+        channels, orientation, icc, exif = _read_by_pillow(
+            path, deep_png, lambda size: check_memory(path, *size, bytes_per_pixel, memory)
+        )
     return exif_tags.upright(channels, orientation), icc, exif
 
 
@@ -157,26 +171,20 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     path = Path(path)
     kind = check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
-    values = torch.cat(planes, dim=1)[0].permute(1, 2, 0).numpy(force=True)  # (H, W, S)
-    dtype = np.dtype(photograph.depth)
-    if photograph.depth in WHITE:
-        values = np.rint(values.clip(0, 1) * WHITE[photograph.depth])
-    channels = np.ascontiguousarray(values.astype(dtype))
+    channels = stored_as(torch.cat(planes, dim=1), photograph.depth)  # (H, W, S)
     with open_beside(path) as stream:
         encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif)
 
 
 def encode(stream: BinaryIO, kind: str, channels: Pixels, alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
     """Write channels (H, W, S) of the stored dtype as an image file of a type in :data:`DEPTHS`."""
-    if channels.shape[2] == 1:
-        channels = channels[..., 0]
+    channels = channels[..., 0] if channels.shape[2] == 1 else channels
     if kind == "TIFF":
-        tiff.write(stream, channels, alpha, icc, exif)
+        tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif)
     elif channels.dtype == np.uint16:
         stream.write(_encode_deep_png(channels, icc, exif))
     else:
-        options: dict[str, object] = dict(ENCODING.get(kind, {}))
-        options |= {name: block for name, block in (("icc_profile", icc), ("exif", exif)) if block is not None}
+        options: dict[str, object] = {"icc_profile": icc, "exif": exif or b""} | ENCODING.get(kind, {})
         Image.fromarray(channels).save(stream, format=kind, **options)
 
 
@@ -245,24 +253,30 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
     ['note.txt']
     """
     path = link_target(path)
+    with part_beside(path) as beside:
+        beside.touch(exist_ok=False)
+        with claimed(beside):
+            with beside.open("r+b") as stream:
+                yield stream
+            beside.replace(path)
+
+
+@contextmanager
+def part_beside(path: Path) -> Iterator[Path]:
+    """A unique hidden name beside ``path`` for a file or folder that is being written, removed when the block ends."""
     # Not tempfile: the file needs the usual permissions and must be on the same file system.
     beside = name_beside(path)
     unfinished.add(beside)
     try:
         remove_stale(path.parent, {path.name})
-        with ExitStack() as claim:
-            with beside.open("x+b") as stream:
-                claim.enter_context(claimed(beside))
-                yield stream
-            beside.replace(path)
+        yield beside
     except OSError as error:
-        if error.filename not in (None, str(beside)) or error.errno is None:
+        if error.errno is None or not str(error.filename or beside).startswith(str(beside)):
             raise
         # A full disk, a quota or missing permission: the system's message does not name the path.
         raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
     finally:
-        with suppress(OSError):  # no such file, or the name is too long
-            beside.unlink()
+        _remove(beside)
         unfinished.discard(beside)
 
 
@@ -280,43 +294,39 @@ def name_beside(path: Path) -> Path:
 @contextmanager
 def claimed(part: Path) -> Iterator[None]:
     """Lock a file or folder, so that :func:`remove_stale` in other processes leaves it alone."""
-    if sys.platform == "win32":  # open files cannot be removed there
+    with ExitStack() as stack:
+        if sys.platform != "win32":  # open files cannot be removed there
+            stack.callback(os.close, handle := os.open(part, os.O_RDONLY))
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(handle, fcntl.LOCK_EX)
         yield
-        return
-    handle = os.open(part, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
 
 
 def _is_claimed(part: Path) -> bool:
     if sys.platform == "win32":
         return False
-    try:
-        handle = os.open(part, os.O_RDONLY)
-    except OSError:
-        return True
-    try:
+    with suppress(OSError), ExitStack() as stack:
+        stack.callback(os.close, handle := os.open(part, os.O_RDONLY))
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(handle)
-    return False
+        return False
+    return True
 
 
 def remove_stale(folder: Path, names: Container[str]) -> None:
     """Remove the unfinished files of killed processes for some names in a folder."""
     for part in folder.glob(".*.part"):
         if PART.fullmatch(part.name) and part.name[1:].rsplit(".", 2)[0] in names and not _is_claimed(part):
-            if part.is_dir():
+            _remove(part)
+
+
+def _remove(part: Path) -> None:
+    with suppress(OSError):  # no such file, or the name is too long
+        if part.is_dir():
+            for pause in (0.0, 0.1, 0.4):  # after an interrupt a thread of zarr may still be writing its last chunk
+                time.sleep(pause)
                 shutil.rmtree(part, ignore_errors=True)
-            else:
-                with suppress(OSError):
-                    part.unlink()
+        else:
+            part.unlink()
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:
@@ -337,70 +347,42 @@ def _size(count: int) -> str:
 
 
 def _read_by_pillow(
-    path: Path, head: bytes, bytes_per_pixel: int, memory: int | None
+    path: Path, deep_png: bool, check_size: Callable[[tuple[int, int]], None]
 ) -> tuple[Pixels, int, bytes | None, bytes | None]:
     """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG or WebP file."""
-    try:
-        with warnings.catch_warnings():
-            # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
-            image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP"])
-    except Image.DecompressionBombError as error:
-        raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{path} is not a PNG, JPEG, TIFF or WebP image; convert it to one of these") from error
-    except (OSError, SyntaxError, ValueError) as error:
-        raise _damaged(path, error) from error
-    with image:
-        frames = getattr(image, "n_frames", 1)
-        if frames > 1 and image.format != "MPO":
-            raise ValueError(f"{path} is an animation of {frames} frames; save one of them as a picture")
-        check_memory(path, *image.size, bytes_per_pixel, memory)
+    with tiff.decoding(path):
         try:
+            with warnings.catch_warnings():
+                # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
+                image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP"])
+        except Image.DecompressionBombError as error:
+            raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
+        except UnidentifiedImageError as error:
+            sentence = f"{path} is not a PNG, JPEG, TIFF or WebP image; convert it to one of these"
+            raise tiff.UnhandledImage(sentence) from error
+        with image:
+            frames = getattr(image, "n_frames", 1)
+            if frames > 1 and image.format != "MPO":
+                raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
+            check_size(image.size)
             orientation, exif = exif_tags.split(image.getexif)
-            if image.format == "PNG" and head[24] == 16:  # the bit depth in the header; Pillow would reduce it to 8
-                channels = imagecodecs.png_decode(path.read_bytes())
-            else:
-                channels = np.asarray(_to_plain_mode(image, path))
-        except (OSError, SyntaxError, RuntimeError) as error:
-            raise _damaged(path, error) from error
-        icc = image.info.get("icc_profile")
-    return channels.reshape(*channels.shape[:2], -1), orientation, icc, exif
+            # Pillow would reduce 16 bits to 8.
+            channels = imagecodecs.png_decode(path.read_bytes()) if deep_png else np.asarray(_plain_mode(image, path))
+            return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
 
 
-def _to_plain_mode(image: Image.Image, path: Path) -> Image.Image:
+def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
     """The image in one of the modes L, LA, RGB, RGBA."""
     transparent = "transparency" in image.info
     modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
     modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
     if image.mode not in modes:
-        raise ValueError(f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB")
+        sentence = f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB"
+        raise tiff.UnhandledImage(sentence)
     image.load()
     return image.convert(modes[image.mode])
-
-
-def _read_tiff(
-    path: Path, head: bytes, bytes_per_pixel: int, memory: int | None
-) -> tuple[Pixels, int, bytes | None, bytes | None]:
-    """(H, W, S) channels, orientation, profile and EXIF of the first page of a TIFF file."""
-    try:
-        return tiff.read(
-            path,
-            lambda width, height, double: check_memory(path, width, height, bytes_per_pixel * (1 + double), memory),
-        )
-    except tiff.UnhandledTiff as error:
-        raise ValueError(f"{path} {error}") from error
-    except MemoryError:
-        raise
-    except Exception as error:  # tifffile and its decoders have no common base class for errors
-        raise _damaged(path, error) from error
-
-
-def _damaged(path: Path, error: Exception) -> ValueError:
-    return ValueError(
-        f"{path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
-    )
 
 
 def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None) -> bytes:

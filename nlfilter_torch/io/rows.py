@@ -3,10 +3,9 @@
 Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complete or not at all.
 """
 
-import os
+import math
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -28,9 +27,8 @@ from nlfilter_torch.io.photographs import (
     link_target,
     name_beside,
     open_beside,
+    part_beside,
     read_channels,
-    remove_stale,
-    unfinished,
 )
 from nlfilter_torch.io.tiff import TiffRows
 from nlfilter_torch.tiled.sources import Rows, RowSource
@@ -47,7 +45,7 @@ class StoredPicture:
     Attributes:
         rows: upright, (H, W, S) or (H, W).
         alpha: whether the last channel is transparency.
-        held: bytes of it that are cached in memory.
+        held: bytes that are cached in memory while it is read.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
         attributes: of a zarr array.
@@ -76,7 +74,7 @@ class StoredPicture:
 
 
 def is_zarr(path: Path) -> bool:
-    """Is this the folder of a zarr array, or does it have the name of one?"""
+    """Whether ``path`` is the folder of a zarr array or has the name of one."""
     return path.suffix.lower() == ZARR or _holds_zarr(path)
 
 
@@ -90,7 +88,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
 
     Raises:
         FileNotFoundError, ValueError: if the file does not exist or cannot be read.
-        FileNotFoundError, ValueError: if the file does not exist or cannot be read.
+        MemoryError: if reading it takes more than ``memory`` bytes.
     """
     with ExitStack() as stack:
         if is_zarr(path):
@@ -109,12 +107,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
 
 
 def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> None:
-    """Raise unless the picture can be written to ``path`` at that depth.
-
-    Raises:
-        ValueError: as :func:`check_output`.
-        MemoryError: if encoding a file of that type takes more than ``memory`` bytes.
-    """
+    """Raise unless the picture can be written to ``path`` at that depth, using at most ``memory`` bytes."""
     if path.suffix.lower() == ZARR:
         _zarr()
         if not path.is_dir():
@@ -125,7 +118,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
             raise ValueError(f"{path} is a folder, but no array of zarr that could be replaced; choose another name")
         return
     kind = check_type(path, depth, picture.alpha)
-    needed = 0 if kind == "TIFF" else _bytes(picture, depth) * CODED
+    needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODED
     if needed > memory:
         raise MemoryError(
             f"{path} takes {needed / 1e6:.0f} MB to be put together, but {memory / 1e6:.0f} MB may be used; write a "
@@ -134,11 +127,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
 
 
 def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> None:
-    """Write rows as they arrive, with the profile and metadata of another picture of that shape.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write rows as they arrive, with the shape, profile and metadata of another picture."""
     shape, dtype = like.shape, np.dtype(depth)
     if path.suffix.lower() == ZARR:
         _write_zarr(path, rows, dtype, like)
@@ -155,35 +144,20 @@ def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> No
             encode(stream, kind, whole, like.alpha, like.icc, like.exif)
 
 
-def _bytes(picture: StoredPicture, depth: str) -> int:
-    height, width, samples = picture.shape
-    return height * width * samples * np.dtype(depth).itemsize
-
-
 def free_memory() -> int:
     """Default memory budget in bytes: four fifths of the free memory."""
     return int(psutil.virtual_memory().available * 4 // 5)
 
 
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
-    try:
+    with tiff.decoding(path):
         rows = stack.enter_context(TiffRows(path))
-    except tiff.UnhandledTiff as error:
-        raise ValueError(f"{path} {error}") from error
-    except OSError:
-        raise
-    except Exception as error:  # tifffile has no common base class for errors
-        raise ValueError(
-            f"{path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
-        ) from error
-    source: RowSource = rows
-    if rows.turned:
-        source = _turn(rows, stack)
+    source: RowSource = _turn(rows, stack) if rows.turned else rows
     return StoredPicture(source, rows.alpha, rows.held, rows.icc, rows.exif)
 
 
 def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
-    """The rows of a picture stored on its side, from a copy in a temporary file."""
+    """The rows of a picture stored on its side, upright, in a temporary file."""
     height, width, samples = rows.shape
     copy = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
     upright = np.memmap(copy, dtype=rows.dtype, mode="w+", shape=(width, height, samples))
@@ -240,50 +214,34 @@ def _open_zarr(path: Path) -> StoredPicture:
         )
     alpha = len(rows.shape) == 3 and rows.shape[2] in (2, 4)
     chunk = (*rows.array.chunks[:1], *rows.shape[1:])
-    held = 2 * int(np.prod(chunk)) * rows.dtype.itemsize
+    held = 2 * math.prod(chunk) * rows.dtype.itemsize
     return StoredPicture(rows, alpha, held, attributes=dict(rows.array.attrs))
 
 
 def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:
-    """An array that is renamed when it is complete, and only then replaces an earlier one of that name."""
+    """Write an array that is renamed when it is complete, and only then replaces an earlier one of that name."""
     shape = tuple(like.rows.shape)
     path = link_target(path)
-    beside, former = name_beside(path), name_beside(path)
-    unfinished.add(beside)
-    claim = ExitStack()
-    try:
-        remove_stale(path.parent, {path.name})
-        chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
+    former = name_beside(path)
+    chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
+    with part_beside(path) as beside:
         array = _zarr().create_array(
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
         )
-        claim.enter_context(claimed(beside))
-        start = 0
-        for band in tiff.bands((part for _, part in rows), CHUNK):
-            values = band.reshape(len(band), *shape[1:])
-            # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
-            for left in range(0, shape[1], CHUNK):
-                array[start : start + len(band), left : left + CHUNK] = values[:, left : left + CHUNK]
-            start += len(band)
-        if path.exists():
-            path.replace(former)
-        try:
-            os.replace(beside, path)
-        except OSError:
-            former.replace(path)
-            raise
-    except OSError as error:
-        raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
-    finally:
-        claim.close()
-        shutil.rmtree(former, ignore_errors=True)
-        if beside.exists():
-            _remove(beside)
-        unfinished.discard(beside)
-
-
-def _remove(folder: Path) -> None:
-    """Remove an abandoned array; after an interrupt a thread of zarr may still be writing its last chunk."""
-    for pause in (0.0, 0.1, 0.4):
-        time.sleep(pause)
-        shutil.rmtree(folder, ignore_errors=True)
+        with claimed(beside):
+            start = 0
+            for band in tiff.bands((part for _, part in rows), CHUNK):
+                values = band.reshape(len(band), *shape[1:])
+                # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
+                for left in range(0, shape[1], CHUNK):
+                    array[start : start + len(band), left : left + CHUNK] = values[:, left : left + CHUNK]
+                start += len(band)
+            if path.exists():
+                path.replace(former)
+            try:
+                beside.replace(path)
+            except OSError:
+                former.replace(path)
+                raise
+            finally:
+                shutil.rmtree(former, ignore_errors=True)

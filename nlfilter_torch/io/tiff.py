@@ -1,14 +1,11 @@
-"""TIFF files by tifffile, of any depth, with profile and EXIF; whole, or a few rows at a time.
-
-Reading rows decodes strips or tiles as they are needed.
-"""
+"""TIFF files of any depth, with profile and EXIF, by tifffile; whole, or a few rows at a time."""
 
 import logging
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -17,7 +14,6 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from nlfilter_torch.io import exif as exif_tags
-from nlfilter_torch.io import tiff
 
 # Tags that describe the photograph. The others describe how the file stores it and are not copied.
 _DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)
@@ -27,10 +23,23 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 TILE = 256  # side of the tiles that are written
 CLASSIC = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
+KEPT = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
 
 
-class UnhandledTiff(Exception):
-    """A valid TIFF file of an unsupported kind; the message continues a sentence that starts with the file's name."""
+class UnhandledImage(ValueError):
+    """A valid image file of an unsupported kind."""
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Report errors in the block as those of a damaged file; decoders have no common base class for errors."""
+    try:
+        yield
+    except (MemoryError, UnhandledImage):
+        raise
+    except Exception as error:
+        reason = error or type(error).__name__
+        raise ValueError(f"{path} is damaged or cut short ({reason}); copy it again from its source") from error
 
 
 def is_tiff(head: bytes) -> bool:
@@ -39,39 +48,43 @@ def is_tiff(head: bytes) -> bool:
 
 
 def read(
-    path: Path, check_size: Callable[[int, int, bool], None]
+    path: Path, check_size: Callable[[tuple[int, int], bool], None]
 ) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
     """(H, W, S) channels as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
 
-    ``check_size(width, height, double)`` is called before the pixels are decoded; ``double`` means 64-bit pixels.
+    ``check_size((width, height), double)`` is called before the pixels are decoded; ``double`` means 64-bit pixels.
     """
-    with tifffile.TiffFile(path) as file:
+    with decoding(path), tifffile.TiffFile(path) as file:
         page = file.pages.first
-        check_page(page)
-        check_size(page.imagewidth, page.imagelength, page.dtype == np.float64)
+        check_page(path, page)
+        check_size((page.imagewidth, page.imagelength), page.dtype == np.float64)
         channels = np.asarray(page.asarray())
         if page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
         channels = plain(page, channels.reshape(page.imagelength, page.imagewidth, -1))
-        orientation, icc, exif = notes(file, path)
+        orientation, icc, exif = metadata(file, path)
     return channels, orientation, icc, exif
 
 
-def check_page(page: Any) -> None:
-    """Raise UnhandledTiff unless a page is a picture in grey or RGB, with or without alpha."""
+def check_page(path: Path, page: Any) -> None:
+    """Raise UnhandledImage unless a page is a picture in grey or RGB, with or without alpha."""
     kinds = tifffile.PHOTOMETRIC
     by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
     handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
     if page.photometric not in handled:
         name = getattr(page.photometric, "name", page.photometric)
-        raise UnhandledTiff(f"is stored in {name} colours, which are not handled; convert it to grey or RGB")
+        raise UnhandledImage(f"{path} is stored in {name} colours, which are not handled; convert it to grey or RGB")
     bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
     if page.dtype is None or bits != 8 * page.dtype.itemsize:
-        raise UnhandledTiff(f"has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats")
+        raise UnhandledImage(
+            f"{path} has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats"
+        )
     if page.axes not in ("YX", "YXS", "SYX"):
-        raise UnhandledTiff(f"has the axes {page.axes}, which are not those of a picture; save a plain picture")
+        raise UnhandledImage(f"{path} has the axes {page.axes}, which are not those of a picture; save a plain picture")
     if page.samplesperpixel - len(page.extrasamples) not in (1, 3) or len(page.extrasamples) > 1:
-        raise UnhandledTiff(f"has {page.samplesperpixel} channels; convert it to grey or RGB, with or without alpha")
+        raise UnhandledImage(
+            f"{path} has {page.samplesperpixel} channels; convert it to grey or RGB, with or without alpha"
+        )
 
 
 def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
@@ -82,7 +95,7 @@ def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
     return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
 
 
-def notes(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes | None]:
+def metadata(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes | None]:
     """Orientation, profile and EXIF (not from a BigTIFF) of the first page of a file."""
     tags = file.pages.first.tags
     orientation, profile = tags.get(_ORIENTATION), tags.get(34675)
@@ -91,11 +104,6 @@ def notes(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes
         profile.value if profile is not None and isinstance(profile.value, bytes) else None,
         None if file.is_bigtiff else _read_exif(path),
     )
-
-
-def write(stream: BinaryIO, channels: NDArray[Any], alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
-    """Write channels, (H, W) or (H, W, S), compressed without loss; ``alpha``: whether the last is transparency."""
-    _write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, bigtiff=False)
 
 
 def write_rows(
@@ -122,7 +130,7 @@ def write_rows(
     big = height * width * samples * dtype.itemsize > CLASSIC
     # Compressing ahead in threads would queue hundreds of megabytes.
     options = {"tile": (TILE, TILE), "maxworkers": 1, "buffersize": TILE * TILE * samples * dtype.itemsize}
-    _write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, bigtiff=big, **options)
+    write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, bigtiff=big, **options)
 
 
 def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
@@ -142,7 +150,7 @@ def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
         yield np.concatenate(waiting)
 
 
-def _write(
+def write(
     stream: BinaryIO,
     data: Any,
     shape: tuple[int, ...],
@@ -152,6 +160,10 @@ def _write(
     exif: bytes | None,
     **options: Any,
 ) -> None:
+    """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
+
+    ``alpha``: whether the last channel is transparency; ``options``: of :func:`tifffile.imwrite`.
+    """
     tags = Image.Exif()
     if exif is not None:
         tags.load(exif)
@@ -226,9 +238,6 @@ def _unmultiplied(channels: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([plain.astype(channels.dtype), channels[..., -1:]], axis=-1)
 
 
-KEPT = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
-
-
 class TiffRows:
     """The first page of a TIFF file, upright, as rows (H, W, S).
 
@@ -241,18 +250,14 @@ class TiffRows:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the header.
-
-        Raises:
-            UnhandledTiff: if the picture is of an unsupported kind.
-        """
+        """Read the header; raises UnhandledImage if the picture is of an unsupported kind."""
         self.path = path
         self.stream: BinaryIO = path.open("rb")
         try:
             self.file = tifffile.TiffFile(self.stream, name=str(path))
             page: Any = self.file.pages.first
-            tiff.check_page(page)
-            self.orientation, self.icc, self.exif = tiff.notes(self.file, path)
+            check_page(path, page)
+            self.orientation, self.icc, self.exif = metadata(self.file, path)
         except BaseException:
             self.stream.close()
             raise
@@ -269,9 +274,7 @@ class TiffRows:
     def __enter__(self) -> "TiffRows":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stream.close()
 
     @property
@@ -290,20 +293,15 @@ class TiffRows:
         Raises:
             ValueError: if the file has changed since it was opened, or is damaged.
         """
-        start, stop, height = rows.start, rows.stop, self.shape[0]
-        flipped = self.orientation in (3, 4)
-        first, last = (height - stop, height - start) if flipped else (start, stop)
-        read: Callable[[int, int], NDArray[Any]] = self._read_raw if self._raw else self._decode
+        first, last = rows.start, rows.stop
+        if self.orientation in (3, 4):  # stored upside down
+            first, last = self.shape[0] - last, self.shape[0] - first
         try:
-            stored = read(first, last)
-        except Exception as error:  # decoders have no common base class for errors
+            with decoding(self.path):
+                stored = self._read_raw(first, last) if self._raw else self._decode(first, last)
+        finally:
             self._check_unchanged()
-            raise ValueError(
-                f"{self.path} is damaged or cut short ({error or type(error).__name__}); copy it again from its source"
-            ) from error
-        self._check_unchanged()
-        plain = tiff.plain(self.page, stored)
-        return plain[:: -1 if flipped else 1, :: -1 if self.orientation in (2, 3) else 1]
+        return exif_tags.upright(plain(self.page, stored), 1 if self.turned else self.orientation)
 
     @property
     def _raw(self) -> bool:

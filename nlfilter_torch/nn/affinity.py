@@ -21,11 +21,11 @@ class NonlocalAffinity(Learnable):
     """From a guide to an operator: a layer around :func:`nonlocal_operator`, with its options.
 
     Args:
-        learn: what is learned besides the network that makes the guide: any of ``"photometric_bandwidth"`` and
-            ``"spatial_bandwidth"`` (which must have numbers to start from) and ``"patch_weights"``. All stay positive.
-        **options: of :func:`nonlocal_operator`. With a ``generator`` every call has other landmarks; do not combine it
-            with gradient checkpointing, which expects two runs of the layer to agree. A layer with a ``group`` cannot
-            be pickled or copied.
+        learn: the options to learn, any of ``"photometric_bandwidth"`` and ``"spatial_bandwidth"`` (which need initial
+            values) and ``"patch_weights"``. All stay positive.
+        **options: of :func:`nonlocal_operator`. With a ``generator`` every call draws other landmarks; do not combine
+            it with gradient checkpointing, which expects two runs of the layer to agree. A layer with a ``group``
+            cannot be pickled or copied.
 
     Raises:
         TypeError, ValueError: if ``learn`` has another name, or an option is not one of :func:`nonlocal_operator`.

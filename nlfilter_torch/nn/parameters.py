@@ -11,19 +11,16 @@ from nlfilter_torch.core.checks import check_number, check_positive, described
 
 
 class Learnable(nn.Module):
-    """A layer with options that are learned if ``learn`` names them: :func:`positive_option` and :class:`UnitWindow`.
+    """A layer with options that can be learned, each a :func:`positive_option` or a :class:`UnitWindow`.
 
     Attributes:
-        learnable: each of these options, with the name of its parameter.
+        learnable: from the name of such an option to that of its parameter.
     """
 
     learnable: ClassVar[Mapping[str, str]]
 
     def start_positive(self, name: str, value: Any, learn: frozenset[str], *, other: type | None = None) -> None:
-        """Give a positive option its value, as a parameter if ``learn`` has its ``name``.
-
-        A value of the type ``other`` is taken as it is; the caller has checked it.
-        """
+        """Set a positive option, as a parameter if ``learn`` has its name; values of type ``other`` are not checked."""
         if name in learn:
             check_number(value, name, "pass the number to start from")
         if other is None or not isinstance(value, other):
@@ -48,7 +45,7 @@ class Learnable(nn.Module):
         unexpected_keys: list[str],
         error_msgs: list[str],
     ) -> None:
-        """Accept the names of earlier versions, and say which option of the constructor is missing."""
+        """Accept the names of earlier versions; report learned options that this layer does not learn."""
         own = dict(self.named_parameters())
         for option, parameter in self.learnable.items():
             earlier = f"{prefix}{option}.logarithm"
@@ -113,11 +110,8 @@ class UnitWindow(nn.Module):
 
 def check_learn(learn: Collection[str], choices: Sequence[str]) -> frozenset[str]:
     """The names in ``learn``; raise ValueError if one of them is not among ``choices``."""
-    if (
-        not isinstance(learn, Collection)
-        or isinstance(learn, Tensor)
-        or any(not isinstance(name, str) for name in learn)
-    ):
+    is_collection = isinstance(learn, Collection) and not isinstance(learn, Tensor)
+    if not is_collection or any(not isinstance(name, str) for name in learn):
         raise TypeError(f"learn must be a list of names, got {described(learn)}; choose from {', '.join(choices)}")
     names = frozenset([learn] if isinstance(learn, str) else learn)
     unknown = sorted(map(repr, names.difference(choices)))
