@@ -242,12 +242,12 @@ def test_outputs_that_cannot_be(photo: Path, tmp_path: Path, capsys: pytest.Capt
 def test_too_large_for_memory(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = psutil.virtual_memory()._replace(available=60 * 90 * 4 * (100 + 2 * 25 + 40) - 1)
+    free = psutil.virtual_memory()._replace(available=1_000_000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
-    sentence = refused(capsys, "tone", photo, tmp_path / "out.png")
-    assert "has 90x60 pixels and needs about 4 MB of memory, but 4 MB is free; use fewer landmarks, smaller" in sentence
-    sentence = refused(capsys, "detail", photo, tmp_path / "out.png")  # not even in tiles
-    assert "in.png needs 4 MB of memory at least, but 3 MB may be used; allow more" in sentence
+    sentence = refused(capsys, "tone", photo, tmp_path / "out.png")  # not even in tiles
+    assert "in.png needs 4 MB of memory at least, but 1 MB may be used; allow more, or use fewer landmarks" in sentence
+    sentence = refused(capsys, "inspect", photo, tmp_path)  # needs all pixels at once
+    assert "has 90x60 pixels and needs about 13 MB of memory, but 1 MB is free; use fewer landmarks" in sentence
 
 
 def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

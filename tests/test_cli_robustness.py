@@ -130,7 +130,7 @@ def test_memory_of_large_patches_is_asked_for(
         asked.append(bytes_per_pixel)
         raise ValueError("enough")
 
-    monkeypatch.setattr("nlfilter_torch.cli.tiled.read_photograph", read)
+    monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", read)
     refused(capsys, "apply", photo, tmp_path / "out.png", "--preset", preset)
     assert asked[0] > 4 * 2 * 99**2
 

@@ -38,7 +38,7 @@ def apply(
     from torch import Tensor
 
     from nlfilter_torch.cli import editing
-    from nlfilter_torch.cli.tiled import Job
+    from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.tiled.recipe import edit_rows
     from nlfilter_torch.tiled.sources import Rows

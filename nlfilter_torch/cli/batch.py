@@ -78,9 +78,9 @@ def batch(
     """
     step_of(EDITS["detail"], given)
 
+    from nlfilter_torch.cli.editing import allowed_memory
     from nlfilter_torch.cli.folders import Tally, edit_folder, pictures, prepare
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.cli.tiled import allowed_memory
     from nlfilter_torch.core.checks import check_patch_size
     from nlfilter_torch.core.ranks import connected_ranks
 

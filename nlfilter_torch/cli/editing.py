@@ -1,17 +1,103 @@
-"""What every verb does that turns one photograph into another: read, check, edit, write."""
+"""What every verb does that turns one photograph into another: read, check, edit, write; in tiles if it has to be."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.progress import steps
-from nlfilter_torch.cli.tiled import Job, allowed_memory, edit_by_rows, read_if_it_fits
+from nlfilter_torch.cli.progress import stages, steps
 from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.io.photographs import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.io.photographs import Photograph, TooLarge, check_output, read_photograph, write_photograph
+from nlfilter_torch.io.rows import StoredPicture, check_place, free_memory, is_zarr, open_picture, write_picture
+from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import Rows
+from nlfilter_torch.tiled.tiles import Passes
+
+MOST = 1e6  # gigabytes that anyone may have
+
+
+def allowed_memory(gigabytes: float | None) -> int:
+    """``--memory`` in bytes."""
+    if gigabytes is None:
+        return free_memory()
+    if not 0 < gigabytes <= MOST:
+        raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
+    return int(gigabytes * 1e9)
+
+
+def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int) -> Photograph | None:
+    """The photograph, or None if it has to be read by rows."""
+    if is_zarr(Path(source)) or is_zarr(Path(target)):
+        return None
+    try:
+        return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=memory)
+    except TooLarge:
+        return None
+
+
+@dataclass
+class Job:
+    """A photograph that is edited by rows.
+
+    Attributes:
+        picture: that is read.
+        kind: dtype of what is written.
+        memory: bytes that are left.
+        report: told of the progress.
+        files: closes what was opened.
+    """
+
+    picture: StoredPicture
+    kind: str
+    memory: int
+    report: Report
+    files: ExitStack
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.picture.shape[0], self.picture.shape[1]
+
+    def passes(self, full: bool) -> Passes:
+        """Over the photograph, from every pixel or from a sample of them."""
+        return Passes(self.kind, "full" if full else "sample", memory=max(self.memory, 1), report=self.report)
+
+    def open(self, path: Path) -> StoredPicture:
+        """Another picture, read by rows as long as the job takes."""
+        found = self.files.enter_context(open_picture(path, self.memory))
+        self.memory -= found.held
+        return found
+
+
+def edit_by_rows(
+    source: Path,
+    target: Path,
+    depth: str | None,
+    memory: int,
+    edit: Callable[[Job], Rows],
+    *,
+    coloured: bool = False,
+) -> None:
+    """Write the rows that ``edit`` makes of the photograph in one file to another.
+
+    Args:
+        source: the file to read.
+        target: the file to write; may be the same.
+        depth: dtype of the output, None for that of the input.
+        memory: bytes that may be used.
+        edit: from what is open to the edited rows.
+        coloured: that a grey photograph becomes one in colour.
+    """
+    with ExitStack() as stack:
+        picture = stack.enter_context(open_picture(source, memory))
+        kind = depth or str(picture.rows.dtype)
+        written = picture.in_colour() if coloured else picture
+        check_place(target, kind, written, memory)
+        job = Job(picture, kind, memory - picture.held, stack.enter_context(stages()), stack)
+        write_picture(target, edit(job), kind, written)
 
 
 def edit_file(
@@ -23,8 +109,8 @@ def edit_file(
     landmarks: int,
     patch_size: int = 5,
     factors: int = 1,
-    memory: float | None = None,
-    by_rows: Callable[[Job], Rows] | None = None,
+    memory: float | None,
+    by_rows: Callable[[Job], Rows],
     coloured: bool = False,
 ) -> None:
     """Write ``edit`` of the photograph in one file to another, at its depth and with all that the file carries.
@@ -37,26 +123,21 @@ def edit_file(
         landmarks: M.
         patch_size: p.
         factors: arrays of the factor's size that the edit holds at once.
-        memory: gigabytes that may be used, None for most of what is free; for edits that can do by rows.
-        by_rows: the edit of a photograph that is larger, or None where there is no such edit.
+        memory: gigabytes that may be used, None for most of what is free.
+        by_rows: the same edit of a photograph that is larger.
         coloured: that the edit by rows gives colours to a grey photograph.
     """
     needed = working_bytes(landmarks, patch_size, factors=factors)
-    allowed = None if by_rows is None else allowed_memory(memory)
+    allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:
         begin("Reading")
-        if allowed is None:
-            photograph: Photograph | None = read_photograph(source, bytes_per_pixel=needed)
-        else:
-            photograph = read_if_it_fits(source, target, needed, allowed)
+        photograph = read_if_it_fits(source, target, needed, allowed)
         if photograph is not None:
-            edited = photograph if depth is None else replace(photograph, depth=options.DEPTHS[depth])
+            edited = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, edited)
             begin("Editing")
             edited = edited.with_pixels(edit(photograph))
             begin("Writing")
             write_photograph(edited, target)
             return
-    if allowed is not None and by_rows is not None:
-        kind = None if depth is None else options.DEPTHS[depth]
-        edit_by_rows(Path(source), Path(target), kind, allowed, by_rows, coloured=coloured)
+    edit_by_rows(Path(source), Path(target), kind, allowed, by_rows, coloured=coloured)

@@ -166,7 +166,7 @@ def edit_photograph(
     from torch import Tensor
 
     from nlfilter_torch.cli import editing, scribble_rows, scribbles
-    from nlfilter_torch.cli.tiled import Job
+    from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.tiled.source import Tiled

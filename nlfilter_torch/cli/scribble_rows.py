@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.cli.editing import Job
 from nlfilter_torch.cli.scribbles import (
     Rectangle,
     check_size,
@@ -20,7 +21,6 @@ from nlfilter_torch.cli.scribbles import (
     unfocused,
     with_sliders,
 )
-from nlfilter_torch.cli.tiled import Job
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.sources import Picture, transparency
 
