@@ -19,7 +19,7 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.sampling import draw, sample_by_influence
+from nlfilter_torch.tiled.sampling import draw, sample_by_leverage
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import balance_by_passes
@@ -28,6 +28,7 @@ from nlfilter_torch.tiled.tiles import Passes
 Array = NDArray[Any]
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 LEVEL = 1 / 255
+FEW = 1 << 27  # bytes, with which rows are computed one at a time
 
 
 def cat(height: int, width: int) -> Array:
@@ -174,7 +175,7 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> 
     picture = GuidePicture(Picture(cat(90, 120)), Guide(lambda image: image, {}))
     pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=30)
     for spectral in (False, True):
-        parts = sample_by_influence(picture, pilot, 3000, lambda *_: None, spectral=spectral)
+        parts = sample_by_leverage(picture, pilot, 3000, lambda *_: None, spectral=spectral)
         assert len(parts) > 1
         weights = sampling.Sample.together(parts).weights
         assert 2500 < weights.numel() < 3500
@@ -228,9 +229,9 @@ def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
-    stream_detail(source, edited, ALPHA, tile_rows=10, sample=2000, num_landmarks=30)
+    stream_detail(source, edited, ALPHA, tile_rows=10, sample=2000, num_landmarks=30, memory=FEW)
     assert source.read <= 3 * 90 * 14 // 10  # the pilot, the sample and the result, each with its halo
-    np.testing.assert_array_equal(edited, streamed(picture, tile_rows=10, sample=2000, num_landmarks=30))
+    np.testing.assert_array_equal(edited, streamed(picture, tile_rows=10, sample=2000, num_landmarks=30, memory=FEW))
 
 
 def test_memory_gives_the_size_of_tiles() -> None:
@@ -281,7 +282,9 @@ def test_equal_seeds_give_equal_pictures() -> None:
 
 def test_report_tells_every_stage_and_its_end() -> None:
     seen: list[tuple[str, int, int]] = []
-    streamed(cat(40, 60), sample=1000, num_landmarks=20, tile_rows=25, report=lambda *step: seen.append(step))
+    streamed(
+        cat(40, 60), sample=1000, num_landmarks=20, tile_rows=25, memory=FEW, report=lambda *step: seen.append(step)
+    )
     stages = list(dict.fromkeys(stage for stage, _, _ in seen))
     assert stages == ["Looking", "Sampling", "Balancing", "Bounding", "Summing up", "Filtering"]
     assert seen[-3:] == [("Filtering", 0, 40), ("Filtering", 25, 40), ("Filtering", 40, 40)]

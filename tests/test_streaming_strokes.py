@@ -18,7 +18,7 @@ from nlfilter_torch.io.photographs import read_photograph
 from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor
 from nlfilter_torch.tiled.scribbles import read_scribbles
 from nlfilter_torch.tiled.sources import Picture
-from tests.test_streaming import LEVEL, Rows, Shrinking, cat
+from tests.test_streaming import FEW, LEVEL, Rows, Shrinking, cat
 
 Array = NDArray[Any]
 
@@ -156,7 +156,7 @@ def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     painted = paint(90, 60)
-    settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30}
+    settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
     source, *paints = (Rows(rows, most=10 + 4) for rows in (picture, *painted))
     edited = np.empty_like(picture)
     stream_recolor(source, edited, paints[0], paints[1], keep=paints[2], **settings)

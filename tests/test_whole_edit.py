@@ -11,12 +11,15 @@ import torch
 from numpy.typing import NDArray
 
 from nlfilter_torch.cli import main
+from nlfilter_torch.edits.denoise import estimate_noise, noise_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled import recipe as whole_edit
 from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import cat, difference
 
@@ -83,6 +86,20 @@ def test_an_edit_by_rows_is_the_one_in_memory(recipe: Recipe, tmp_path: Path) ->
     # In memory the balancing ends at 1e-5.
     assert np.abs(edited - wanted).max() < (1e-4 if RECOLOR in last else 2e-5)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_coarse_smoothing_of_the_focus_is_the_same_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.edits.defocus.GUIDED", 1)  # every fourth pixel takes part
+    image = cat()[..., :97, :149]
+    recipe = Recipe((Step("defocus", (IN,), landmarks=60, radius=3.0),))
+    edited = by_rows(recipe, rows_of(image), tmp_path, tile_rows=17)
+    assert np.abs(edited - rows_of(recipe.apply(image))).max() < 2e-5
+
+
+def test_noise_is_estimated_by_rows_as_in_memory() -> None:
+    image = cat()
+    tiled = Tiled(Picture(rows_of(image)), Passes("float32"))
+    assert torch.equal(noise_of(tiled), estimate_noise(image))
 
 
 def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:

@@ -118,8 +118,13 @@ def fit_defocus(
     def finish(image: Tensor, planes: Tensor) -> Tensor:
         return blur_by(image, 1 - focus_map(image, planes[:, :1], planes[:, 1:], short), reach, aperture)
 
-    margin = focus_margin(short) + _kernel_radius(reach, aperture)
-    return Fitted(lambda pixels: torch.cat([likeness(pixels), scribbles.planes(pixels)], dim=1), finish, margin)
+    margin, step = focus_margin(short) + _kernel_radius(reach, aperture), _every(math.ceil(SMOOTHING * short))
+    return Fitted(
+        lambda pixels: torch.cat([likeness(pixels), scribbles.planes(pixels)], dim=1),
+        finish,
+        -(-margin // step) * step,
+        step,
+    )
 
 
 def focus_margin(short: int) -> int:
@@ -156,7 +161,11 @@ def focus_map(image: Tensor, likeness: Tensor, focus_region: Tensor, short: int)
     if radius < short:  # reflection needs as many pixels
         every = _every(radius)
         window = 2 * (radius // every) * every + 1
-        closed = guided_blur(image, closed, window, eps=1e-4, subsample=every, separable=True)
+        height, width = image.shape[-2:]
+        # A multiple of the step keeps the pixels that take part evenly spaced, in tiles the same as in the whole.
+        guide, rough = (F.pad(p, (0, -width % every, 0, -height % every), "replicate") for p in (image, closed))
+        smooth = guided_blur(guide, rough, window, eps=1e-4, subsample=every, separable=True)
+        closed = smooth[..., :height, :width]
     return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
 
 

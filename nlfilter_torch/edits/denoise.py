@@ -84,7 +84,7 @@ def fit_denoise(
     """:func:`denoise` for any source."""
     check_count(num_landmarks, "num_landmarks")
     DENOISE["noise_level"].check_argument(noise_level, source.batch)
-    level = _noise_of(source) if noise_level is None else torch.as_tensor(noise_level, dtype=source.dtype).reshape(-1)
+    level = noise_of(source) if noise_level is None else torch.as_tensor(noise_level, dtype=source.dtype).reshape(-1)
     heard = level.clamp(min=QUIET)
     options = {"patch_size": DENOISE.defaults["patch_size"]} | options
     options |= {
@@ -129,10 +129,10 @@ def estimate_noise(image: Tensor) -> Tensor:
         tensor([0.1000])
     """
     check_image(image, "image")
-    return _noise_of(InMemory(image.detach().to(working_dtype(image))))
+    return noise_of(InMemory(image.detach().to(working_dtype(image))))
 
 
-def _noise_of(source: Source) -> Tensor:
+def noise_of(source: Source) -> Tensor:
     """:func:`estimate_noise` for any source."""
     if min(source.size) < 3:
         return torch.zeros(source.batch, dtype=source.dtype)

@@ -152,9 +152,11 @@ def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> 
         coefficients: of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
         image: their y, (B, C, n).
     """
+    rows = coefficients.to(columns.factor).transpose(2, 3)  # (1, k, C, M), for one read of the columns
+    affinities = spread(rows.flatten(1, 2), columns.factor, columns.scaling).unflatten(1, rows.shape[1:3])
     smoothed, remainder = [image], columns.remainder.unsqueeze(1)
-    for each in coefficients.to(columns.factor).unbind(1):  # one for each power of W
-        smoothed.append(torch.addcmul(spread(each.mT, columns.factor, columns.scaling), remainder, smoothed[-1]))
+    for affinity in affinities.unbind(1):  # one for each power of W
+        smoothed.append(torch.addcmul(affinity, remainder, smoothed[-1]))
     return layers_between(torch.stack(smoothed, dim=1))
 
 

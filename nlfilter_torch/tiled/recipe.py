@@ -90,7 +90,9 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
         if steps:
             yield from step_rows(steps[-1], passes, source, name, folder)
         else:
-            yield from passes.work_out(picture, lambda tile: tile.inner, 0, max(1, TILE_PIXELS // picture.size[1]))
+            yield from passes.work_out(
+                picture, lambda tile: tile.inner, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1])
+            )
 
 
 def step_rows(step: Step, passes: Passes, source: RowSource, name: str, folder: Path) -> Rows:

@@ -15,6 +15,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import CACHED
 from nlfilter_torch.core.checks import check_choice, check_count, check_positive, warn
 from nlfilter_torch.core.kernels.affinity import Affinity
+from nlfilter_torch.core.kernels.sweeps import positive_root
 from nlfilter_torch.operator.features import (
     GuideChannels,
     bandwidth_of_gradient,
@@ -27,7 +28,7 @@ from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
+from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import CUT
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
@@ -211,21 +212,21 @@ SKETCHED = 16  # random projections; they tell squared lengths to a third
 EVEN = 0.1  # share of a sample that is spread evenly over the picture
 
 
-def sample_by_influence(
+def sample_by_leverage(
     picture: GuidePicture, pilot: Pilot, count: int, report: Report, *, spectral: bool
 ) -> list[Sample]:
     """About ``count`` pixels in several parts, rare ones more likely than common ones.
 
     A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
-    of a photograph off by two grey levels and more. The influence of a pixel is its own share of what W makes of it,
+    of a photograph off by two grey levels and more. The leverage of a pixel is its own share of what W makes of it,
     ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members. What
     projects on eigenvectors (``spectral``) divides by small eigenvalues, and pixels that these depend on come in, too.
     """
     kernel, generator = pilot.kernel, np.random.default_rng(pilot.seed)
     size = kernel.recipe.patch_weights.shape[0]
     even = EVEN * count / picture.pixels
-    influence = Influence.of(pilot, spectral=spectral)
-    rate = _rate(influence(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
+    leverage = Leverage.of(pilot, spectral=spectral)
+    rate = _rate(leverage(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
     recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
     done: list[Sample] = []
     waiting: list[Sample] = []  # of single tiles, much smaller than a chunk
@@ -234,7 +235,7 @@ def sample_by_influence(
         seen = picture.seen(tile, size // 2)
         guide = reduce_channels(seen.pixels, kernel.recipe.guide_channels)
         features = kernel.recipe(seen.pixels, origin=seen.origin, halo=seen.halo)
-        likely = (even + rate * influence(features)).clamp(max=1.0)
+        likely = (even + rate * leverage(features)).clamp(max=1.0)
         chosen, counts = draw(likely, generator)
         patches, places = patches_at(guide, seen, chosen, size), chosen + tile.start * picture.size[1]
         values = tile.inner.flatten(2)[:, :, chosen]
@@ -274,29 +275,28 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
-class Influence:
-    """How much single pixels matter to sums over all of them, roughly and without the whitening of every pixel.
+class Leverage:
+    """Leverage scores: how much single pixels matter to sums over all of them, from affinities to the landmarks alone.
 
     Lengths of M-vectors are estimated from a few random projections of them, which are projections of the affinities.
 
     Attributes:
         kernel: whose affinities they are.
-        direction: (1, M, 1), whose product with the affinities of a pixel is ``u . t``.
-        sketches: (J k, M): k random projections of u for every measure of length.
+        rows: (1 + J k, M), whose products with the affinities of a pixel are ``u . t``, and k random projections of u
+            for every measure of length.
         scales: (J,): of the measures, which are added up.
     """
 
     kernel: Kernel
-    direction: Tensor
-    sketches: Tensor
+    rows: Tensor
     scales: Tensor
 
     @staticmethod
-    def of(pilot: Pilot, *, spectral: bool) -> "Influence":
-        """The influence on W, and as much again that on projections on its eigenvectors if they are needed."""
+    def of(pilot: Pilot, *, spectral: bool) -> "Leverage":
+        """The leverage on W, and as much again that on projections on its eigenvectors if they are needed."""
         kernel, generator = pilot.kernel, torch.Generator().manual_seed(pilot.seed)
-        marks = kernel.landmarks.shape[2]
-        measures = [torch.eye(marks, dtype=torch.float64)]
+        count = kernel.landmarks.shape[2]
+        measures = [torch.eye(count, dtype=torch.float64)]
         if spectral:
             balancing = PixelScaling(pilot.balancing, pilot.completed)
             blocks = pilot.sample.blocks(kernel)
@@ -305,13 +305,11 @@ class Influence:
             values, vectors = torch.linalg.eigh(gram)
             values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
             measures.append(values.rsqrt()[:, None] * vectors.mT)
-        whitening = kernel.inverse_cholesky[0].double()
-        draws = torch.randn(SKETCHED, marks, generator=generator, dtype=torch.float64) / SKETCHED**0.5
-        sketches = torch.cat([draws @ measure @ whitening for measure in measures]).to(kernel.landmarks)
-        direction = (whitening.mT @ pilot.balancing).to(kernel.landmarks)  # u . t = c . direction
-        influence = Influence(kernel, direction, sketches, torch.ones(len(measures)).to(sketches))
-        lengths = influence.measure(pilot.sample.features)
-        return replace(influence, scales=1 / lengths.mean(1))
+        inverse = kernel.inverse_cholesky[0].double()
+        draws = torch.randn(SKETCHED, count, generator=generator, dtype=torch.float64) / SKETCHED**0.5
+        rows = torch.cat([pilot.balancing[0].mT @ inverse, *(draws @ measure @ inverse for measure in measures)])
+        leverage = Leverage(kernel, rows.to(kernel.landmarks), torch.ones(len(measures)).to(kernel.landmarks))
+        return replace(leverage, scales=1 / leverage.measure(pilot.sample.features).mean(1))
 
     def __call__(self, features: Tensor) -> Tensor:
         """Of pixels with the features (1, D, n): (n,) in float64."""
@@ -322,18 +320,19 @@ class Influence:
         affinity = Affinity(self.kernel.landmarks, self.kernel.completion == "diagonal")
         found = []
         for part in features.split(CACHED, dim=2):
-            near, _ = affinity(part, features.new_empty(1, self.direction.shape[1], part.shape[2]))
-            lengths = (self.sketches @ near[0]).square().unflatten(0, (-1, SKETCHED)).sum(1)  # (J, n)
-            scaling = scaling_from_moment(near, (1 - lengths[:1]).clamp(min=0.0), self.direction)
+            near, _ = affinity(part, features.new_empty(1, self.rows.shape[1], part.shape[2]))
+            products = self.rows @ near[0]
+            lengths = products[1:].square().unflatten(0, (-1, SKETCHED)).sum(1)  # (J, n)
+            scaling = positive_root(products[:1] / 2, (1 - lengths[:1]).clamp(min=0.0))
             found.append(scaling.square() * lengths)
         return torch.cat(found, dim=1)
 
 
-def _rate(influence: Tensor, weight: float, even: float, count: int) -> float:
-    """The factor of the influence at which about ``count`` pixels are drawn, from that of an even sample."""
-    low, high = 0.0, 1 / max(float(influence.min()), 1e-12)
+def _rate(leverage: Tensor, weight: float, even: float, count: int) -> float:
+    """The factor of the leverage at which about ``count`` pixels are drawn, from that of an even sample."""
+    low, high = 0.0, 1 / max(float(leverage.min()), 1e-12)
     for _ in range(60):
         middle = (low + high) / 2
-        expected = weight * float((even + middle * influence).clamp(max=1.0).sum())
+        expected = weight * float((even + middle * leverage).clamp(max=1.0).sum())
         low, high = (middle, high) if expected < count else (low, middle)
     return low

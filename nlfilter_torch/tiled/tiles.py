@@ -15,6 +15,7 @@ from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTar
 
 SAMPLE = 1 << 20  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
+TOGETHER, AMPLE = 1 << 14, 1 << 28  # pixels of rows computed together, which take less time each, and bytes for that
 Statistics = Literal["sample", "full"]
 Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
 
@@ -31,7 +32,7 @@ class Passes:
         kind: dtype of the output.
         statistics: from a sample of the pixels or from all of them.
         sample: number of pixels of that sample.
-        tile_rows: rows that are computed at once; None is as many as fit in memory.
+        tile_rows: rows of a tile, see :meth:`rows_together`; None is as many as fit in memory.
         memory: bytes that may be used.
         report: called with the progress.
     """
@@ -63,6 +64,10 @@ class Passes:
         if self.tile_rows is not None:
             check_count(self.tile_rows, "tile_rows")
 
+    def rows_together(self, width: int) -> int:
+        """Rows that are always computed together; a tile has as many, or a multiple."""
+        return max(1, (TOGETHER if self.memory >= AMPLE else 1) // width)
+
     def work_out(
         self,
         picture: Picture,
@@ -73,8 +78,8 @@ class Passes:
         transparent: bool = True,
         stage: str = "Filtering",
     ) -> Rows:
-        """The edited rows, with their transparency if asked for, in tiles of ``rows`` unless ``tile_rows`` is given."""
-        for tile in picture.tiles(margin, self.tile_rows or rows):
+        """The edited rows, with their transparency if asked for, in tiles of ``rows``."""
+        for tile in picture.tiles(margin, rows):
             self.report(stage, tile.start, picture.size[0])
             with torch.no_grad():
                 values = stored_as(edit(tile), self.kind)
@@ -124,7 +129,8 @@ def rows_that_fit(
     """
     size, memory = (8 if picture.dtype == torch.float64 else 4), passes.memory
     row = picture.size[1] * floats * size
-    at_hand = picture.size[1] * 4 * num_landmarks  # the factor of one row, and products as large
+    rows = passes.rows_together(picture.size[1])
+    at_hand = rows * picture.size[1] * 4 * num_landmarks  # their factor, and products as large
     # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
     later = (pilot + min(picture.pixels, passes.sample)) * planes + block * (num_landmarks + planes + 8)
