@@ -10,6 +10,7 @@ import torch
 from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import build, noise, picture
@@ -123,6 +124,16 @@ def test_one_reference_is_the_usual_filter_on_luminance() -> None:
     torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
 
 
+def test_all_channels_on_request() -> None:
+    frame = pan(1, 1, 40, 50)[0]
+    operator = nonlocal_operator(reduce_channels(frame, "luminance"), num_landmarks=60)
+    wanted = polynomial_filter(operator, frame, ALPHA.float())
+    found = next(filter_frames([frame], ALPHA.float(), references=[frame], channels="all", num_landmarks=60))
+    torch.testing.assert_close(found, wanted, atol=2e-4, rtol=0)
+    with pytest.raises(ValueError, match="channels must be one of"):
+        filter_frames([frame], ALPHA.float(), references=[frame], channels="red")
+
+
 def test_frames_are_read_one_at_a_time() -> None:
     film, seen = pan(3, 5, 30, 30), []
 
@@ -191,6 +202,26 @@ def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         found = read_photograph(path)
         assert (found.pixels - frame.clamp(0, 1)).abs().max() < 0.6 / 255
         assert found.depth == ("uint16" if path.suffix == ".tif" else "uint8")
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_frames_by_every_preset(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film, preset = pan(2, 6, 30, 40), PRESETS[name]
+    (tmp_path / "film").mkdir()
+    for i, frame in enumerate(film):
+        write_photograph(Photograph(frame, "uint8"), tmp_path / "film" / f"{i}.png")
+    arguments = ["frames", str(tmp_path / "film"), str(tmp_path / "out"), "--landmarks", "40", "--references", "1"]
+    assert main([*arguments, "--preset", name]) == 0
+    stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").iterdir())]
+    options = preset.options() | {"num_landmarks": 40}
+    wanted = list(filter_frames(stored, torch.tensor(preset.alpha), references=stored[:1], **options))
+    for path, frame, before in zip(sorted((tmp_path / "out").iterdir()), wanted, stored, strict=True):
+        found = read_photograph(path).pixels
+        assert (found - frame.clamp(0, 1)).abs().max() < 0.6 / 255
+        assert (found - before).abs().max() > 1 / 255
+    (tmp_path / "look.json").write_text('{"version": 1, "steps": [{"edit": "tone"}]}')
+    assert main([*arguments, "--preset", str(tmp_path / "look.json")]) == 2
+    assert "--preset must be a file with one step, of detail and without strokes" in capsys.readouterr().err
 
 
 def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import step_of, with_options
+from nlfilter_torch.cli.edits import PresetName, step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS, FILTER
 
@@ -26,14 +26,23 @@ References = Annotated[
 ]
 
 
-@with_options("alpha", "bandwidth", "residual", "patch_size", "landmarks", "sampling")
-def frames(folder: Frames, target: Edited, references: References = 3, seed: options.Seed = 0, **given: Any) -> None:
+@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name != "time"))
+def frames(
+    folder: Frames,
+    target: Edited,
+    references: References = 3,
+    seed: options.Seed = 0,
+    preset: PresetName = None,
+    **given: Any,
+) -> None:
     """Edit the details of all frames of a film alike, so that nothing flickers.
 
     The sliders are those of `nlfilter-torch detail`; the filter is made once, and each frame is edited with it. Every
     file keeps its name, type, depth, transparency, colour profile and notes of the camera.
 
-    Example: `nlfilter-torch frames shots edited --alpha 2,2,2,1`
+    By sliders: `nlfilter-torch frames shots edited --alpha 2,2,2,1`
+
+    By the name of a look, or a file: `nlfilter-torch frames shots edited --preset crisp`
     """
     step = step_of(EDITS["detail"], given)
 
@@ -65,6 +74,7 @@ def frames(folder: Frames, target: Edited, references: References = 3, seed: opt
             torch.tensor(step["alpha"]),
             references=samples,
             residual=step["residual"],
+            channels=step["channels"],
             **{name: value for name, value in step.arguments((0, 0)).items() if name in FILTER},
             generator=torch.Generator().manual_seed(seed),
         )

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
+from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.filtering.fitted import fit_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -18,7 +20,8 @@ def filter_frames(
     alpha: Tensor,
     *,
     references: Sequence[Tensor],
-    residual: float | Tensor | None = None,
+    residual: float | Tensor | None = DETAIL.defaults["residual"],
+    channels: str = DETAIL.defaults["channels"],
     **options: Any,
 ) -> Iterator[Tensor]:
     """Filter the frames of a film, or any set of like images, with one filter, so that the edit does not flicker.
@@ -29,6 +32,7 @@ def filter_frames(
         references: one or a few frames (1, C, H, W) of one size that show what there is to see; the filter is fitted to
             all of them. What looks like nothing in them stays as it is.
         residual: of :func:`polynomial_filter`.
+        channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
         **options: of :func:`nonlocal_operator`, for the luminance of the references.
 
     Returns:
@@ -45,6 +49,7 @@ def filter_frames(
         [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
     """
     check_alpha(alpha, dimensions=(1,))
+    DETAIL["channels"].check_argument(channels)
     if not isinstance(references, Sequence):
         raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
     if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
@@ -62,11 +67,15 @@ def filter_frames(
         check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
     # One above the other they are one image; the few patches across a seam are the price.
-    tall = torch.cat([reduce_channels(frame, "luminance") for frame in references], dim=2)
-    fitted = fit_filter(nonlocal_operator(tall, **options), tall, order=alpha.shape[-1] - 1)
+    tall = torch.cat([frame.to(working_dtype(frame)) for frame in references], dim=2)
+    grey = reduce_channels(tall, "luminance")
+    filtered = tall if channels == "all" else grey
+    fitted = fit_filter(nonlocal_operator(grey, **options), filtered, order=alpha.shape[-1] - 1)
 
     def edit(frame: Tensor) -> Tensor:
         check_image(frame, "frames")
+        if channels == "all":
+            return fitted(frame, alpha, reduce_channels(frame, "luminance"), residual=residual)
         return edit_luminance(frame, lambda planes: fitted(planes, alpha, residual=residual))
 
     return map(edit, frames)

@@ -120,7 +120,7 @@ class Spectrum(RitzPairs):
 
     @property
     def mass(self) -> Tensor:
-        """The scaling d times the weights of the points, (B, N): the weights of sums over points."""
+        """(B, N), the scaling d times the weights of the points, by which values are summed up."""
         return weighted(self.scaling, self.weights)
 
     @property
