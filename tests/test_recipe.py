@@ -10,6 +10,7 @@ import torch
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.cli import main
+from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import colour_masks
 from nlfilter_torch.edits.parameters import EDITS
@@ -286,8 +287,8 @@ def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_more_memory_is_asked_for_by_hungrier_steps() -> None:
-    assert (Recipe().landmarks, Recipe().factors) == (100, 1)
-    assert Recipe((RECOLOR, DEFOCUS, COLORIZE)).factors == 1
-    assert Recipe((DETAIL,)).factors == 2
-    assert Recipe((Step("denoise", patch_size=9),)).patch_size == 9
-    assert (WHOLE.landmarks, WHOLE.factors) == (200, 2)
+    assert Recipe().bytes_per_pixel == 0
+    assert Recipe((RECOLOR, DEFOCUS, COLORIZE)).bytes_per_pixel == working_bytes(100, 5)
+    assert Recipe((DETAIL,)).bytes_per_pixel == working_bytes(DETAIL["landmarks"], 5, factors=2)
+    assert Recipe((Step("denoise", patch_size=9),)).bytes_per_pixel == working_bytes(200, 9)
+    assert WHOLE.bytes_per_pixel == max(step.bytes_per_pixel() for step in WHOLE.acting)

@@ -180,7 +180,7 @@ class Session:
         recipe, photograph = self.recipe, self.opened.photograph
         check_output(target, photograph)
         height, width = photograph.size
-        needed = working_bytes(recipe.landmarks, recipe.patch_size, factors=recipe.factors)
+        needed = recipe.bytes_per_pixel
         check_memory(Path(self.opened.name), width, height, needed)
         write_photograph(photograph.with_pixels(recipe.apply(photograph.pixels)), target)
         return target

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import stages, steps
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.io.photographs import Photograph, TooLarge, check_output, read_photograph, write_photograph
 from nlfilter_torch.io.rows import StoredPicture, check_place, free_memory, is_zarr, open_picture, write_picture
 from nlfilter_torch.tiled.sampling import Report
@@ -106,9 +105,7 @@ def edit_file(
     depth: options.FileDepth | None,
     edit: Callable[[Photograph], Tensor],
     *,
-    landmarks: int,
-    patch_size: int = 5,
-    factors: int = 1,
+    bytes_per_pixel: int,
     memory: float | None,
     by_rows: Callable[[Job], Rows],
     coloured: bool = False,
@@ -120,18 +117,15 @@ def edit_file(
         target: the file to write; may be the same.
         depth: of the output, None for that of the input.
         edit: from the photograph to new pixels (1, C, H, W).
-        landmarks: M.
-        patch_size: p.
-        factors: arrays of the factor's size that the edit holds at once.
+        bytes_per_pixel: memory that the edit needs for each pixel of an image.
         memory: gigabytes that may be used, None for most of what is free.
         by_rows: the same edit of a photograph that is larger.
         coloured: that the edit by rows gives colours to a grey photograph.
     """
-    needed = working_bytes(landmarks, patch_size, factors=factors)
     allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:
         begin("Reading")
-        photograph = read_if_it_fits(source, target, needed, allowed)
+        photograph = read_if_it_fits(source, target, bytes_per_pixel, allowed)
         if photograph is not None:
             edited = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, edited)

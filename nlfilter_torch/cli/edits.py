@@ -182,14 +182,13 @@ def edit_photograph(
         drawn = scribble_rows.of_edit(step, job, given)
         yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
 
+    masked = name == "detail" and bool(given.get("region") or given.get("mask"))
     editing.edit_file(
         source,
         target,
         depth,
         work,
-        landmarks=step["landmarks"],
-        patch_size=max(step["patch_size"], 5),  # 3x3 in three colours takes as much as 5x5 in grey
-        factors=2 if name == "detail" and (given.get("region") or given.get("mask")) else 1,
+        bytes_per_pixel=step.bytes_per_pixel(masked=masked),
         memory=memory,
         by_rows=by_rows,
         coloured=edit.coloured,

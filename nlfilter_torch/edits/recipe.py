@@ -60,19 +60,9 @@ class Recipe:
         return Recipe((*self.steps[:place], step, *self.steps[place:]))
 
     @property
-    def landmarks(self) -> int:
-        """The largest number of landmarks of any step, at least the default, for an estimate of the memory needed."""
-        return max([100, *(step["landmarks"] for step in self.acting)])
-
-    @property
-    def patch_size(self) -> int:
-        """The largest patches of any step, at least the default, likewise."""
-        return max([5, *(step["patch_size"] for step in self.acting)])
-
-    @property
-    def factors(self) -> int:
-        """Arrays as large as a factor that the hungriest step holds at once; patches in colour count as one."""
-        return 2 if any(step.has_region() for step in self.acting) else 1
+    def bytes_per_pixel(self) -> int:
+        """Memory in bytes that the hungriest step needs for each pixel of an image."""
+        return max((step.bytes_per_pixel() for step in self.acting), default=0)
 
     @property
     def gives_colour(self) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.declaration import Edit, Parameter, is_within, shown
 from nlfilter_torch.edits.parameters import EDITS
 
@@ -91,6 +92,15 @@ class Step:
         return any(not p.is_idle(self[p.name]) for p in acting) or (
             self.has_region() and any(slider != 1 for slider in self.sliders_inside)
         )
+
+    def bytes_per_pixel(self, *, masked: bool = False) -> int:
+        """Memory in bytes that it needs for each pixel of an image; ``masked`` if it has a region without strokes."""
+        names = {parameter.name for parameter in self.declared}
+        landmarks = self["landmarks"] if "landmarks" in names else 0
+        patch_size = (
+            max(self["patch_size"], 5) if "patch_size" in names else 0
+        )  # 3x3 in colour is as large as 5x5 in grey
+        return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
 
     def in_units(self, size: tuple[int, int], stride: int = 1) -> list[tuple[Parameter, Any]]:
         """Parameters and their values for an image of a size, see :meth:`Parameter.argument_of`."""
