@@ -96,6 +96,16 @@ def test_a_coarse_smoothing_of_the_focus_is_the_same_by_rows(tmp_path: Path, mon
     assert np.abs(edited - rows_of(recipe.apply(image))).max() < 2e-5
 
 
+def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image, recipe = cat(), Recipe((Step("abstract", landmarks=20, edges=1.0),))
+    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISHED", 4000)  # 2.4 MB a row
+    few = by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)  # and so two tiles or more
+    assert np.abs(few - by_rows(recipe, rows_of(image), tmp_path)).max() < 1e-5
+    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISHED", 20_000)
+    with pytest.raises(MemoryError, match=r"scan.tif needs \d+ MB of memory at least, but 60 MB may be used"):
+        by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)
+
+
 def test_noise_is_estimated_by_rows_as_in_memory() -> None:
     image = cat()
     tiled = Tiled(Picture(rows_of(image)), Passes("float32"))

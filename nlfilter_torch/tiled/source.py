@@ -26,6 +26,7 @@ from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource,
 from nlfilter_torch.tiled.statistics import CONVERGED, balance_by_passes, limiter_by_passes
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, rows_that_fit
 
+FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
 LARGE_PATCHES = 50  # numbers in a patch above which the sample has half as many of them
 
 
@@ -253,5 +254,20 @@ class Tiled:
                 found = finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels)
                 return found[..., tile.halo[0] : found.shape[2] - tile.halo[1], :]
 
-            rows = -(-max(rows, margin) // fitted.step) * fitted.step  # with fewer most of them would be margins
-            yield from self.passes.work_out(self.picture, finished, margin, rows)
+            yield from self.passes.work_out(self.picture, finished, margin, self._rows_to_finish(fitted, rows))
+
+    def _rows_to_finish(self, fitted: Fitted, rows: int) -> int:
+        """Rows of a tile that is finished: not fewer than its margins, as far as memory allows.
+
+        Raises:
+            MemoryError: if it allows none.
+        """
+        row = self.size[1] * FINISHED * self.dtype.itemsize
+        most = self.passes.memory // row - 2 * fitted.margin
+        if self.size[0] > most and most < fitted.step:
+            raise MemoryError(
+                f"{self.picture.name} needs {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory at least, "
+                f"but {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+            )
+        rows = max(rows, fitted.margin) if self.size[0] <= most else min(max(rows, fitted.margin), most)
+        return max(1, rows // fitted.step) * fitted.step
