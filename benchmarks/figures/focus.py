@@ -7,9 +7,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
-from nlfilter_torch import defocus, nonlocal_operator
-from nlfilter_torch.edits.defocus import blur_by, focus_map
+from nlfilter_torch import defocus
+from nlfilter_torch.edits.defocus import blur_by, fit_defocus, focus_map
 from nlfilter_torch.edits.parameters import DEFOCUS
+from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.plotting import show_images
 
 PORTRAIT: tuple[Box, ...] = (
@@ -78,14 +79,9 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 def default_map(image: Tensor, region: Tensor) -> Tensor:
     """The map that the defaults of defocus make."""
-    operator = nonlocal_operator(
-        image,
-        photometric_bandwidth=25 / 255,
-        spatial_bandwidth=DEFOCUS["spatial_bandwidth"].share * min(image.shape[-2:]),
-        patch_size=3,
-        guide_channels="all",
-    )
-    return focus_map(operator.spectrum(), image, region)
+    source = InMemory(image)
+    likeness, painted = fit_defocus(source, region).pixels(source).split(1, dim=1)
+    return focus_map(image, likeness, painted, min(source.size))
 
 
 def _disparity(image: Tensor) -> Tensor:

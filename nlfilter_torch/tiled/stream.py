@@ -69,7 +69,7 @@ def stream_detail(
         MemoryError: if the samples or a single row take more than ``memory``.
 
     Example:
-        >>> import torch
+        >>> import numpy as np
         >>> picture = np.random.default_rng(0).integers(0, 256, (60, 40, 3), np.uint8)
         >>> edited = np.empty_like(picture)
         >>> stream_detail(picture, edited, torch.ones(4), num_landmarks=20, tile_rows=16)
@@ -143,6 +143,7 @@ def stream_recolor(
         MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
 
     Example:
+        >>> import numpy as np
         >>> picture = np.full((60, 40, 3), 100, np.uint8)
         >>> picture[:, 20:, 0] = 220  # the right half is reddish
         >>> strokes, recoloured = np.zeros((60, 40, 4), np.uint8), np.empty_like(picture)
@@ -213,6 +214,7 @@ def stream_colorize(
         MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
 
     Example:
+        >>> import numpy as np
         >>> grey = np.full((60, 40), 60, np.uint8)
         >>> grey[:, 20:] = 200
         >>> strokes, coloured = np.zeros((60, 40, 4), np.uint8), np.empty((60, 40, 3), np.uint8)
