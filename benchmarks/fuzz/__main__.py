@@ -71,6 +71,7 @@ def main(arguments: list[str] | None = None) -> None:
     kind.add_argument("--pictures", action="store_true", help="photographs of scikit-image over a grid of settings")
     kind.add_argument("--functions", action="store_true", help="every public function with random arguments")
     parser.add_argument("--cases", type=int, help=f"how many; default {CASES}, of pictures all")
+    parser.add_argument("--first", type=int, default=0, help="number of the first one; default 0")
     parser.add_argument("--case", type=int, help="run this one alone and print every figure")
     parser.add_argument("--seed", type=int, default=0, help="of all cases; default 0")
     parser.add_argument("--workers", type=int, choices=range(1, WORKERS + 1), default=WORKERS, help="processes")
@@ -86,8 +87,9 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(min(details(check, options.case), 1))
     whole = len(pictures(options.seed)) if options.pictures else None
     count = options.cases if options.cases is not None else whole or CASES
-    found = list(results(check, range(count if whole is None else min(count, whole)), min(options.workers, count)))
-    print(f"{len(found)} {name}, seed {options.seed}")
+    last = options.first + count if whole is None else min(options.first + count, whole)
+    found = list(results(check, range(options.first, last), min(options.workers, count)))
+    print(f"{len(found)} {name} from number {options.first}, seed {options.seed}")
     flag = "" if name == "operators" else f" --{name}"
     broken = report(found, f"python -m benchmarks.fuzz{flag} --seed {options.seed}")
     if options.out is not None:

@@ -153,7 +153,7 @@ def edge_lines(luminance: Tensor, width: float) -> Tensor:
 
 def quantize(luminance: Tensor, tones: int) -> Tensor:
     """Luminance (B, 1, H, W) in ``tones`` tones, with soft steps in flat areas and crisp ones at edges."""
-    from kornia.filters import spatial_gradient  # kornia takes half a second to import: only who needs it waits
+    from kornia.filters import spatial_gradient  # kornia takes half a second to import
 
     step = 1 / (tones - 1)
     nearest = (luminance / step).round() * step
@@ -168,7 +168,7 @@ def _gaussian_margin(sigma: float) -> int:
 
 
 def _gaussian(image: Tensor, sigma: float) -> Tensor:
-    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import: only who needs it waits
+    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
 
     size = 2 * _gaussian_margin(sigma) + 1
     return gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="replicate")

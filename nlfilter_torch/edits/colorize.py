@@ -182,6 +182,7 @@ def fit_colorize(
         )
         wanted = wanted - torch.cat([fitted(block) for block in columns()], dim=2)
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
+        del operator  # the factor of one is freed before that of the other is made
     far, near = parts
     return Fitted(lambda some: merge_luminance(luminance(some), far(some) + near(some)))
 

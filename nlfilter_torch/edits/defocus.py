@@ -150,7 +150,7 @@ def focus_map(image: Tensor, likeness: Tensor, focus_region: Tensor, short: int)
         focus_region: weights of the region, (B, 1, H, W).
         short: pixels of the short side of the whole picture.
     """
-    from kornia.filters import guided_blur  # kornia takes half a second to import: only who needs it waits
+    from kornia.filters import guided_blur  # kornia takes half a second to import
 
     share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
     focus = torch.maximum(share * share * (3 - 2 * share), focus_region)

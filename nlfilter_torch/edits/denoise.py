@@ -85,10 +85,10 @@ def fit_denoise(
     check_count(num_landmarks, "num_landmarks")
     DENOISE["noise_level"].check_argument(noise_level, source.batch)
     level = noise_of(source) if noise_level is None else torch.as_tensor(noise_level, dtype=source.dtype).reshape(-1)
-    heard = level.clamp(min=QUIET)
+    assumed = level.clamp(min=QUIET)
     options = {"patch_size": DENOISE.defaults["patch_size"]} | options
     options |= {
-        "photometric_bandwidth": heard if photometric_bandwidth is None else photometric_bandwidth,
+        "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
         "spatial_bandwidth": nearby(spatial_bandwidth, DENOISE["spatial_bandwidth"].share, source.size),
         "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
         "guide_channels": "all",
@@ -96,7 +96,7 @@ def fit_denoise(
     operator = source.operator(Guide(lambda image: image, options, blur=GUIDE_BLUR))
     layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
     energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of (B, ORDER, H, W)
-    noise = heard.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)
+    noise = assumed.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)
 
     def cleaned(pixels: Pixels) -> Tensor:
         kept = (1 - noise[..., None, None].to(pixels.image) / energy(pixels)[:, -1].clamp(min=1e-12)).clamp(0.0, 1.0)
@@ -111,8 +111,8 @@ def estimate_noise(image: Tensor) -> Tensor:
     """Standard deviation of white noise: the median response to Immerkaer's mask, mean over channels.
 
     The mask (Immerkaer, "Fast Noise Variance Estimation", 1996) is blind to whatever is linear in rows or columns, and
-    a median does not hear edges. Fine texture counts as noise: expect one or two grey levels too many on photographs,
-    and ten on grass.
+    the median ignores edges, which are few. Fine texture counts as noise: expect one or two grey levels too many on
+    photographs, and ten on grass.
 
     Args:
         image: (B, C, H, W), at least 3x3.

@@ -181,7 +181,7 @@ def colour_guide(image: Tensor) -> Tensor:
 
     To the last bit the same for a pixel wherever it stands, so that landmarks are the same for a picture read by rows.
     """
-    from kornia.color import rgb_to_lab  # kornia takes half a second to import: only who needs it waits
+    from kornia.color import rgb_to_lab  # kornia takes half a second to import
 
     # Powers round differently in the odd pixels that are left over at the end of a tensor, or of a thread's part of it.
     parts = []

@@ -72,7 +72,7 @@ class Guide:
         guide = self.look(image)
         if self.margin == 0:
             return guide
-        from kornia.filters import gaussian_blur2d  # kornia takes half a second to import: only who needs it waits
+        from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
 
         margin = self.margin
         size, padded = 2 * margin + 1, pad_border(guide, margin)
