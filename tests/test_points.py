@@ -208,7 +208,7 @@ def test_an_operator_of_features_has_no_guide() -> None:
         ({"size": (3, 5)}, ValueError, r"size must have as many pixels as there are features, 12, got 3x5"),
         ({"size": (-3, -4)}, ValueError, r"size must have as many pixels"),
         ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
-        ({"weights": torch.zeros(12)}, ValueError, r"weights must be from 1e-06 to 1e\+06, got values from 0 to 0"),
+        ({"weights": torch.zeros(12)}, ValueError, r"weights must be from 1e-06 to 1e\+06, got 0 to 0"),
         ({"weights": torch.full((12,), 1e7)}, ValueError, r"weights must be from 1e-06 to 1e\+06"),
         ({"weights": torch.ones(12, dtype=torch.complex64)}, TypeError, "weights must be of a floating-point dtype"),
         ({"weights": 4.0}, TypeError, r"weights must be a torch.Tensor"),

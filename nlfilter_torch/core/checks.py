@@ -21,6 +21,7 @@ Response = Callable[[Tensor], Tensor]
 LARGEST_PATCH = 101  # features take patch_size^2 times the memory of the guide
 LARGEST_ORDER = 1000  # each order takes a copy of the image
 LARGEST_EIGENVALUE = 1e6
+LEAST_WEIGHT = 1e-6  # of a point; its inverse is the largest, beyond which sums in float32 lose the others
 FAR_OUTSIDE = 16.0  # above the values of HDR pictures with white at 1, below those of 8-bit pictures
 
 
@@ -363,11 +364,8 @@ def check_size(size: object, points: int) -> tuple[int, int]:
     return (size[0], size[1])
 
 
-LEAST_WEIGHT = 1e-6  # of a point; its inverse is the largest, beyond which sums in float32 lose the others
-
-
 def check_weights(weights: Tensor, features: Tensor) -> Tensor:
-    """Weights (B, N) in the dtype of features (B, D, N), from (N,) or (B, N); raise unless positive and finite."""
+    """Weights (B, N) in the dtype of features (B, D, N), from (N,) or (B, N); raise unless all are in range."""
     check_tensor(weights, "weights")
     check_dtype(weights, "weights", "convert it with weights.float()")
     batch, _, points = features.shape
@@ -377,10 +375,8 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
         )
     weights = weights.detach().to(features).expand(batch, points).contiguous()
     if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
-        raise ValueError(
-            f"weights must be from {LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}, got values from {weights.min():g} to "
-            f"{weights.max():g}; leave out points that stand for no pixel"
-        )
+        allowed, found = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
+        raise ValueError(f"weights must be from {allowed}, got {found}; leave out points that stand for no pixel")
     return weights
 
 
