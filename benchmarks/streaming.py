@@ -27,9 +27,11 @@ from benchmarks.memory import MIB, forget_peak, resident
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_detail
-from nlfilter_torch.tiled.detail import detail_rows
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
@@ -91,12 +93,8 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
         stage, since = name, now
 
     with open_picture(source, memory) as picture:
-        rows = detail_rows(
-            Passes("uint8", statistics, memory=memory, report=report),
-            picture.rows,
-            ALPHA,
-            num_landmarks=landmarks,
-        )
+        tiled = Tiled(Picture(picture.rows), Passes("uint8", statistics, memory=memory, report=report))
+        rows = tiled.rows(fit_detail(tiled, ALPHA, num_landmarks=landmarks))
         write_picture(target, rows, "uint8", picture)
         pixels = picture.shape[0] * picture.shape[1]
     report("", 0, 0)

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,16 @@ from numpy.typing import NDArray
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
+from nlfilter_torch.edits.colorize import fit_colorize
 from nlfilter_torch.edits.colour import split_luminance
-from nlfilter_torch.edits.recolor import colour_guide
+from nlfilter_torch.edits.recolor import colour_guide, fit_recolor
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_colorize, stream_recolor
-from nlfilter_torch.tiled.colorize import colorize_rows
-from nlfilter_torch.tiled.recolor import recolor_rows
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 
-VERBS = {"recolor": recolor_rows, "colorize": colorize_rows}
+VERBS: dict[str, Any] = {"recolor": fit_recolor, "colorize": fit_colorize}
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB
     ((0.25, 0.25, 0.02, 0.03), (0, 0, 255)),
     ((0.70, 0.60, 0.02, 0.02), (255, 0, 0)),
@@ -65,8 +65,8 @@ def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
     before, started = resident("VmRSS"), time.process_time()
     with open_picture(source, memory) as picture:
         height, width, _ = picture.shape
-        rows: Iterator[Any] = VERBS[verb](Passes("uint8", memory=memory), picture.rows, Boxes((height, width, 4)))
-        write_picture(target, rows, "uint8", picture)
+        tiled = Tiled(Picture(picture.rows), Passes("uint8", memory=memory))
+        write_picture(target, tiled.rows(VERBS[verb](tiled, Boxes((height, width, 4)), None)), "uint8", picture)
     return {
         "verb": verb,
         "megapixels": height * width / 1e6,
