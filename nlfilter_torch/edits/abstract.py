@@ -121,7 +121,7 @@ def fit_abstract(
     def varying(pixels: Pixels) -> Tensor:
         return pixels.image - mean
 
-    exponent = torch.as_tensor(power).to(operator.pairs.root).reshape(-1, 1)
+    exponent = torch.as_tensor(power).to(mean.device, torch.float64).reshape(-1, 1)
     coefficients = operator.coefficients(varying)
     captured = synthesize(operator, torch.ones_like, coefficients)
     smoothed = synthesize(operator, lambda eigenvalues: eigenvalues**exponent, coefficients)

@@ -29,7 +29,7 @@ class TilePixels:
 
     Attributes:
         image: their colours, (1, C, h, W).
-        features: the same for each operator that asks for them, (1, D, h W).
+        features: of these pixels, (1, D, h W), for the guide of an operator.
         first: number of the first pixel, along the rows of the picture.
     """
 
@@ -168,11 +168,10 @@ class TiledOperator:
         """Features (1, D, n) of single pixels, read from their rows."""
         recipe, report = self.kernel.recipe, self.report
         size, patches = recipe.patch_weights.shape[0], []
-        for tile, chosen in visit(self.guide.picture, self.margin, places, report, "Comparing strokes"):
-            if len(chosen):
-                seen = self.guide.seen(tile, size // 2)
-                guide = reduce_channels(seen.pixels, recipe.guide_channels)
-                patches.append(patches_at(guide, seen, chosen, size))
+        for tile, chosen in visit(self.guide.picture, self.margin, places, report, "Comparing strokes", every=False):
+            seen = self.guide.seen(tile, size // 2)
+            guide = reduce_channels(seen.pixels, recipe.guide_channels)
+            patches.append(patches_at(guide, seen, chosen, size))
         scales = (recipe.patch_weights, recipe.photometric_bandwidth, recipe.spatial_bandwidth)
         return scaled_patches(torch.cat(patches, dim=2), places, self.guide, *scales)
 

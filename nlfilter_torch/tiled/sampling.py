@@ -170,14 +170,20 @@ def take_pilot(
     return Pilot(kernel, sample, start_balancing(*kernel.factor(sample.features), weight), rest.initial_seed())
 
 
-def visit(picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str) -> Iterator[tuple[Tile, Tensor]]:
-    """All tiles of a pass, each with those of the sorted ``pixels`` that lie in it, as counted from its first one."""
-    width, rows = picture.size[1], picture.statistics_rows
-    for tile in picture.tiles(margin, rows):
-        report(stage, tile.start, picture.size[0])
-        bounds = torch.tensor([tile.start, tile.start + tile.stored.shape[0]]) * width
-        first, last = torch.searchsorted(pixels, bounds).tolist()
-        yield tile, pixels[first:last] - tile.start * width
+def visit(
+    picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str, *, every: bool = True
+) -> Iterator[tuple[Tile, Tensor]]:
+    """Tiles of a pass, each with those of the sorted ``pixels`` that lie in it, as counted from its first one.
+
+    Tiles without any are read only if ``every`` one is asked for.
+    """
+    (height, width), rows = picture.size, picture.statistics_rows
+    for start in range(0, height, rows):
+        report(stage, start, height)
+        stop = min(start + rows, height)
+        first, last = torch.searchsorted(pixels, torch.tensor([start, stop]) * width).tolist()
+        if every or first < last:
+            yield picture.tile(start, stop, margin), pixels[first:last] - start * width
 
 
 def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:

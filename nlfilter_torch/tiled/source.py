@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.source import Fitted, Guide, Planes
 from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
+from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
@@ -176,20 +176,19 @@ class Tiled:
         check_negative(1 if negative is None else negative.shape[2], regions.shape[2])
         operator = self.operator(guide)
         core = operator.pairs.basis(lambda eigenvalues: eigenvalues.pow(time))
-        centres = [(core @ operator.region_means(rows, name)).mT if rows is not None else None
-                   for rows, name in ((regions, "regions"), (negative, "negative"))]  # fmt: skip
+        inner = (core @ operator.region_means(regions, "regions")).mT
+        outer = None if negative is None else (core @ operator.region_means(negative, "negative")).mT
         scale = self.picture.pixels / width
 
-        def masks(pixels: Any) -> Tensor:
-            columns = pixels.columns(operator)
+        def masks(columns: Columns) -> Tensor:
             coordinates = core.to(columns.factor) @ (columns.factor * columns.scaling.unsqueeze(1))
-            exponents = [
-                None if c is None else scale * squared_distances(coordinates, c.to(coordinates)) for c in centres
-            ]
-            assert exponents[0] is not None  # regions are given
-            return mask_of_exponents(exponents[0], exponents[1]).unflatten(2, pixels.image.shape[-2:])
 
-        return masks
+            def exponents(centres: Tensor) -> Tensor:
+                return scale * squared_distances(coordinates, centres.to(coordinates))
+
+            return mask_of_exponents(exponents(inner), None if outer is None else exponents(outer))
+
+        return operator.each(masks)
 
     def pixels_of(self, tile: Tile) -> TilePixels:
         """All pixels of a tile of the picture."""
