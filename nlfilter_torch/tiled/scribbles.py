@@ -8,8 +8,6 @@ from torch import Tensor
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.tiled.sources import Picture, RowSource, transparency
 
-FLOATS_OF_SCRIBBLED = 200  # that a scribbled pixel takes: features of a patch in colour, twice while they are joined
-
 Rows = Callable[[int, int], Tensor]  # planes of the rows from the first to before the second
 
 
@@ -62,7 +60,7 @@ def read_scribbles(
             )
         chosen = plane.nonzero().squeeze(1)
         count += len(chosen)
-        check_room(picture, count, memory)
+        check_room(picture, count, 0, memory)
         if len(chosen):
             places.append(chosen + start * width)
             values.append(plane[chosen].to(picture.dtype))
@@ -99,9 +97,14 @@ def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
     return Picture(rows, name)
 
 
-def check_room(picture: Picture, count: int, memory: int) -> None:
-    """Raise MemoryError if that many scribbled pixels take more than ``memory`` bytes."""
-    needed = count * FLOATS_OF_SCRIBBLED * (8 if picture.dtype == torch.float64 else 4)
+def floats_of_scribbled(numbers: int) -> int:
+    """Floats of a scribbled pixel with so many features, which are there twice while they are joined."""
+    return 2 * numbers + 40
+
+
+def check_room(picture: Picture, count: int, numbers: int, memory: int) -> None:
+    """Raise MemoryError if that many scribbled pixels with so many features take more than ``memory`` bytes."""
+    needed = count * floats_of_scribbled(numbers) * picture.dtype.itemsize
     if needed > memory:
         raise MemoryError(
             f"the strokes on {picture.name} cover {count} pixels or more and need {needed / 1e6:.0f} MB of memory, but "

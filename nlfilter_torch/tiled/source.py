@@ -21,7 +21,7 @@ from nlfilter_torch.tiled.sampling import (
     sample_by_leverage,
     take_pilot,
 )
-from nlfilter_torch.tiled.scribbles import FLOATS_OF_SCRIBBLED, read_scribbles
+from nlfilter_torch.tiled.scribbles import check_room, floats_of_scribbled, read_scribbles
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.statistics import CONVERGED, balance_by_passes, limiter_by_passes
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, rows_that_fit
@@ -46,8 +46,8 @@ class Tiled:
         self.picture, self.passes, self.strokes = picture, passes, strokes
         self.size, self.channels, self.dtype = picture.size, picture.colours, picture.dtype
         self.operators: list[TiledOperator] = []
-        self.planes = 8 * picture.colours + 40  # floats for each pixel of a tile, without features
-        self.cached = 0  # floats that are there all the time
+        self.floats = 8 * picture.colours + 40  # floats for each pixel of a tile, without features
+        self.scribbled = 0  # pixels
 
     @torch.no_grad()
     @full_precision
@@ -80,7 +80,7 @@ class Tiled:
             limiter = limiter_by_passes(lambda: found.blocks("Bounding"), found.balancing)
             found.kernel = replace(found.kernel, limiter=limiter)
         self.operators.append(found)
-        self.planes += numbers
+        self.floats += numbers
         return found
 
     def room(self, numbers: int, num_landmarks: int) -> int:
@@ -89,13 +89,14 @@ class Tiled:
         Raises:
             MemoryError: if there is not one, or no room for the samples.
         """
+        check_room(self.picture, self.scribbled, numbers, self.passes.memory)
         return rows_that_fit(
             self.picture,
             self.passes,
-            floats=self.planes + numbers,
+            floats=self.floats + numbers,
             planes=numbers,
             num_landmarks=num_landmarks,
-            held=self.cached,
+            held=self.scribbled * floats_of_scribbled(numbers),
         )
 
     def scribbles(
@@ -120,7 +121,7 @@ class Tiled:
         if needed and len(found.places) == 0:
             called = self.strokes if mask is None else name
             raise ValueError(f"{called} must hold a painted pixel, got none; paint at least one")
-        self.cached += len(found.places) * FLOATS_OF_SCRIBBLED
+        self.scribbled += len(found.places)
         return found
 
     @torch.no_grad()

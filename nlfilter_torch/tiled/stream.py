@@ -58,7 +58,8 @@ def stream_detail(
             favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
             or four passes that each cost more than the output.
         sample: approximate number of pixels of that sample; with as many as the picture has, statistics are full.
-        tile_rows: rows that are computed at once; None is as many as fit in ``memory``.
+        tile_rows: rows of a tile, None as many as fit in ``memory``; with 256 MB or more, at least as many as make
+            16,384 pixels, or a multiple.
         memory: bytes that may be used, besides those of source and target.
         report: called with the name of a stage, the part done and the total.
         **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are
