@@ -1,6 +1,6 @@
 """What a step does to an image, and what of it can be kept for the next step of its kind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from nlfilter_torch.edits.denoise import fit_denoise
 from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.edits.parameters import FILTER
 from nlfilter_torch.edits.recolor import fit_recolor
-from nlfilter_torch.edits.scribbles import mask_of, paint
+from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.sharpen import fit_sharpen
 from nlfilter_torch.edits.source import Fitted, InMemory, Source, apply_fitted, edited
 from nlfilter_torch.edits.steps import Step
@@ -46,23 +46,31 @@ def check_channels(edit: str, channels: int) -> None:
         raise ValueError("recolor needs a colour photograph, got a grey one; use colorize, which colours grey ones")
 
 
-def scribbles_of(step: Step, size: tuple[int, int]) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
-    """The strokes of a step as tensors: those that its function takes after the image, and those it takes by name."""
+def scribbles_of(
+    step: Step,
+    size: tuple[int, int],
+    colours: Callable[[Sequence[Stroke], tuple[int, int]], tuple[Any, ...]] = paint,
+    mask: Callable[[Sequence[Stroke], tuple[int, int]], Any] = mask_of,
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The strokes of a step: those that its function takes after the image, and those it takes by name.
+
+    Args:
+        step: of an edit.
+        size: (H, W) of the image.
+        colours: makes colours and their mask of strokes, here as tensors.
+        mask: makes a mask of strokes, likewise.
+    """
     if step.edit in ("recolor", "colorize"):
-        keep = mask_of(step.painted("keep"), size)
-        return paint(step.painted("colour"), size), {"keep": keep} if bool(keep.any()) else {}
+        keep = mask(step.painted("keep"), size)
+        return colours(step.painted("colour"), size), {"keep": keep} if bool(keep.any()) else {}
     if step.edit == "defocus":
-        return (mask_of(step.painted("in"), size),), {}
+        return (mask(step.painted("in"), size),), {}
     if not step.has_region():
         return (), {}
-    outer = mask_of(step.painted("out"), size)
+    outer = mask(step.painted("out"), size)
     negative = {"negative": outer} if bool(outer.any()) else {}
-    return (mask_of(step.painted("in"), size),), sliders_of(step) | negative
-
-
-def sliders_of(step: Step) -> dict[str, Tensor]:
-    """The sliders of a step of detail with a region, inside and outside."""
-    return {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
+    sliders = {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
+    return (mask(step.painted("in"), size),), sliders | negative
 
 
 def fit_step(

@@ -1,15 +1,15 @@
 """A whole edit, as the editor saves it, on a picture larger than memory: its steps in turn, in tiles of rows."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.edits.applying import fit_step, sliders_of
+from nlfilter_torch.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.steps import Step
@@ -31,7 +31,7 @@ class CoveredRows:
         size: (H, W).
     """
 
-    strokes: tuple[Stroke, ...]
+    strokes: Sequence[Stroke]
     size: tuple[int, int]
     dtype = np.dtype(np.float32)
 
@@ -98,21 +98,5 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
 def step_rows(step: Step, passes: Passes, source: RowSource, name: str, folder: Path) -> Rows:
     """The rows that a step makes of a picture."""
     tiled = Tiled(Picture(source, name), passes)
-    yield from tiled.rows(fit_step(step, tiled, *scribbled_rows(step, tiled.size)), folder)
-
-
-def scribbled_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[RowSource | None, ...], dict[str, Any]]:
-    """What :func:`scribbles_of` gives, as rows."""
-
-    def covered(word: str) -> CoveredRows | None:
-        rows = CoveredRows(step.painted(word), size)
-        return rows if rows.any() else None
-
-    if step.edit in ("recolor", "colorize"):
-        keep = covered("keep")
-        return (ColouredRows(step.painted("colour"), size), None), {"keep": keep} if keep is not None else {}
-    if step.edit == "defocus":
-        return (CoveredRows(step.painted("in"), size),), {}
-    if not step.has_region():
-        return (), {}
-    return (CoveredRows(step.painted("in"), size),), sliders_of(step) | {"negative": covered("out")}
+    scribbles = scribbles_of(step, tiled.size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)
+    yield from tiled.rows(fit_step(step, tiled, *scribbles), folder)
