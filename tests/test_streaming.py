@@ -172,7 +172,7 @@ def test_regions_that_cannot_be_used_are_named(regions: Array, alpha: Tensor, me
 
 @pytest.mark.usefixtures("small_blocks")
 def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> None:
-    picture = GuidePicture(Picture(cat(90, 120)), Guide(lambda image: image, {}))
+    picture = GuidePicture(Picture(cat(90, 120)), Guide({}))
     pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=30)
     for spectral in (False, True):
         parts = sample_by_leverage(picture, pilot, 3000, lambda *_: None, spectral=spectral)
@@ -308,7 +308,7 @@ def test_more_landmarks_than_pixels_are_reduced() -> None:
 
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.tiled.statistics.MAX_PASSES", 1)
-    picture = GuidePicture(Picture(cat(30, 40)), Guide(lambda image: image, {}))
+    picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
     pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
         balance_by_passes(lambda: pilot.sample.blocks(pilot.kernel), 9 * pilot.balancing, completed=True)

@@ -114,7 +114,7 @@ def fit_abstract(
         "spatial_bandwidth": nearby(spatial_bandwidth, ABSTRACT["spatial_bandwidth"].share, source.size),
         "guide_channels": "all",
     }
-    operator = source.operator(Guide(lambda image: image, options, spectral=True))
+    operator = source.operator(Guide(options, spectral=True))
     # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
     mean = source.mean(lambda pixels: pixels.image)
 

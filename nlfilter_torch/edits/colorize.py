@@ -18,7 +18,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance
 from nlfilter_torch.edits.parameters import COLORIZE
-from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Source, edited, luminance, luminance_guide
+from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Source, edited, luminance
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.spectrum import Spectrum
@@ -158,7 +158,7 @@ def fit_colorize(
             "photometric_bandwidth": stage.photometric * photometric_bandwidth,
             "spatial_bandwidth": stage.spatial * nearness,
         }
-        return source.operator(Guide(luminance_guide, options | scaled, spectral=True))
+        return source.operator(Guide(options | scaled, spectral=True))
 
     assert scribbles.colours is not None  # for mypy
     wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)

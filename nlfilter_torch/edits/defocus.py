@@ -107,7 +107,7 @@ def fit_defocus(
         "spatial_bandwidth": nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size),
         "guide_channels": "all",
     }
-    operator = source.operator(Guide(lambda image: image, options, spectral=True))
+    operator = source.operator(Guide(options, spectral=True))
     basis = walk_basis(operator.pairs, REACH).to(source.dtype)
     found = find_components(scribbles, operator.at(scribbles.places), basis, source.size)
     likeness = operator.each(

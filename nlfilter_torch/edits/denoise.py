@@ -93,7 +93,7 @@ def fit_denoise(
         "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
         "guide_channels": "all",
     }
-    operator = source.operator(Guide(lambda image: image, options, blur=GUIDE_BLUR))
+    operator = source.operator(Guide(options, blur=GUIDE_BLUR))
     layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
     energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of (B, ORDER, H, W)
     noise = assumed.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)

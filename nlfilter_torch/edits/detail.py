@@ -121,13 +121,13 @@ def fit_detail(
         if isinstance(shared.get("generator"), torch.Generator):  # both filters draw from the same state
             shared["generator"] = shared["generator"].clone_state()
         shared |= {"photometric_bandwidth": mask_bandwidth, "guide_channels": "all"}
-        seen = Guide(lambda image: image, shared, spectral=True)
+        seen = Guide(shared, spectral=True)
         masks = source.masks(seen, regions, negative, time=time, width=width)
     elif negative is not None or outside is not None:
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
-    operator = source.operator(Guide(lambda image: image, options, exact=residual is not None))
+    operator = source.operator(Guide(options, exact=residual is not None))
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
     filtered = polynomial(operator, planes, order, residual)
 

@@ -107,7 +107,7 @@ def fit_recolor(
     marked = marked if kept is None else marked.joined(kept)
 
     options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
-    operator = source.operator(Guide(colour_guide, {**options, "guide_channels": "all"}, spectral=True))
+    operator = source.operator(Guide({**options, "guide_channels": "all"}, look=colour_guide, spectral=True))
     basis = walk_basis(operator.pairs, reach).to(source.dtype)
     found = find_components(marked, operator.at(marked.places), basis, source.size)
     directions = [divide(components) for components in found]

@@ -1,5 +1,6 @@
 """Sharper edges without more noise: the middle sliders of a filter that compares softened patches. Paper: Fig. 6."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,7 +10,8 @@ from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.parameters import SHARPEN
-from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, luminance_guide, polynomial
+from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
+from nlfilter_torch.operator.features import reduce_channels
 
 
 @full_precision
@@ -69,7 +71,8 @@ def fit_sharpen(
     SHARPEN["amount"].check_argument(amount, source.batch)
     SHARPEN["guide_blur"].check_argument(guide_blur)
     check_reach(guide_blur, "guide_blur", source.size)
-    operator = source.operator(Guide(luminance_guide, options, blur=guide_blur))
+    grey = partial(reduce_channels, guide_channels="luminance")  # one channel to blur in place of three
+    operator = source.operator(Guide(options, look=grey, blur=guide_blur))
     filtered = polynomial(operator, luminance, 3, None)
     middle = torch.as_tensor(amount, dtype=torch.float32).reshape(-1).expand(source.batch)
     alpha = torch.stack([torch.ones_like(middle), middle, middle, torch.ones_like(middle)], dim=1)

@@ -48,16 +48,16 @@ class Guide:
     """What the filter of an edit compares.
 
     Attributes:
-        look: makes the guide from an image (B, C, H, W), pixel by pixel.
         options: of :func:`nonlocal_operator`.
+        look: makes the guide from an image (B, C, H, W), pixel by pixel; None takes the image.
         blur: standard deviation in pixels of a Gaussian that the guide is blurred by.
         spectral: whether the edit takes sums along eigenvectors.
         exact: whether it takes what eigenvectors capture of single pixels, which depends on rare pixels that a sample
             lacks.
     """
 
-    look: Callable[[Tensor], Tensor]
     options: Mapping[str, Any]
+    look: Callable[[Tensor], Tensor] | None = None
     blur: float = 0.0
     spectral: bool = False
     exact: bool = False
@@ -69,7 +69,7 @@ class Guide:
 
     def __call__(self, image: Tensor) -> Tensor:
         """The guide of an image (B, C, H, W) of any size."""
-        guide = self.look(image)
+        guide = image if self.look is None else self.look(image)
         if self.margin == 0:
             return guide
         from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
@@ -297,11 +297,6 @@ def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> 
 def luminance(pixels: Pixels) -> Tensor:
     """The luminance of pixels in colour; pixels of another number of channels as they are."""
     return reduce_channels(pixels.image, "luminance")
-
-
-def luminance_guide(image: Tensor) -> Tensor:
-    """The luminance of an image as a guide."""
-    return reduce_channels(image, "luminance")
 
 
 def polynomial(

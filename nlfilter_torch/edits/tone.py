@@ -62,7 +62,7 @@ def fit_tone(
     check_order(order)
     TONE["contrast"].check_argument(contrast, source.batch)
     TONE["clarity"].check_argument(clarity, source.batch)
-    operator, mean = source.operator(Guide(lambda image: image, options)), source.mean(luminance)
+    operator, mean = source.operator(Guide(options)), source.mean(luminance)
 
     def slider(value: float | Tensor) -> Tensor:
         return torch.as_tensor(value).to(mean).reshape(-1).expand(source.batch)
