@@ -12,7 +12,7 @@ import torch
 
 from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 
-LIBRARIES = ("torch", "kornia", "numpy", "scikit-image", "scipy", "opencv-python-headless")
+LIBRARIES = ("torch", "kornia", "numpy", "scikit-image", "scipy", "opencv-contrib-python-headless")
 
 
 def describe() -> dict[str, Any]:
