@@ -163,23 +163,31 @@ def edit_photograph(
     edit = EDITS[name]
     step = step_of(edit, given)
 
+    from contextlib import ExitStack
+
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, scribble_rows, scribbles
+    from nlfilter_torch.cli import editing, scribbles
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
     from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.io.rows import open_picture
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture, Rows
 
     def work(photograph: Photograph) -> Tensor:
         check_channels(name, photograph.pixels.shape[1])
-        return apply_to(step, photograph.pixels, *scribbles.of_edit(step, photograph, given), generator=seeded(seed))
+        with ExitStack() as files:
+            free = editing.allowed_memory(memory)
+            drawn = scribbles.of_edit(
+                step, photograph.size, given, lambda path: files.enter_context(open_picture(path, free))
+            )
+            return apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
 
     def by_rows(job: Job) -> Rows:
         check_channels(name, job.picture.shape[2])
         tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
-        drawn = scribble_rows.of_edit(step, job, given)
+        drawn = scribbles.of_edit(step, job.size, given, job.open)
         yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
 
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))
