@@ -67,7 +67,7 @@ class Job:
     def open(self, path: Path) -> StoredPicture:
         """Another picture, read by rows as long as the job takes."""
         found = self.files.enter_context(open_picture(path, self.memory))
-        self.memory -= found.held
+        self.memory -= found.cached
         return found
 
 
@@ -111,5 +111,5 @@ def edit_file(
         stored = kind or str(picture.rows.dtype)
         written = picture.in_colour() if coloured else picture
         check_place(Path(target), stored, written, allowed)
-        job = Job(picture, stored, allowed - picture.held, stack.enter_context(stages()), stack)
+        job = Job(picture, stored, allowed - picture.cached, stack.enter_context(stages()), stack)
         write_picture(Path(target), by_rows(job), stored, written)
