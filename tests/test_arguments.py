@@ -144,7 +144,6 @@ def test_other_arguments_of_a_wrong_type() -> None:
     sentence(lambda: FITTED.layers(GREY, origin="top"), "origin")
     sentence(lambda: FITTED.layers(GREY, halo=(0, -1)), "halo")
     sentence(lambda: FITTED.layers(GREY, halo=(4, 4)), "halo")
-    sentence(lambda: FITTED(GREY, ONES, by_rows="yes"), "by_rows")
     sentence(lambda: enhance(IMAGE, ONES, IMAGE[0]), "regions")
     sentence(lambda: NonlocalFilter().forward(None), "image")
     sentence(lambda: NonlocalFilter().sliders.combine(IMAGE), "layers")

@@ -1,16 +1,11 @@
 """The kernels in C compute what torch does without them, whatever the sizes, the threads and the instruction set."""
 
-import platform
-import shutil
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from hatch_build import FOLDER, CompiledKernels
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core import instruction_sets
 from nlfilter_torch.core.autograd import OuterProduct
@@ -20,14 +15,14 @@ from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator import landmarks, newton
-from nlfilter_torch.operator.conjugate_gradients import weighted_moment
+from nlfilter_torch.operator.newton import weighted_moment
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
+from nlfilter_torch.operator.scaling import KernelMatrix
 from tests import reference
 
 LEVELS = [
     pytest.param(level, id=name) for level, name in enumerate(instruction_sets.NAMES) if 0 < level <= library.level
 ]
-POSSIBLE = platform.machine() == "x86_64" and sys.platform == "linux" and shutil.which("cc") is not None
 
 pytestmark = pytest.mark.skipif(not library.level, reason="this installation or processor has no kernels in C")
 
@@ -135,6 +130,10 @@ def test_far_features_meet_the_floor_and_nan_is_not_hidden(level: int) -> None:
     assert factor[..., rest].isfinite().all()
 
 
+def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    return newton._sweep(KernelMatrix(factor, diagonal), total)
+
+
 @pytest.mark.parametrize("pixels", [1, 7, 255, 8256, 40_000])
 @pytest.mark.parametrize("marks", [1, 3, 50, 900])
 def test_sweep(level: int, pixels: int, marks: int) -> None:
@@ -142,10 +141,9 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
     diagonal = 1 - factor.square().sum(1).clamp(max=1)
     total = random(2, marks, 1, seed=1).abs().double() * pixels**0.5
-    arguments = (factor, diagonal, total, ALONE)
-    exact = newton._sweep(*(part.double() for part in arguments[:3]), ALONE)
-    found = newton._sweep(*arguments)
-    plain = by_torch(newton._sweep, *arguments)
+    exact = swept(factor.double(), diagonal.double(), total)
+    found = swept(factor, diagonal, total)
+    plain = by_torch(swept, factor, diagonal, total)
     torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
     error, usual = (found[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
     assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
@@ -250,8 +248,8 @@ def test_tensors_of_any_layout(level: int) -> None:
     z, x, diagonal = random(1, 7, 4).mT, random(1, 300, 4).mT, random(1, 600)[:, ::2].sigmoid()
     arguments = (x, z, inverse_cholesky(z), "diagonal")
     torch.testing.assert_close(nystrom_factor(*arguments), by_torch(nystrom_factor, *arguments))
-    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2, ALONE)
-    found, expected = newton._sweep(*arguments), by_torch(newton._sweep, *arguments)
+    arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2)
+    found, expected = swept(*arguments), by_torch(swept, *arguments)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
 
@@ -273,7 +271,7 @@ def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
 
     def results() -> list[Tensor]:
         factor, diagonal = nystrom_factor(features, marks, inverse_cholesky(marks), "diagonal")
-        scaling, found = newton._sweep(factor, diagonal, factor.double().sum(2, keepdim=True), ALONE)
+        scaling, found = swept(factor, diagonal, factor.double().sum(2, keepdim=True))
         return [factor, scaling, found, sum_grams(factor, scaling, diagonal, 2)]
 
     threads(1)
@@ -347,56 +345,3 @@ def test_negated_views_are_resolved() -> None:
     negated = torch.imag(torch.complex(rows, rows).conj())
     assert negated.is_neg()
     torch.testing.assert_close(spread(negated, factor), -rows @ factor)
-
-
-class Application:
-    """What the builder shows to the one who installs."""
-
-    def __init__(self) -> None:
-        self.shown: list[str] = []
-
-    def display_warning(self, text: str) -> None:
-        self.shown.append(text)
-
-    display_info = display_warning
-
-
-def install(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    shutil.copytree(
-        Path(library.__file__).parent, folder / FOLDER, ignore=shutil.ignore_patterns("*.so", "__pycache__")
-    )
-    application = Application()
-    hook = CompiledKernels(str(folder), {}, None, None, str(folder), "wheel", application)
-    build_data: dict[str, Any] = {"artifacts": [], "pure_python": True}
-    hook.initialize("standard", build_data)
-    return build_data, application.shown
-
-
-@pytest.mark.skipif(not POSSIBLE, reason="there is no C compiler")
-def test_installing_compiles(tmp_path: Path) -> None:
-    build_data, shown = install(tmp_path)
-    assert not shown
-    assert (tmp_path / FOLDER / "kernels.so").stat().st_size > 10_000
-    assert build_data["artifacts"] == ["nlfilter_torch/core/kernels/kernels.so"]
-    assert build_data["tag"].startswith("py3-none-")
-    assert not build_data["pure_python"]
-
-
-@pytest.mark.skipif(not POSSIBLE, reason="there is no C compiler")
-@pytest.mark.parametrize("compiler", ["no-such-compiler", "false"])
-def test_installing_goes_on_without_a_compiler(compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", compiler)
-    build_data, shown = install(tmp_path)
-    assert len(shown) == 1
-    assert "more slowly" in shown[0]
-    assert build_data == {"artifacts": [], "pure_python": True}
-    assert not list((tmp_path / FOLDER).glob("kernels.[!ch]*"))
-
-
-def test_without_the_library_torch_does_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(instruction_sets, "__file__", str(tmp_path / "instruction_sets.py"))
-    assert library._load() is None
-    image = random(1, 1, 20, 20).sigmoid()
-    with_kernels = nonlocal_operator(image, num_landmarks=20).matmul(image)
-    without = by_torch(lambda: nonlocal_operator(image, num_landmarks=20).matmul(image))
-    torch.testing.assert_close(with_kernels, without, atol=1e-4, rtol=0)

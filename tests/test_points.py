@@ -17,9 +17,9 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.operator.damped_newton import damped
+from nlfilter_torch.operator.newton import damped
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import Solution
+from nlfilter_torch.operator.scaling import KernelMatrix, Solution
 from tests import reference
 from tests.problems import noise, picture, seeded
 
@@ -141,7 +141,7 @@ def test_damped_steps_balance_weighted_points() -> None:
     start = Solution(
         scaling, factor @ scaling.unsqueeze(2), torch.full((1,), torch.inf).double(), 0, torch.eye(4).double()
     )
-    found = damped(factor, diagonal, start, 1e-12, weights=weights)
+    found = damped(KernelMatrix(factor, diagonal, weights), start, 1e-12)
     sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     total = factor @ (weights * found.scaling).unsqueeze(2)

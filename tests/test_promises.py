@@ -15,9 +15,8 @@ from nlfilter_torch import (
     polynomial_filter,
 )
 from nlfilter_torch.operator.balancing import balance
-from nlfilter_torch.operator.damped_newton import damped
-from nlfilter_torch.operator.newton import LARGEST
-from nlfilter_torch.operator.scaling import PixelScaling, Solution, scaling_from_moment
+from nlfilter_torch.operator.newton import LARGEST, damped
+from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling, Solution, scaling_from_moment
 from nlfilter_torch.tiled import stream_detail
 from tests import reference
 from tests.problems import noise, picture, seeded
@@ -111,7 +110,7 @@ def test_the_damped_method_converges_from_any_start(start: float) -> None:
     scaling = torch.full((2, 60), start, dtype=torch.float64)
     infinite = torch.full((2,), torch.inf, dtype=torch.float64)
     begun = Solution(scaling, factor @ scaling.unsqueeze(2), infinite, 0, torch.eye(5).double().expand(2, -1, -1))
-    found = damped(factor, diagonal, begun, 1e-12)
+    found = damped(KernelMatrix(factor, diagonal), begun, 1e-12)
     sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     assert found.residual.max() < 1e-11

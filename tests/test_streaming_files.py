@@ -106,7 +106,7 @@ def test_a_part_of_a_tiff_is_read_without_the_rest(tmp_path: Path) -> None:
         assert list(rows.bands) == [2]
         rows[slice(60, 130)]
         assert list(rows.bands) == [3, 4]
-        assert rows.held == 3 * 32 * 150 * 3
+        assert rows.cached == 3 * 32 * 150 * 3
 
 
 def test_a_tiff_in_one_piece_needs_memory_for_it(tmp_path: Path) -> None:

@@ -17,13 +17,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.applying import prepare, scribbles_of, shared
+from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import MASK_BANDWIDTH
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
-from nlfilter_torch.operator.build import nonlocal_operator, operator_from_features
+from nlfilter_torch.filtering.masks import mask_of_exponents
+from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures
 from nlfilter_torch.operator.operator import NonlocalOperator
@@ -50,22 +51,7 @@ def reduce(image: Tensor, stride: int) -> Tensor:
 def sampled_operator(
     guide: Tensor, stride: int, detail: Step, *, bandwidth: float | Tensor, channels: GuideChannels, patch_size: int
 ) -> NonlocalOperator:
-    """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution.
-
-    With ``stride`` 1 it is :func:`nonlocal_operator`, else a sample of it.
-    """
-    generator = torch.Generator().manual_seed(0)
-    if stride == 1:
-        return nonlocal_operator(
-            guide,
-            patch_size=patch_size,
-            photometric_bandwidth=bandwidth,
-            spatial_bandwidth=detail["spatial_bandwidth"],
-            num_landmarks=detail["landmarks"],
-            landmarks=detail["sampling"],
-            guide_channels=channels,
-            generator=generator,
-        )
+    """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution."""
     recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, detail["spatial_bandwidth"], channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
     return operator_from_features(
@@ -73,7 +59,7 @@ def sampled_operator(
         size=size,
         num_landmarks=min(detail["landmarks"], size[0] * size[1]),
         landmarks=detail["sampling"],
-        generator=generator,
+        generator=seeded(),
     )
 
 
@@ -104,10 +90,9 @@ class MaskMaker:
             return
         spectrum = self._spectrum
         core = spectrum.gain(lambda eigenvalues: eigenvalues.pow(2 * time)).to(spectrum.factor)
-        self._norms = torch.cat(
-            [(block * (core @ block)).sum(1) for block in spectrum.factor.split(1 << 15, dim=2)], dim=1
-        )
-        self._norms *= spectrum.scaling.square()  # |x_i|^2 of the diffusion map, (1, N)
+        blocks = spectrum.factor.split(1 << 15, dim=2)
+        norms = torch.cat([(block * (core @ block)).sum(1) for block in blocks], dim=1)
+        self._norms = norms * spectrum.scaling.square()  # |x_i|^2 of the diffusion map, (1, N)
         self._core, self._time = core, time
 
     def _distances(self, region: Tensor) -> Tensor:
@@ -124,11 +109,8 @@ class MaskMaker:
         """The mask (1, 1, h, w) of a region; arguments as those of :func:`diffusion_mask`."""
         self._prepare(time)
         scale = region.numel() / width
-        exponents = scale * self._distances(region)
-        mask = torch.exp(-exponents.clamp(max=60.0))
-        if negative is not None:
-            mask = mask * torch.sigmoid((scale * self._distances(negative) - exponents).clamp(min=-20.0))
-        return mask.view_as(region)
+        others = None if negative is None else scale * self._distances(negative)
+        return mask_of_exponents(scale * self._distances(region), others).view_as(region)
 
 
 class Preview:

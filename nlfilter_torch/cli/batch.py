@@ -10,7 +10,7 @@ import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.apply import apply
-from nlfilter_torch.cli.edits import edit_photograph, plain_step, step_of, take_defaults, with_options
+from nlfilter_torch.cli.edits import edit_photograph, plain_step, preset_option, step_of, with_options
 from nlfilter_torch.cli.interrupts import INTERRUPTED
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, find_recipe
@@ -37,21 +37,12 @@ Workers = Annotated[
 ]
 
 
-def _use_preset(context: typer.Context, name: str | None) -> str | None:
-    step = None if name is None else plain_step(find_recipe(name))
-    if step is not None:
-        take_defaults(context, step)
-    return name
-
-
 Preset = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME|FILE",
-        callback=_use_preset,
-        is_eager=True,
-        help=f"One of {', '.join(PRESETS)}, or a file of any edits, such as `nlfilter-torch fit` and the editor make. "
+    preset_option(
+        f"One of {', '.join(PRESETS)}, or a file of any edits, such as `nlfilter-torch fit` and the editor make. "
         "Options that are given count for more than a preset of detail; other edits take none.",
+        plain=False,
     ),
 ]
 
@@ -88,8 +79,7 @@ def batch(
     allowed_memory(memory)
     settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
-    recipe = None if preset is None else find_recipe(preset)
-    if preset is not None and recipe is not None and plain_step(recipe) is None:
+    if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
         sources = {name: context.get_parameter_source(name) for name in settings}
         beside = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
         if beside:

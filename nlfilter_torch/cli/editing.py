@@ -67,36 +67,8 @@ class Job:
     def open(self, path: Path) -> StoredPicture:
         """Another picture, read by rows as long as the job takes."""
         found = self.files.enter_context(open_picture(path, self.memory))
-        self.memory -= found.held
+        self.memory -= found.cached
         return found
-
-
-def edit_by_rows(
-    source: Path,
-    target: Path,
-    depth: str | None,
-    memory: int,
-    edit: Callable[[Job], Rows],
-    *,
-    coloured: bool = False,
-) -> None:
-    """Write the rows that ``edit`` makes of the photograph in one file to another.
-
-    Args:
-        source: the file to read.
-        target: the file to write; may be the same.
-        depth: dtype of the output, None for that of the input.
-        memory: bytes that may be used.
-        edit: from what is open to the edited rows.
-        coloured: that a grey photograph becomes one in colour.
-    """
-    with ExitStack() as stack:
-        picture = stack.enter_context(open_picture(source, memory))
-        kind = depth or str(picture.rows.dtype)
-        written = picture.in_colour() if coloured else picture
-        check_place(target, kind, written, memory)
-        job = Job(picture, kind, memory - picture.held, stack.enter_context(stages()), stack)
-        write_picture(target, edit(job), kind, written)
 
 
 def edit_file(
@@ -134,4 +106,10 @@ def edit_file(
             begin("Writing")
             write_photograph(edited, target)
             return
-    edit_by_rows(Path(source), Path(target), kind, allowed, by_rows, coloured=coloured)
+    with ExitStack() as stack:
+        picture = stack.enter_context(open_picture(Path(source), allowed))
+        stored = kind or str(picture.rows.dtype)
+        written = picture.in_colour() if coloured else picture
+        check_place(Path(target), stored, written, allowed)
+        job = Job(picture, stored, allowed - picture.cached, stack.enter_context(stages()), stack)
+        write_picture(Path(target), by_rows(job), stored, written)

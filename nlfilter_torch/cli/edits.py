@@ -1,7 +1,7 @@
 """A command for every edit: its options are made from the declaration of its parameters."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,31 +23,28 @@ def plain_step(recipe: Recipe) -> Step | None:
     return step if step is not None and step.edit == "detail" and not step.strokes else None
 
 
-def take_defaults(context: typer.Context, step: Step) -> None:
-    """Let the values of a step take the place of the options' defaults."""
-    context.default_map = {name: option_value(step.declared[name], value) for name, value in step.values}
+def preset_option(help: str, *, plain: bool = True) -> Any:
+    """An option for a preset, whose values take the place of the options' defaults; a ``plain`` one takes no others."""
 
-
-def _use_preset(context: typer.Context, name: str | None) -> str | None:
-    if name is not None:
-        step = plain_step(find_recipe(name))
-        if step is None:
+    def use(context: typer.Context, name: str | None) -> str | None:
+        step = None if name is None else plain_step(find_recipe(name))
+        if step is not None:
+            context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
+        elif plain and name is not None:
             raise ValueError(
                 f"--preset must be a file with one step, of detail and without strokes, got {name}; "
                 "use nlfilter-torch apply, which takes any"
             )
-        take_defaults(context, step)
-    return name
+        return name
+
+    return typer.Option(metavar="NAME|FILE", callback=use, is_eager=True, help=help)
 
 
 PresetName = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME|FILE",
-        callback=_use_preset,
-        is_eager=True,
-        help=f"One of {', '.join(PRESETS)} (`nlfilter-torch presets` describes them), or a file that "
-        "`nlfilter-torch fit` made, in place of the defaults here; options that are given count for more.",
+    preset_option(
+        f"One of {', '.join(PRESETS)} (`nlfilter-torch presets` describes them), or a file that "
+        "`nlfilter-torch fit` made, in place of the defaults here; options that are given count for more."
     ),
 ]
 #: Options for what is painted or marked on the photograph, by the name of the edit.
@@ -90,20 +87,28 @@ def option(parameter: Parameter) -> Any:
     return Annotated[kind | None if parameter.optional else kind, decorated]
 
 
+def _argument(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _declared(parameters: Iterable[Parameter]) -> list[inspect.Parameter]:
+    return [_argument(p.name, option(p), option_value(p, p.default)) for p in parameters]
+
+
 def signature(edit: Edit) -> inspect.Signature:
     """The arguments of the command of an edit."""
-    found: list[tuple[str, Any, Any]] = [
-        ("source", options.Source, inspect.Parameter.empty),
-        ("target", options.Target, inspect.Parameter.empty),
-        *((name, annotation, None) for name, annotation in SCRIBBLES.get(edit.name, {}).items()),
-        *((p.name, option(p), option_value(p, p.default)) for p in edit if p.is_option),
-        ("depth", options.OutputDepth, None),
-        ("seed", options.Seed, 0),
-        ("memory", options.Memory, None),
-        ("full", options.Full, False),
-    ]
-    kind = inspect.Parameter.KEYWORD_ONLY
-    return inspect.Signature([inspect.Parameter(n, kind, default=d, annotation=a) for n, a, d in found])
+    return inspect.Signature(
+        [
+            _argument("source", options.Source, inspect.Parameter.empty),
+            _argument("target", options.Target, inspect.Parameter.empty),
+            *(_argument(name, annotation, None) for name, annotation in SCRIBBLES.get(edit.name, {}).items()),
+            *_declared(p for p in edit if p.is_option),
+            _argument("depth", options.OutputDepth, None),
+            _argument("seed", options.Seed, 0),
+            _argument("memory", options.Memory, None),
+            _argument("full", options.Full, False),
+        ]
+    )
 
 
 def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -111,10 +116,8 @@ def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., N
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         own = [p for p in inspect.signature(function, eval_str=True).parameters.values() if p.kind != p.VAR_KEYWORD]
-        declared = [(p.name, option(p), option_value(p, p.default)) for p in map(EDITS["detail"].__getitem__, names)]
-        kind = inspect.Parameter.KEYWORD_ONLY
-        more = [inspect.Parameter(name, kind, default=value, annotation=note) for name, note, value in declared]
-        signature = inspect.Signature([*(p.replace(kind=kind) for p in own), *more])
+        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+        signature = inspect.Signature([*own, *_declared(EDITS["detail"][name] for name in names)])
         setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
         return function
 
@@ -163,23 +166,31 @@ def edit_photograph(
     edit = EDITS[name]
     step = step_of(edit, given)
 
+    from contextlib import ExitStack
+
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, scribble_rows, scribbles
+    from nlfilter_torch.cli import editing, scribbles
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
     from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.io.rows import open_picture
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture, Rows
 
     def work(photograph: Photograph) -> Tensor:
         check_channels(name, photograph.pixels.shape[1])
-        return apply_to(step, photograph.pixels, *scribbles.of_edit(step, photograph, given), generator=seeded(seed))
+        with ExitStack() as files:
+            free = editing.allowed_memory(memory)
+            drawn = scribbles.of_edit(
+                step, photograph.size, given, lambda path: files.enter_context(open_picture(path, free))
+            )
+            return apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
 
     def by_rows(job: Job) -> Rows:
         check_channels(name, job.picture.shape[2])
         tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
-        drawn = scribble_rows.of_edit(step, job, given)
+        drawn = scribbles.of_edit(step, job.size, given, job.open)
         yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
 
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))

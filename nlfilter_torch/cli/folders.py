@@ -54,17 +54,17 @@ class Tally:
         self.left += other.left
 
 
-def pictures(folder: Path) -> list[Path]:
+def pictures(folder: Path, what: str = "photographs") -> list[Path]:
     """The image files of a folder, by name.
 
     Raises:
-        ValueError: if it is no folder, or has no image files.
+        ValueError: if it is no folder, or has no image files; the message calls them ``what``.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder} is no folder; name the one that holds the photographs")
+        raise ValueError(f"{folder} is no folder; name the one that holds the {what}")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not paths:
-        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF or WebP file; put the photographs there")
+        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF or WebP file; put the {what} there")
     return paths
 
 

@@ -8,7 +8,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import PresetName, step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
 
 Frames = Annotated[
     Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
@@ -48,11 +48,13 @@ def frames(
 
     import torch
 
+    from nlfilter_torch.cli.folders import pictures
     from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.edits.frames import filter_frames
     from nlfilter_torch.io.photographs import Photograph, check_folder, check_output, read_photograph, write_photograph
 
-    paths = _pictures(folder)
+    paths = pictures(folder, "frames")
     if target.exists() and target.resolve() == folder.resolve():
         raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
     check_folder(target)
@@ -75,22 +77,10 @@ def frames(
             references=samples,
             residual=step["residual"],
             channels=step["channels"],
-            **{name: value for name, value in step.arguments((0, 0)).items() if name in FILTER},
-            generator=torch.Generator().manual_seed(seed),
+            **step.filter_options(),
+            generator=seeded(seed),
         )
         target.mkdir(exist_ok=True)
         for path, pixels in zip(paths, edited, strict=True):
             write_photograph(films[0].with_pixels(pixels), target / path.name)
     typer.echo(f"{len(paths)} frames in {target}")
-
-
-def _pictures(folder: Path) -> list[Path]:
-    """The image files of a folder, by name."""
-    from nlfilter_torch.io.photographs import SUFFIXES
-
-    if not folder.is_dir():
-        raise ValueError(f"{folder} is no folder; name the one that holds the frames")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF or WebP file; put the frames there")
-    return paths

@@ -10,7 +10,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -84,8 +84,7 @@ def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOpe
     from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.operator.build import nonlocal_operator
 
-    parameters = {name: value for name, value in step.arguments((0, 0)).items() if name in FILTER}
-    return nonlocal_operator(guide, **parameters, generator=seeded(seed))
+    return nonlocal_operator(guide, **step.filter_options(), generator=seeded(seed))
 
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:

@@ -1,19 +1,24 @@
-"""Scribbles, masks and rectangles on a photograph, from the options of a command."""
+"""Scribbles, masks and rectangles on a photograph, from the options of a command, as rows."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph
+from nlfilter_torch.io.rows import StoredPicture
+from nlfilter_torch.tiled.sources import Picture, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
+Open = Callable[[Path], StoredPicture]  # reads a picture over it
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -48,57 +53,103 @@ class Rectangle:
         return Rectangle(slice(y, y + height), slice(x, x + width), note if colon else None)
 
 
-def of_edit(
-    step: Step, photograph: Photograph, given: Mapping[str, Any]
-) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
-    """Scribbles and masks from the options of an edit, in the form of :func:`scribbles_of`."""
-    size, mask, regions = photograph.size, given.get("mask"), given.get("region")
+@dataclass(frozen=True)
+class Overlay:
+    """What lies over a photograph: a picture of its size, and rectangles on top. Rows (h, W, S).
+
+    Attributes:
+        shape: (H, W, S).
+        picture: or None.
+        rectangles: the channels that each sets, and to what.
+    """
+
+    shape: tuple[int, int, int]
+    picture: Picture | None
+    rectangles: list[tuple[Rectangle, slice, list[float]]]
+    dtype = np.dtype(np.float32)
+    marks: ClassVar[int]  # the channel of the picture that is 0 where it says nothing
+    nothing: ClassVar[str]  # end of the sentence for a picture that says nothing
+
+    def _of_picture(self, rows: slice, picture: Picture) -> Floats:
+        raise NotImplementedError
+
+    def __getitem__(self, rows: slice) -> Floats:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        found = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        if self.picture is not None:
+            found = self._of_picture(rows, self.picture)
+        for rectangle, channels, values in self.rectangles:
+            top, bottom = (max(row - rows.start, 0) for row in (rectangle.rows.start, rectangle.rows.stop))
+            found[top:bottom, rectangle.columns, channels] = values
+        return found
+
+    def at_once(self) -> Tensor:
+        """All rows, as planes (1, S, H, W).
+
+        Raises:
+            ValueError: if there is a picture that says nothing.
+        """
+        rows = slice(0, self.shape[0])
+        if self.picture is not None and not self._of_picture(rows, self.picture)[..., self.marks].any():
+            raise ValueError(f"{self.picture.name} is {self.nothing}")
+        return torch.from_numpy(self[rows]).permute(2, 0, 1)[None].contiguous()
+
+
+class Regions(Overlay):
+    """Weights of regions, the first of them in the picture."""
+
+    marks, nothing = 0, "black everywhere; paint white what is to be selected"
+
+    def _of_picture(self, rows: slice, picture: Picture) -> Floats:
+        weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        weights[..., 0] = picture.tile(rows.start, rows.stop, 0).pixels.float().mean(1)[0].clamp(0, 1)
+        return weights
+
+
+class Strokes(Overlay):
+    """Colours in RGB and their mask, in four channels."""
+
+    marks, nothing = 3, "transparent everywhere; paint at least one stroke"
+
+    def _of_picture(self, rows: slice, picture: Picture) -> Floats:
+        tile = picture.tile(rows.start, rows.stop, 0)
+        colours = tile.pixels[0].expand(3, -1, -1).permute(1, 2, 0)  # a grey picture gives its value to all three
+        return np.concatenate([colours.to(torch.float32), transparency(tile, "float32")], axis=2)
+
+
+def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Scribbles and masks from the options of an edit, in the form of :func:`scribbles_of`, as rows."""
+    mask, regions = given.get("mask"), given.get("region")
     if step.edit in ("recolor", "colorize"):
-        keep = selection(size, None, given.get("keep"), "--keep")
-        strokes = colour_strokes(size, given.get("strokes"), regions)
-        return strokes, {} if keep is None else {"keep": keep}
+        keep = _selection(size, None, given.get("keep"), "--keep", read)
+        strokes = _strokes(size, given.get("strokes"), regions, read)
+        return (strokes, None), {} if keep is None else {"keep": keep}
     if step.edit == "defocus":
-        focus = selection(size, mask, regions, "--region")
+        focus = _selection(size, mask, regions, "--region", read)
         if focus is None:
-            raise unfocused()
+            raise ValueError(
+                "give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60"
+            )
         return (focus,), {}
     if step.edit != "detail" or (mask is None and not regions):
         return (), {}
-    masks, sliders = slider_regions(size, mask, regions, torch.tensor(step["alpha"]))
+    masks, sliders = _slider_regions(size, mask, regions, torch.tensor(step["alpha"]), read)
     return (masks,), {"alpha": sliders}
 
 
-def unfocused() -> ValueError:
-    """What to raise where nothing is to stay sharp."""
-    return ValueError("give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60")
+def at_once(scribbles: tuple[Any, ...], named: dict[str, Any]) -> tuple[tuple[Tensor, ...], dict[str, Any]]:
+    """What :func:`of_edit` gives as tensors."""
+    planes = [rows.at_once() for rows in scribbles if rows is not None]
+    if scribbles and isinstance(scribbles[0], Strokes):
+        planes = list(planes[0].split([3, 1], dim=1))
+    return tuple(planes), {name: v.at_once() if isinstance(v, Overlay) else v for name, v in named.items()}
 
 
-def colour_strokes(size: Size, path: Path | None, regions: list[str] | None) -> tuple[Tensor, Tensor]:
-    """Scribbles (1, 3, H, W) and their mask (1, 1, H, W) from ``--strokes`` and ``--region``."""
-    check_strokes(path, regions)
-    strokes, painted = torch.zeros(1, 3, *size), torch.zeros(1, 1, *size)
-    if path is not None:
-        painting = _read(path, size)
-        if painting.alpha is None:
-            raise opaque(path)
-        if not bool((painting.alpha > 0).any()):
-            raise ValueError(f"{path} is transparent everywhere; paint at least one stroke")
-        strokes, painted = painting.pixels.float().expand(-1, 3, -1, -1).clone(), painting.alpha.float().clone()
-    for rectangle, colour in coloured_rectangles(size, regions):
-        strokes[0, :, rectangle.rows, rectangle.columns] = colour[:, None, None]
-        painted[..., rectangle.rows, rectangle.columns] = 1
-    return strokes, painted
-
-
-def check_strokes(path: Path | None, regions: list[str] | None) -> None:
-    """Raise unless there is ``--strokes`` or ``--region``."""
+def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Open) -> Strokes:
+    """From ``--strokes`` and ``--region``."""
     if path is None and not regions:
         raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
-
-
-def coloured_rectangles(size: Size, regions: list[str] | None) -> list[tuple[Rectangle, Tensor]]:
-    """Rectangles of ``--region`` and their RGB colours (3,)."""
-    found = []
+    rectangles = []
     for text in regions or []:
         rectangle = Rectangle.parse(text, "--region", size)
         if rectangle.note is None:
@@ -110,80 +161,55 @@ def coloured_rectangles(size: Size, regions: list[str] | None) -> list[tuple[Rec
                 "--region must end in a colour, such as red, #c04020 or rgb(192,64,32), "
                 f"got {rectangle.note!r} in {text!r}"
             ) from None
-        found.append((rectangle, torch.tensor(colour) / 255))
-    return found
+        rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
+    return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles)
 
 
-def selection(size: Size, path: Path | None, regions: list[str] | None, option: str) -> Tensor | None:
-    """A mask (1, 1, H, W) from a mask file and the rectangles of an option, or None if neither is given."""
-    if path is None and not regions:
-        return None
-    mask = torch.zeros(1, 1, *size) if path is None else _read_mask(path, size)
-    for rectangle in plain_rectangles(size, regions, option):
-        mask[..., rectangle.rows, rectangle.columns] = 1
-    return mask
-
-
-def plain_rectangles(size: Size, regions: list[str] | None, option: str) -> list[Rectangle]:
-    """Rectangles of an option that takes nothing after them."""
-    found = []
-    for text in regions or []:
-        found.append(Rectangle.parse(text, option, size))
-        if found[-1].note is not None:
+def _selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
+    """A single region from a mask file and the rectangles of an option, or None if neither is given."""
+    rectangles = []
+    for text in texts or []:
+        rectangle = Rectangle.parse(text, option, size)
+        if rectangle.note is not None:
             raise ValueError(f"{option} must be X,Y,W,H alone here, got {text!r}; leave out what follows the colon")
-    return found
+        rectangles.append((rectangle, slice(None), [1.0]))
+    return None if path is None and not rectangles else Regions((*size, 1), _picture(size, path, read), rectangles)
 
 
-def slider_regions(size: Size, path: Path | None, regions: list[str] | None, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Regions (1, K, H, W) and their sliders (K, k+1) from ``--mask`` and ``--region``, at least one of them given.
+def _slider_regions(
+    size: Size, path: Path | None, texts: list[str] | None, alpha: Tensor, read: Open
+) -> tuple[Regions, Tensor]:
+    """K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, at least one of them given.
 
     A mask, and a rectangle without its own sliders, has the sliders ``alpha`` (k+1,).
     """
-    masks, sliders = ([], []) if path is None else ([_read_mask(path, size)], [alpha])
-    for text in regions or []:
-        rectangle, own = with_sliders(text, size, alpha)
-        masks.append(torch.zeros(1, 1, *size))
-        masks[-1][..., rectangle.rows, rectangle.columns] = 1
+    rectangles, sliders = [], [] if path is None else [alpha]
+    for text in texts or []:
+        rectangle = Rectangle.parse(text, "--region", size)
+        own = alpha if rectangle.note is None else torch.tensor(parse_sliders(rectangle.note, "--region"))
+        if len(own) != len(alpha):
+            raise ValueError(
+                f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
+                "repeat or drop some"
+            )
+        rectangles.append((rectangle, slice(len(sliders), len(sliders) + 1), [1.0]))
         sliders.append(own)
-    return torch.cat(masks, dim=1), torch.stack(sliders)
+    return Regions((*size, len(sliders)), _picture(size, path, read), rectangles), torch.stack(sliders)
 
 
-def with_sliders(text: str, size: Size, alpha: Tensor) -> tuple[Rectangle, Tensor]:
-    """A rectangle of ``--region`` and its sliders (k+1,)."""
-    rectangle = Rectangle.parse(text, "--region", size)
-    own = alpha if rectangle.note is None else torch.tensor(parse_sliders(rectangle.note, "--region"))
-    if len(own) != len(alpha):
-        raise ValueError(
-            f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
-            "repeat or drop some"
-        )
-    return rectangle, own
-
-
-def _read_mask(path: Path, size: Size) -> Tensor:
-    mask = _read(path, size).pixels.float().mean(1, keepdim=True).clamp(0, 1)
-    if not bool((mask > 0).any()):
-        raise ValueError(f"{path} is black everywhere; paint white what is to be selected")
-    return mask
-
-
-def _read(path: Path, size: Size) -> Photograph:
-    picture = read_photograph(path)
-    check_size(path, picture.size, size)
-    return picture
-
-
-def check_size(path: Path, found: Size, size: Size) -> None:
-    """Raise unless a picture over a photograph of ``size`` has its height and width."""
+def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = False) -> Picture | None:
+    """A picture over a photograph of ``size``; raises unless it has that size and the transparency it needs."""
+    if path is None:
+        return None
+    stored = read(path)
+    found = stored.shape[:2]
     if found != size:
         raise ValueError(
             f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize one"
         )
-
-
-def opaque(path: Path) -> ValueError:
-    """The error for a picture of scribbles without transparency."""
-    return ValueError(
-        f"{path} has no transparency, so that every pixel of it would be a stroke; "
-        "paint on a transparent layer and save that"
-    )
+    if transparent and not stored.alpha:
+        raise ValueError(
+            f"{path} has no transparency, so that every pixel of it would be a stroke; "
+            "paint on a transparent layer and save that"
+        )
+    return Picture(stored.rows, str(path))

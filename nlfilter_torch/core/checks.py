@@ -24,6 +24,15 @@ LARGEST_EIGENVALUE = 1e6
 LEAST_WEIGHT = 1e-6  # of a point; its inverse is the largest, beyond which sums in float32 lose the others
 FAR_OUTSIDE = 16.0  # above the values of HDR pictures with white at 1, below those of 8-bit pictures
 
+#: Of the finite numbers that an argument may be: what they are, whether a number is one, and what to do otherwise.
+DOMAINS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
+    "positive": ("positive and finite", lambda v: v > 0, "pass a positive number"),
+    "not negative": ("at least 0 and finite", lambda v: v >= 0, "pass 0 or more"),
+    "share": ("in [0, 1]", lambda v: (v >= 0) & (v <= 1), "clamp it"),
+    "below 1": ("in [0, 1)", lambda v: (v >= 0) & (v < 1), "clamp it"),
+    "finite": ("finite", lambda v: v == v, "1.0 changes nothing"),
+}
+
 
 def check_tensor(value: object, name: str, remedy: str = "convert it with torch.tensor") -> None:
     """Raise unless ``value`` is a tensor."""
@@ -152,33 +161,32 @@ def check_number(value: object, name: str, remedy: str = "pass a float") -> None
 
 
 def check_positive(value: float | Tensor, name: str, batch: int | None = None) -> None:
-    """Raise unless ``value`` is positive and finite; see :func:`_check_values`."""
-    _check_values(value, name, batch, "positive and finite", lambda v: v > 0, "pass a positive number")
+    """Raise unless ``value`` is positive and finite; see :func:`check_values`."""
+    check_values(value, name, "positive", batch)
 
 
 def check_not_negative(value: float | Tensor, name: str, remedy: str, batch: int | None = None) -> None:
-    """Raise unless ``value`` is at least 0 and finite; see :func:`_check_values`."""
-    _check_values(value, name, batch, "at least 0 and finite", lambda v: v >= 0, remedy)
+    """Raise unless ``value`` is at least 0 and finite; see :func:`check_values`."""
+    check_values(value, name, "not negative", batch, remedy)
 
 
 def check_weight(value: float | Tensor, name: str, batch: int | None = None) -> None:
-    """Raise unless ``value`` is finite; see :func:`_check_values`."""
-    _check_values(value, name, batch, "finite", lambda v: v == v, "1.0 changes nothing")
+    """Raise unless ``value`` is finite; see :func:`check_values`."""
+    check_values(value, name, "finite", batch)
 
 
 def check_share(value: float | Tensor, name: str, batch: int | None = None, *, below: bool = False) -> None:
-    """Raise unless ``value`` is in [0, 1], or in [0, 1) where ``below``; see :func:`_check_values`."""
-    inside = (lambda v: (v >= 0) & (v < 1)) if below else (lambda v: (v >= 0) & (v <= 1))
-    _check_values(value, name, batch, f"in [0, 1{')' if below else ']'}", inside, "clamp it")
+    """Raise unless ``value`` is in [0, 1], or in [0, 1) where ``below``; see :func:`check_values`."""
+    check_values(value, name, "below 1" if below else "share", batch)
 
 
-def _check_values(
-    value: object, name: str, batch: int | None, wanted: str, inside: Callable[[Any], Any], remedy: str
-) -> None:
-    """Raise unless ``value`` is a finite number ``inside`` a range, or a tensor of them of shape () or (batch,).
+def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:
+    """Raise unless ``value`` is a number in one of :data:`DOMAINS`, or a tensor of them of shape () or (batch,).
 
     The values of a tensor are checked where :func:`check_finite` checks them.
     """
+    wanted, inside, usual = DOMAINS[domain]
+    remedy = remedy or usual
     if not isinstance(value, Tensor):
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number")

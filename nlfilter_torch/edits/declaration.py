@@ -193,20 +193,13 @@ class Parameter:
             return
         if self.domain == "choice":
             checks.check_choice(value, name, self.choices)
-            return
-        if self.domain == "count":
+        elif self.domain == "count":
             checks.check_count(value, name, least=int(self.low), most=int(self.high))
-            return
-        if batch is None:
-            checks.check_number(value, name, "pass a float or None" if self.unit == "%" else "pass a float")
-        if self.domain == "positive":
-            checks.check_positive(value, name, batch)
-        elif self.domain == "not negative":
-            checks.check_not_negative(value, name, self.zero, batch)
-        elif self.domain in ("share", "below 1"):
-            checks.check_share(value, name, batch, below=self.domain == "below 1")
-        elif self.domain == "finite":
-            checks.check_weight(value, name, batch)
+        else:
+            if batch is None:
+                checks.check_number(value, name, "pass a float or None" if self.unit == "%" else "pass a float")
+            if self.domain is not None:
+                checks.check_values(value, name, self.domain, batch, self.zero)
 
 
 @dataclass(frozen=True)

@@ -225,7 +225,10 @@ class InMemory:
         for tensor, called, channels in named:
             check_image(tensor, called, channels=channels, batch=self.batch)
             check_same_size(tensor, self.size, called, "image")
-        (check_painted if needed else check_unit_range)(mask, name)
+        if needed:
+            check_painted(mask, name)
+        else:
+            check_unit_range(mask, name)
         weights = mask.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)
         some = torch.ones_like(weights[0, 0], dtype=torch.bool)
         if not weights.requires_grad:  # pixels of weight 0 matter only to the derivative by the weights

@@ -80,19 +80,13 @@ class FittedFilter:
         residual: float | Tensor | None = None,
         origin: tuple[int, int] = (0, 0),
         halo: tuple[int, int] = (0, 0),
-        by_rows: bool = False,
     ) -> Tensor:
-        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`.
-
-        ``by_rows`` computes one row after the other, so that rounding, which depends on the shape of a product, is the
-        same for tiles of any height.
-        """
-        check_instance(by_rows, bool, "by_rows", "pass True or False")
+        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`."""
         check_tensor(image, "image", "convert it with torch.as_tensor")
         check_alpha(alpha)
         if residual is not None:
             check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
-        planes = self._planes(image, guide, origin, halo, by_rows=by_rows, with_residual=residual is not None)
+        planes = self._planes(image, guide, origin, halo, with_residual=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
         if residual is not None:
@@ -106,7 +100,6 @@ class FittedFilter:
         origin: tuple[int, int],
         halo: tuple[int, int],
         *,
-        by_rows: bool = False,
         with_residual: bool = False,
     ) -> Tensor:
         """Layers (B, k+1, C, H, W), with the residual and r as two more if asked for, in the kernel's dtype."""
@@ -124,24 +117,15 @@ class FittedFilter:
         batch = (image.shape[0], -1, -1)
         landmarks, inverse = (matrix.expand(batch) for matrix in (self.kernel.landmarks, self.kernel.inverse_cholesky))
         kernel = replace(self.kernel, landmarks=landmarks, inverse_cholesky=inverse)
-        features = kernel.recipe(image if guide is None else guide, origin=origin, halo=halo)
-        image = _without(image, halo)
-        size = (image.shape[-2], image.shape[-1])
-        step = size[1] if by_rows else features.shape[2]
-        parts = zip(features.split(step, dim=2), image.to(features).flatten(2).split(step, dim=2), strict=True)
-        planes = [self._split(kernel, *part, with_residual=with_residual) for part in parts]
-        return torch.cat(planes, dim=-1).unflatten(-1, size)
-
-    def _split(self, kernel: Kernel, features: Tensor, image: Tensor, *, with_residual: bool) -> Tensor:
-        """The same (B, k+1 or k+3, C, n) of pixels (B, C, n) with features (B, D, n)."""
-        factor, diagonal = kernel.factor(features)
+        factor, diagonal = kernel.factor(kernel.recipe(image if guide is None else guide, origin=origin, halo=halo))
         columns = Columns(factor, *self.balancing(factor, diagonal))
-        layers = layers_of_columns(columns, self.moments, image)
-        if not with_residual:
-            return layers
-        captured = spread(self.captured.to(factor).mT, factor, columns.scaling)
-        share = columns.remainder.unsqueeze(1).expand_as(image)
-        return torch.cat([layers, torch.stack([image - captured, share], dim=1)], dim=1)
+        pixels = image[..., halo[0] : size[0] - halo[1], :].to(factor).flatten(2)
+        planes = layers_of_columns(columns, self.moments, pixels)
+        if with_residual:
+            captured = spread(self.captured.to(factor).mT, factor, columns.scaling)
+            share = columns.remainder.unsqueeze(1).expand_as(pixels)
+            planes = torch.cat([planes, torch.stack([pixels - captured, share], dim=1)], dim=1)
+        return planes.unflatten(-1, (-1, size[1]))
 
 
 def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:
@@ -158,11 +142,6 @@ def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> 
     for affinity in affinities.unbind(1):  # one for each power of W
         smoothed.append(torch.addcmul(affinity, remainder, smoothed[-1]))
     return layers_between(torch.stack(smoothed, dim=1))
-
-
-def _without(image: Tensor, halo: tuple[int, int]) -> Tensor:
-    """The rows of an image without its halo."""
-    return image[..., halo[0] : image.shape[-2] - halo[1], :]
 
 
 @full_precision

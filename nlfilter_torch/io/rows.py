@@ -45,7 +45,7 @@ class StoredPicture:
     Attributes:
         rows: upright, (H, W, S) or (H, W).
         alpha: whether the last channel is transparency.
-        held: bytes that are cached in memory while it is read.
+        cached: bytes that stay in memory while it is read.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
         attributes: of a zarr array.
@@ -53,7 +53,7 @@ class StoredPicture:
 
     rows: RowSource
     alpha: bool
-    held: int
+    cached: int
     icc: bytes | None = None
     exif: bytes | None = None
     attributes: dict[str, Any] | None = None
@@ -98,9 +98,9 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
         else:
             channels, icc, exif = read_channels(path, bytes_per_pixel=CODED, memory=memory)
             stored = StoredPicture(channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif)
-        if stored.held > memory:
+        if stored.cached > memory:
             raise MemoryError(
-                f"{path} can only be read in pieces of {stored.held / 1e6:.0f} MB, but {memory / 1e6:.0f} MB may be "
+                f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but {memory / 1e6:.0f} MB may be "
                 "used; save it in tiles, or allow more"
             )
         yield stored
@@ -153,7 +153,7 @@ def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     with tiff.decoding(path):
         rows = stack.enter_context(TiffRows(path))
     source: RowSource = _turn(rows, stack) if rows.turned else rows
-    return StoredPicture(source, rows.alpha, rows.held, rows.icc, rows.exif)
+    return StoredPicture(source, rows.alpha, rows.cached, rows.icc, rows.exif)
 
 
 def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
@@ -214,8 +214,8 @@ def _open_zarr(path: Path) -> StoredPicture:
         )
     alpha = len(rows.shape) == 3 and rows.shape[2] in (2, 4)
     chunk = (*rows.array.chunks[:1], *rows.shape[1:])
-    held = 2 * math.prod(chunk) * rows.dtype.itemsize
-    return StoredPicture(rows, alpha, held, attributes=dict(rows.array.attrs))
+    cached = 2 * math.prod(chunk) * rows.dtype.itemsize
+    return StoredPicture(rows, alpha, cached, attributes=dict(rows.array.attrs))
 
 
 def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:

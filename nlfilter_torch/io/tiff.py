@@ -283,7 +283,7 @@ class TiffRows:
         return self.orientation >= 5
 
     @property
-    def held(self) -> int:
+    def cached(self) -> int:
         """Bytes of decoded strips or tiles that are cached while rows are read."""
         return 0 if self._raw else (KEPT + 1) * self.segment[0] * self.shape[1] * self.shape[2] * self.dtype.itemsize
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.communicator import check_group
 from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
-from nlfilter_torch.operator.build import check_options, nonlocal_operator
+from nlfilter_torch.operator.build import Construction, nonlocal_operator
 from nlfilter_torch.operator.features import GuideChannels, unit_window
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
@@ -63,14 +63,8 @@ class NonlocalAffinity(Learnable):
     ) -> None:
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))
-        check_options(
-            num_landmarks=num_landmarks,
-            landmarks=landmarks,
-            completion=completion,
-            guide_channels=guide_channels,
-            tolerance=tolerance,
-            generator=generator,
-        )
+        check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+        Construction(num_landmarks, landmarks, completion, tolerance, generator)  # checks them
         check_group(group)
         window = unit_window(patch_size, patch_weights)
         self.patch_size = patch_size

@@ -1,11 +1,10 @@
 """Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
 The scaling of a completed kernel comes from :mod:`~nlfilter_torch.operator.newton`, that of any other from
-:mod:`~nlfilter_torch.operator.chebyshev`. On processors, :mod:`~nlfilter_torch.operator.damped_newton` continues where
-these do not converge. The gradient is implicit and the same for all methods.
+:mod:`~nlfilter_torch.operator.chebyshev`. On processors, damped steps of Newton's method continue where these do not
+converge. The gradient is implicit and the same for all methods.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,34 +14,14 @@ from nlfilter_torch.core.autograd import once_differentiable, outer_product
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.operator import chebyshev, newton
-from nlfilter_torch.operator.conjugate_gradients import conjugate_gradients
-from nlfilter_torch.operator.damped_newton import damped
-from nlfilter_torch.operator.scaling import moment_of
+from nlfilter_torch.operator.scaling import Balancing, KernelMatrix
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = {
     torch.float32: 1e-4,
     torch.float64: 1e-9,
 }  # larger residuals raise a warning, unless the tolerance allows them
-
-
-@dataclass(frozen=True)
-class Balancing:
-    """Result of :func:`balance`.
-
-    Attributes:
-        scaling: d, (B, N), positive; differentiable in factor and diagonal.
-        moment: ``factor @ d``, (B, M, 1) in float64, without a gradient.
-        residual: largest deviation of a row sum of W from 1, (B,).
-        steps: number of sweeps over the factor.
-    """
-
-    scaling: Tensor
-    moment: Tensor
-    residual: Tensor
-    steps: int
 
 
 def balance(
@@ -109,15 +88,15 @@ class _Balance(torch.autograd.Function):
         among: Communicator,
         weights: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, int]:
-        solve = newton.solve if completed else chebyshev.solve
-        found = solve(factor, diagonal, tolerance, among, weights)
+        matrix = KernelMatrix(factor, diagonal, weights, among)
+        found = newton.solve(matrix, tolerance) if completed else chebyshev.solve(matrix, tolerance)
         goal = attainable(factor, tolerance, among)
         if factor.device.type == "cpu" and not bool((found.residual <= goal).all()):
-            found = damped(factor, diagonal, found, goal, among, weights)
+            found = newton.damped(matrix, found, goal)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
         ctx.among, ctx.completed = among, completed
         ctx.mark_non_differentiable(found.moment, found.residual)
-        return found.scaling, found.moment, found.residual, found.sweeps
+        return found.scaling, found.moment, found.residual, found.steps
 
     @staticmethod
     @once_differentiable
@@ -128,9 +107,10 @@ class _Balance(torch.autograd.Function):
             factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
         share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
         weight = scaling.square() * share
-        right = moment_of(factor, weight * grad, ctx.among, None)
-        solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, ctx.among)
-        affinity = weighted(spread(solution.to(factor).mT, factor).squeeze(1), weights)
+        matrix = KernelMatrix(factor, diagonal, None, ctx.among)
+        right = matrix.moment(weight * grad)
+        solution = newton.conjugate_gradients(factor, weighted(weight, weights), right, inverse, ctx.among)
+        affinity = weighted(matrix.affinities(solution), weights)
         a = scaling * scaling * share * (grad - affinity)
         totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
         grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))

@@ -1,6 +1,6 @@
 """Guide, or features, to operator: landmarks, Nystrom factor, completion, balancing. Paper: Sec. II."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -27,38 +27,39 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.compilation import uncompiled
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.operator.balancing import Balancing, balance, warn_of_residual
+from nlfilter_torch.operator.balancing import balance, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.scaling import PixelScaling, isolated, moment_of, row_sums
+from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling, isolated
 
 ROUNDS = 8  # most rounds in which isolated pixels are removed; one or two are usual
 
 
-def check_options(
-    *,
-    num_landmarks: int,
-    landmarks: str,
-    completion: str,
-    tolerance: float | None,
-    generator: torch.Generator | None,
-    guide_channels: str = "all",
-) -> None:
-    """Check the options of :func:`nonlocal_operator` that do not depend on its guide."""
-    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    remedy = "choose one of these, and pass how many there are as num_landmarks"
-    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
-    check_choice(completion, "completion", ("diagonal", "none"))
-    check_count(num_landmarks, "num_landmarks")
-    if tolerance is not None:
-        check_number(tolerance, "tolerance", "pass a float or None")
-        check_positive(tolerance, "tolerance")
-    if generator is not None:
-        check_instance(generator, torch.Generator, "generator", "make one with torch.Generator()")
+@dataclass(frozen=True)
+class Construction:
+    """How an operator is made from features: options of :func:`nonlocal_operator`, which are checked."""
+
+    num_landmarks: int
+    landmarks: Sampling
+    completion: Completion
+    tolerance: float | None
+    generator: torch.Generator | None
+
+    def __post_init__(self) -> None:
+        """Raise unless each option is as the documentation has it."""
+        remedy = "choose one of these, and pass how many there are as num_landmarks"
+        check_choice(self.landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
+        check_choice(self.completion, "completion", ("diagonal", "none"))
+        check_count(self.num_landmarks, "num_landmarks")
+        if self.tolerance is not None:
+            check_number(self.tolerance, "tolerance", "pass a float or None")
+            check_positive(self.tolerance, "tolerance")
+        if self.generator is not None:
+            check_instance(self.generator, torch.Generator, "generator", "make one with torch.Generator()")
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:
@@ -130,14 +131,8 @@ def nonlocal_operator(
         True
     """
     check_image(guide, "guide")
-    check_options(
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        tolerance=tolerance,
-        generator=generator,
-    )
+    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
+    method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
     if isinstance(photometric_bandwidth, str):
         check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
     else:
@@ -163,17 +158,8 @@ def nonlocal_operator(
         check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial_bandwidth = among.copy_to_group(spatial_bandwidth)
     recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
-    return assemble(
-        recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo),
-        size,
-        recipe=recipe,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        tolerance=tolerance,
-        generator=generator,
-        among=among,
-    )
+    features = recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo)
+    return _assemble(features, size, method, recipe=recipe, among=among)
 
 
 @uncompiled
@@ -222,57 +208,34 @@ def operator_from_features(
         True
     """
     check_features(features, "features")
-    check_options(
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        tolerance=tolerance,
-        generator=generator,
-    )
+    method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
     shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
     among = all_gather_shapes(features.unflatten(2, shape), group)
-    return assemble(
-        features,
-        shape,
-        weights=weights,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        tolerance=tolerance,
-        generator=generator,
-        among=among,
-    )
+    return _assemble(features, shape, method, weights=weights, among=among)
 
 
-def assemble(
+def _assemble(
     features: Tensor,
     size: tuple[int, int],
+    method: Construction,
     *,
-    num_landmarks: int,
-    landmarks: Sampling,
-    completion: Completion,
-    tolerance: float | None,
-    generator: torch.Generator | None,
     recipe: GuideFeatures | None = None,
     weights: Tensor | None = None,
     among: Communicator = ALONE,
 ) -> NonlocalOperator:
     """Features (B, D, N) to operator; ``recipe`` says how they were computed, if they come from a guide."""
     whole = among.whole(size)
-    points = whole[0] * whole[1]
-    if num_landmarks > points:
-        warn(
-            f"num_landmarks must be at most the number of pixels, {points}, got {described(num_landmarks)}; "
-            "using every pixel"
-        )
-        num_landmarks = points
-    chosen = choose_landmarks(features, whole, num_landmarks, landmarks, generator, among, weights)
-    kernel = Kernel(chosen, inverse_cholesky(chosen), completion, features=recipe)
+    points, count, tolerance = whole[0] * whole[1], method.num_landmarks, method.tolerance
+    if count > points:
+        warn(f"num_landmarks must be at most the number of pixels, {points}, got {described(count)}; using every pixel")
+        count = points
+    chosen = choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
+    kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
-    completed, watched = completion == "diagonal", factor.device.type == "cpu"
+    completed, watched = method.completion == "diagonal", factor.device.type == "cpu"
 
     def balanced() -> tuple[Balancing, float]:
         found = balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
@@ -291,11 +254,13 @@ def assemble(
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, among)
     allowed = slack(factor.dtype, worst)
-    if watched and is_bounded(landmarks, points, num_landmarks) and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, moment_of(factor, scaling, among, weights), allowed)
+    if watched and is_bounded(method.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
+        limit = limiter(gram, KernelMatrix(factor, diagonal, weights, among).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
-        residual = _residual(factor.detach(), diagonal.detach(), scaling.detach(), among, weights)
+        limited = KernelMatrix(factor.detach(), diagonal.detach(), weights, among)
+        sums = limited.row_sums(scaling.detach(), limited.moment(scaling.detach()))
+        residual = among.max((sums - 1).abs().amax(1))
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     return NonlocalOperator(
         factor=factor,
@@ -310,9 +275,3 @@ def assemble(
         weights=weights,
         among=among,
     )
-
-
-def _residual(factor: Tensor, diagonal: Tensor, scaling: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
-    """Largest deviation of a row sum from 1, (B,)."""
-    sums = row_sums(factor, diagonal, scaling, moment_of(factor, scaling, among, weights))
-    return among.max((sums - 1).abs().amax(1))

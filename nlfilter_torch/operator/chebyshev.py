@@ -9,12 +9,10 @@ large, is balanced this way.
 from collections.abc import Iterator
 
 import torch
-from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
-from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
-from nlfilter_torch.operator.scaling import Solution, moment_of
+from nlfilter_torch.operator.scaling import KernelMatrix, Solution
 
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # reading the residual would stall the queue of an accelerator
@@ -35,18 +33,12 @@ def _weights(low: float, high: float) -> Iterator[tuple[float, float]]:
         yield rho * previous, 2 * rho / radius
 
 
-def _start(factor: Tensor, diagonal: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
-    """A first guess of d (B, N): ``(K 1)^(-1/2)``."""
-    total = moment_of(factor, torch.ones_like(diagonal), among, weights).to(factor)
-    return (spread(total.mT, factor).squeeze(1) + diagonal).clamp(min=SMALLEST_SUM).rsqrt()
-
-
-def solve(
-    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator = ALONE, weights: Tensor | None = None
-) -> Solution:
+def solve(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Balance any kernel; on processors until the residual is at most ``tolerance`` or stalls."""
-    scaling = _start(factor, diagonal, among, weights)
-    total = moment_of(factor, scaling, among, weights)
+    factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
+    sums = matrix.affinities(matrix.moment(torch.ones_like(diagonal))) + diagonal
+    scaling = sums.clamp(min=SMALLEST_SUM).rsqrt()  # a first guess: (K 1)^(-1/2)
+    total = matrix.moment(scaling)
     move = torch.zeros_like(scaling)
     watched = factor.device.type == "cpu"
     worst, slow = float("inf"), 0

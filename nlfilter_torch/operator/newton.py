@@ -9,21 +9,20 @@ with a spectrum in [1, 2] at the solution. Over all pixels the sum costs as much
 sample almost nothing. Pixels are sampled in proportion to their leverage score ``p |u|^2``, because rare pixels, which
 a uniform sample misses, converge last. On photographs of a megapixel each sweep then reduces the error by a factor of
 10 to 100; Chebyshev's iteration reduces it by 5.8.
-"""
 
-from dataclasses import dataclass
+:func:`damped` is Newton's method on d with an exact line search: slower than all others, but always convergent.
+"""
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
-from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.grams import gram
-from nlfilter_torch.core.kernels.sweeps import sweep
+from nlfilter_torch.core.communicator import Communicator
+from nlfilter_torch.core.kernels.grams import gram, sum_grams
+from nlfilter_torch.core.kernels.sweeps import sweep, weigh
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
-from nlfilter_torch.operator.conjugate_gradients import conjugate_gradients
 from nlfilter_torch.operator.landmarks import stratified
-from nlfilter_torch.operator.scaling import Solution, largest_magnitude, row_sums, scaling_from_moment
+from nlfilter_torch.operator.scaling import KernelMatrix, Solution, scaling_from_moment
 
 PER_LANDMARK = (8, 32, 160)  # sampled pixels at least, usually and at most: the Jacobian is then within 35, 18 or 8 %
 EXPLORED = 8192  # most pixels that the first guess is computed from
@@ -37,36 +36,28 @@ MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
 FIRST_TOLERANCE = 1e-6  # of the solution in float32 that one in float64 starts from
 RESAMPLED = 0.2  # after a sweep that reduces the error by less than a factor of five, another sample is drawn
+MAX_STEPS = 50  # of the damped method; about ten are needed from any start
+SMALL_STEP = 0.1  # relative change of d below which full steps converge quadratically
+# Of conjugate gradients, each of which gains a factor of at least 5.8; or a residual below the rounding of the dtype.
+STEPS = {torch.float32: 10, torch.float64: 24}
+SOLVED = {torch.float32: 1e-7, torch.float64: 1e-16}
 
 
-@dataclass(frozen=True)
-class JacobianSample:
-    """A weighted sample of the pixels, from which the Jacobian is computed.
-
-    Attributes:
-        factor: their columns, (B, M, n).
-        diagonal: (B, n).
-        weight: number of pixels that each stands for, (B, n).
-        among: ranks, each with a sample of its rows.
-    """
-
-    factor: Tensor
-    diagonal: Tensor
-    weight: Tensor
-    among: Communicator
+class JacobianSample(KernelMatrix):
+    """A weighted sample of the pixels, from which the Jacobian is computed; on every rank a sample of its rows."""
 
     def scaling(self, total: Tensor) -> Tensor:
         """Their d (B, n), given t (B, M, 1) in float64."""
         return scaling_from_moment(self.factor, self.diagonal, total.to(self.factor)).clamp_(max=LARGEST)
 
-    def moment(self, scaling: Tensor) -> Tensor:
-        """The sample's estimate of ``factor @ d``, (B, M, 1) in float64."""
-        return self.among.sum(gather((self.weight * scaling).unsqueeze(1), self.factor).mT.double())
+    def moment(self, values: Tensor) -> Tensor:
+        """The sample's estimate of ``factor @ values``, (B, M, 1), added up in the precision of the factor."""
+        return self.among.sum(gather(weighted(values, self.weights).unsqueeze(1), self.factor).mT.double())
 
     def jacobian(self, scaling: Tensor) -> Tensor:
         """J, (B, M, M) in float64."""
         slope = scaling.square()
-        slope = self.weight * slope / (1 + self.diagonal * slope)
+        slope = weighted(slope, self.weights) / (1 + self.diagonal * slope)
         total = self.among.sum(gram(self.factor, slope))
         return total.double() + torch.eye(total.shape[1], dtype=torch.float64, device=total.device)
 
@@ -77,12 +68,11 @@ class JacobianSample:
         return self.among.max(lacking.abs().amax((1, 2)))
 
 
-def _draw(
-    factor: Tensor, diagonal: Tensor, scaling: Tensor, count: int, among: Communicator, weights: Tensor | None
-) -> tuple[JacobianSample, Tensor]:
+def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[JacobianSample, Tensor]:
     """A systematic sample in proportion to leverage scores, and its part of ``scaling``, (B, n)."""
+    factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
     if 2 * count >= factor.shape[2]:
-        return JacobianSample(factor, diagonal, weighted(torch.ones_like(diagonal), weights), among), scaling
+        return JacobianSample(factor, diagonal, weights, among), scaling
     slope = scaling.square()
     leverage = weighted(slope * (1 - diagonal) / (1 + slope * diagonal), weights)  # |u|^2 is 1 - c
     leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
@@ -95,59 +85,55 @@ def _draw(
     return JacobianSample(columns, diagonal.gather(1, chosen), weight, among), scaling.gather(1, chosen)
 
 
-def _guess(factor: Tensor, diagonal: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
+def _guess(matrix: KernelMatrix) -> Tensor:
     """A first guess of t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
+    factor, diagonal = matrix.factor, matrix.diagonal
+    sample = JacobianSample(factor, diagonal, matrix.weights, matrix.among)
     pixels = factor.shape[2]
-    few, rest, each = factor, diagonal, weighted(torch.ones_like(diagonal), weights)
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
         # One pixel at random from each stretch: a fixed stride could coincide with the period of a texture.
         chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
-        few, rest = factor.gather(2, chosen.expand(*factor.shape[:2], -1)), diagonal[:, chosen]
+        each = weighted(torch.ones_like(diagonal), matrix.weights)
         each = each[:, chosen] * (each.sum(1, keepdim=True) / each[:, chosen].sum(1, keepdim=True))
-    sample = JacobianSample(few, rest, each, among)
-    sums = spread(sample.moment(torch.ones_like(rest)).to(few).mT, few).squeeze(1) + rest
+        few = factor.gather(2, chosen.expand(*factor.shape[:2], -1))
+        sample = JacobianSample(few, diagonal[:, chosen], each, matrix.among)
+    sums = sample.affinities(sample.moment(torch.ones_like(sample.diagonal))) + sample.diagonal
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):
         total = (total + sample.moment(sample.scaling(total))) / 2
     return total
 
 
-def _sweep(
-    factor: Tensor, diagonal: Tensor, total: Tensor, among: Communicator, weights: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def _sweep(matrix: KernelMatrix, total: Tensor) -> tuple[Tensor, Tensor]:
     """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor."""
-    half = (total / 2).squeeze(2).to(factor)
-    scaling, found = sweep(factor, diagonal, half, LARGEST, weights)
-    return scaling, among.sum(found.unsqueeze(2))
+    half = (total / 2).squeeze(2).to(matrix.factor)
+    scaling, found = sweep(matrix.factor, matrix.diagonal, half, LARGEST, matrix.weights)
+    return scaling, matrix.among.sum(found.unsqueeze(2))
 
 
-def solve(
-    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator = ALONE, weights: Tensor | None = None
-) -> Solution:
+def solve(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Balance a kernel with a unit diagonal; on processors until the residual is at most ``tolerance`` or stalls.
 
     On an accelerator the number of sweeps is fixed, as reading a residual would stall its queue.
     """
-    solver = _refined if factor.dtype == torch.float64 and factor.device.type == "cpu" else _quasi_newton
-    return solver(factor, diagonal, tolerance, among, weights)
+    refined = matrix.factor.dtype == torch.float64 and matrix.factor.device.type == "cpu"
+    return _refined(matrix, tolerance) if refined else _quasi_newton(matrix, tolerance)
 
 
-def _quasi_newton(
-    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator, weights: Tensor | None
-) -> Solution:
+def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Newton's method with the Jacobian of a sample, corrected by BFGS updates from the sweeps over all pixels."""
-    watched = factor.device.type == "cpu"
-    landmarks, pixels = factor.shape[1:]
-    least, usual, most = (bound * landmarks // among.size for bound in PER_LANDMARK)
-    count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // among.size), least)
-    total = _guess(factor, diagonal, among, weights)
-    scaling, found = _sweep(factor, diagonal, total, among, weights)
+    watched, ranks = matrix.factor.device.type == "cpu", matrix.among.size
+    landmarks, pixels = matrix.factor.shape[1:]
+    least, usual, most = (bound * landmarks // ranks for bound in PER_LANDMARK)
+    count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
+    total = _guess(matrix)
+    scaling, found = _sweep(matrix, total)
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), landmarks, landmarks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         before, error = total, total - found
         if gain > RESAMPLED if watched else sweeps < 3:
-            sample, part = _draw(factor, diagonal, scaling, count, among, weights)
+            sample, part = _draw(matrix, scaling, count)
             # The sample predicts how the moment changes with t. The true moment at the current t is known, and so the
             # error of the sample there, which is subtracted.
             bias = found - sample.moment(part)
@@ -160,7 +146,7 @@ def _quasi_newton(
             inverse = torch.cholesky_inverse(lower)
         else:
             total = total - inverse @ error
-        scaling, found = _sweep(factor, diagonal, total, among, weights)
+        scaling, found = _sweep(matrix, total)
         inverse = _updated(inverse, total - before, total - found - error)
         if not watched:
             continue
@@ -168,40 +154,39 @@ def _quasi_newton(
         gain = worst / previous
         slow = slow + 1 if not gain <= 0.5 else 0
         if worst <= tolerance or slow > 1:
-            measured = _measure(factor, diagonal, scaling, total, found, among)
+            measured = _measure(matrix, scaling, total, found)
             if slow > 1 or bool((measured[1] <= tolerance).all()):
                 break
     else:
-        measured = _measure(factor, diagonal, scaling, total, found, among)
+        measured = _measure(matrix, scaling, total, found)
     return Solution(scaling, found, measured[0], sweeps, inverse)
 
 
-def _refined(
-    factor: Tensor, diagonal: Tensor, tolerance: float, among: Communicator, weights: Tensor | None
-) -> Solution:
+def _refined(matrix: KernelMatrix, tolerance: float) -> Solution:
     """A solution in float64, whose steps are computed from the factor in float32 by the kernels in C."""
-    single, each = factor.float(), None if weights is None else weights.float()
-    rough = _quasi_newton(single, diagonal.float(), max(tolerance, FIRST_TOLERANCE), among, each)
-    total, sweeps = rough.moment, rough.sweeps
+    each = None if matrix.weights is None else matrix.weights.float()
+    single = KernelMatrix(matrix.factor.float(), matrix.diagonal.float(), each, matrix.among)
+    rough = _quasi_newton(single, max(tolerance, FIRST_TOLERANCE))
+    total, sweeps = rough.moment, rough.steps
     for _ in range(MAX_SWEEPS):
-        scaling, found = _sweep(factor, diagonal, total, among, weights)
+        scaling, found = _sweep(matrix, total)
         sweeps += 1
         error, d = total - found, scaling.float()
-        if bool((largest_magnitude(spread(error.to(single).mT, single, d).squeeze(1), among) <= tolerance / 2).all()):
+        lacking = spread(error.to(single.factor).mT, single.factor, d).squeeze(1)
+        if bool((single.largest(lacking) <= tolerance / 2).all()):
             break
-        weight = weighted(d.square() / (1 + d.square() * diagonal.float()), each)
-        total = total - conjugate_gradients(single, weight, error, rough.inverse, among)
-    residual = largest_magnitude(row_sums(factor, diagonal, scaling, found) - 1, among)
+        weight = weighted(d.square() / (1 + d.square() * single.diagonal), each)
+        total = total - conjugate_gradients(single.factor, weight, error, rough.inverse, matrix.among)
+    residual = matrix.largest(matrix.row_sums(scaling, found) - 1)
     return Solution(scaling, found, residual, sweeps, rough.inverse)
 
 
-def _measure(
-    factor: Tensor, diagonal: Tensor, scaling: Tensor, total: Tensor, found: Tensor, among: Communicator
-) -> tuple[Tensor, Tensor]:
+def _measure(matrix: KernelMatrix, scaling: Tensor, total: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
     """Largest deviation of a row sum from 1, (B,): with the rounding of d = d(total), and without it."""
-    rows = spread(torch.cat([found, total - found], dim=2).to(factor).mT, factor)  # (B, 2, N): one read of the factor
-    sums = scaling * (rows[:, 0] + diagonal * scaling)
-    return largest_magnitude(sums - 1, among), largest_magnitude(scaling * rows[:, 1], among)
+    both = torch.cat([found, total - found], dim=2).to(matrix.factor)
+    rows = spread(both.mT, matrix.factor)  # (B, 2, N): one read of the factor
+    sums = scaling * (rows[:, 0] + matrix.diagonal * scaling)
+    return matrix.largest(sums - 1), matrix.largest(scaling * rows[:, 1])
 
 
 def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
@@ -212,3 +197,84 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
     scale = rho * (1 + rho * (change * moved).sum(1, keepdim=True))
     cross = rho * moved @ step.mT
     return inverse - cross - cross.mT + scale * step @ step.mT
+
+
+def damped(matrix: KernelMatrix, start: Solution, goal: float) -> Solution:
+    """Balance from any start until the residual is at most ``goal``, or does not fall any more.
+
+    A balanced d is the only minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
+    even if entries of K are negative. If d changes by ``s d x``, the step x solves ``(I + W) x = 1 - W 1``, a system of
+    M equations with the Jacobian J of all pixels. Along x the function is a quadratic and a sum of logarithms, whose
+    minimum is found without reading the factor again.
+    """
+    factor, weights, among = matrix.factor, matrix.weights, matrix.among
+    tiny = torch.finfo(factor.dtype).tiny
+    usable = start.scaling.isfinite() & (start.scaling > 0)
+    scaling = torch.where(usable, start.scaling, torch.ones_like(start.scaling))
+    best, slow = start, 0
+    for steps in range(1, MAX_STEPS + 1):
+        total = matrix.moment(scaling)
+        lacking = 1 - matrix.row_sums(scaling, total)
+        share = 1 / (1 + scaling * (scaling * matrix.diagonal))  # 1 / (1 + r)
+        sums = among.sum(sum_grams(factor, scaling * weighted(share, weights).sqrt(), None, 1)[:, 0])
+        lower = torch.linalg.cholesky_ex(sums + torch.eye(sums.shape[1], dtype=sums.dtype, device=sums.device)).L
+        residual = matrix.largest(lacking)
+        found = Solution(scaling, total, residual, start.steps + 3 * steps, torch.cholesky_inverse(lower))
+        slow = 0 if bool((residual.max() < 0.5 * best.residual.max()).all()) else slow + 1
+        if bool(residual.max() <= best.residual.max()):
+            best = found
+        right = matrix.moment(scaling * (share * lacking))
+        affinity = spread(torch.cholesky_solve(right, lower).to(factor).mT, factor, scaling).squeeze(1)
+        step = share * (lacking - affinity)
+        small = bool(matrix.largest(step).max() < SMALL_STEP)
+        if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
+            break
+        length = 1.0 if small else _line_search(step.double(), lacking.double(), among, weights)
+        scaling = (scaling * (1 + length * step)).clamp(min=tiny).to(factor)
+    return best
+
+
+def _line_search(step: Tensor, lacking: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
+    """The s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
+    # W 1 = 1 - lacking and W x = lacking - x make the quadratic known.
+
+    def total(values: Tensor) -> Tensor:
+        return among.sum(weighted(values, weights).sum(1, keepdim=True))
+
+    linear, square = total(step * (1 - lacking)), total(step * (lacking - step))
+    longest = among.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()  # where a d reaches zero
+    low, high = torch.zeros_like(longest), 0.999 * longest
+    length = torch.minimum(torch.ones_like(high), 0.5 * high)
+    for _ in range(40):
+        ratio = step / (1 + length * step)
+        slope = linear + length * square - total(ratio)
+        bend = square + total(ratio.square())
+        low, high = torch.where(slope < 0, length, low), torch.where(slope < 0, high, length)
+        following = length - slope / bend
+        inside = (following > low) & (following < high)
+        length = torch.where(inside, following, (low + high) / 2)
+    return length
+
+
+def weighted_moment(factor: Tensor, weight: Tensor, among: Communicator, total: Tensor) -> Tensor:
+    """``factor @ (weight * (factor^T total))``, (B, M, 1) in float64."""
+    return among.sum(weigh(factor, weight, total.to(factor).squeeze(2)).unsqueeze(2))
+
+
+def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, among: Communicator) -> Tensor:
+    """The s (B, M, 1) in float64 with ``(I + factor diag(weight) factor^T) s = right``."""
+    tiny = torch.finfo(torch.float64).tiny  # where the right side is zero, so is the solution
+    solution, residual = torch.zeros_like(right), right
+    preconditioned = inverse @ residual
+    direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
+    goal = SOLVED[factor.dtype] ** 2 * size
+    for _ in range(STEPS[factor.dtype]):
+        image = direction + weighted_moment(factor, weight, among, direction)
+        step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
+        solution, residual = solution + step * direction, residual - step * image
+        preconditioned = inverse @ residual
+        before, size = size, (residual * preconditioned).sum(1, keepdim=True)
+        if factor.device.type == "cpu" and bool((size <= goal).all()):
+            break
+        direction = preconditioned + size / before.clamp(min=tiny) * direction
+    return solution

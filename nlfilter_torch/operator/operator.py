@@ -15,12 +15,11 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.products import apply_powers
-from nlfilter_torch.operator.scaling import PixelScaling, moment_of
+from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
@@ -253,8 +252,8 @@ class NonlocalOperator:
         flat = vectors.flatten(2)
         inner = self.among.sum(weighted(flat, self.weights) @ flat.mT)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
-        total = moment_of(self.factor, torch.ones_like(self.scaling), self.among, self.weights).to(self.factor)
-        kernel_sums = spread(total.mT, self.factor).squeeze(1) + self.diagonal
+        matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.among)
+        kernel_sums = matrix.affinities(matrix.moment(torch.ones_like(self.scaling))) + self.diagonal
         recipe = self.kernel.features
         bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)
         return Diagnostics(

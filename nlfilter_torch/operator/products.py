@@ -38,7 +38,7 @@ def apply_powers(
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, among, weights)  # type: ignore[no-untyped-call]
         return result
-    images, _ = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, among, weights)
+    images, _ = _powers(factor, scaling, remainder, image, order, among, weights)
     return torch.stack(images[1:], dim=1)
 
 
@@ -53,11 +53,11 @@ def _powers(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """The k + 1 images from y to W^k y, and the k moments (B, M, C) of the images from y to W^(k-1) y."""
     images, moments = [image], []
-    each = weighted(scaling, weights)
+    each = weighted(scaling.unsqueeze(1), weights)
     for _ in range(order):
         moments.append(among.sum(moment(factor, each * images[-1])).to(factor))
-        smooth = spread(moments[-1].mT, factor, scaling.squeeze(1))
-        images.append(torch.addcmul(smooth, remainder, images[-1]))
+        smooth = spread(moments[-1].mT, factor, scaling)
+        images.append(torch.addcmul(smooth, remainder.unsqueeze(1), images[-1]))
     return images, moments
 
 
@@ -69,18 +69,9 @@ class _Powers(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        factor: Tensor,
-        scaling: Tensor,
-        remainder: Tensor,
-        image: Tensor,
-        order: int,
-        among: Communicator,
-        weights: Tensor | None,
-    ) -> Tensor:
-        images, moments = _powers(factor, scaling.unsqueeze(1), remainder.unsqueeze(1), image, order, among, weights)
-        ctx.among = among
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        images, moments = _powers(*arguments)
+        factor, scaling, remainder, _, _, ctx.among, weights = arguments
         ctx.save_for_backward(factor, scaling, remainder, weights, *images, *moments)
         return torch.stack(images[1:], dim=1)
 

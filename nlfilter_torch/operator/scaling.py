@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
-from nlfilter_torch.core.communicator import Communicator
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.sweeps import positive_root
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 
@@ -18,21 +18,26 @@ EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # by which rounding may ta
 
 
 @dataclass(frozen=True)
-class Solution:
+class Balancing:
     """Result of balancing.
 
     Attributes:
         scaling: d, (B, N), positive.
-        moment: t of this scaling, (B, M, 1) in float64.
+        moment: t of this scaling, (B, M, 1) in float64, without a gradient.
         residual: largest deviation of a row sum from 1 with this scaling, (B,).
-        sweeps: number of sweeps over the factor.
-        inverse: approximate inverse of the Jacobian J, (B, M, M) in float64.
+        steps: number of sweeps over the factor.
     """
 
     scaling: Tensor
     moment: Tensor
     residual: Tensor
-    sweeps: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class Solution(Balancing):
+    """What a method of balancing found, and the approximate inverse (B, M, M) of the Jacobian J, in float64."""
+
     inverse: Tensor
 
 
@@ -45,19 +50,37 @@ def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tens
     return positive_root(spread((total / 2).mT, factor).squeeze(1), diagonal)
 
 
-def moment_of(factor: Tensor, values: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
-    """``factor @ (weights * values)`` of values (B, N), summed over the ranks: (B, M, 1) in float64."""
-    return among.sum(moment(factor, weighted(values, weights).unsqueeze(1)))
+@dataclass(frozen=True, eq=False)
+class KernelMatrix:
+    """``K = U^T U + diag(c)`` over some points, never formed.
 
+    Attributes:
+        factor: U, (B, M, N).
+        diagonal: c, (B, N).
+        weights: number of equal pixels that each point stands for, (B, N); None is one each.
+        among: ranks that the points are spread over.
+    """
 
-def row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor, found: Tensor) -> Tensor:
-    """Row sums (B, N) of W for any scaling d whose moment ``factor @ d`` is ``found``."""
-    return scaling * (spread(found.to(factor).mT, factor).squeeze(1) + diagonal * scaling)
+    factor: Tensor
+    diagonal: Tensor
+    weights: Tensor | None = None
+    among: Communicator = ALONE
 
+    def moment(self, values: Tensor) -> Tensor:
+        """``U (weights * values)`` of values (B, N), summed over the ranks: (B, M, 1) in float64."""
+        return self.among.sum(moment(self.factor, weighted(values, self.weights).unsqueeze(1)))
 
-def largest_magnitude(values: Tensor, among: Communicator) -> Tensor:
-    """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of them is not finite."""
-    return among.max(values.abs().nan_to_num(nan=torch.inf).amax(1))
+    def affinities(self, total: Tensor) -> Tensor:
+        """``U^T total``, (B, N), of an M-vector (B, M, 1)."""
+        return spread(total.to(self.factor).mT, self.factor).squeeze(1)
+
+    def row_sums(self, scaling: Tensor, found: Tensor) -> Tensor:
+        """Row sums (B, N) of W for any scaling d whose moment is ``found``."""
+        return scaling * (self.affinities(found) + self.diagonal * scaling)
+
+    def largest(self, values: Tensor) -> Tensor:
+        """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of them is not finite."""
+        return self.among.max(values.abs().nan_to_num(nan=torch.inf).amax(1))
 
 
 def isolated(scaling: Tensor, residual: float) -> Tensor:

@@ -6,7 +6,7 @@ read twice: once for G, and once to form or apply eigenvectors.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -56,11 +56,20 @@ class RitzPairs:
 
     @staticmethod
     def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
-        """From the sums that :func:`rayleigh_ritz` takes."""
-        root, inner, ranks = rayleigh_ritz(grams, dtype)
-        ritz = SymmetricMatrix.of(inner)
-        ritz = SymmetricMatrix(ritz.matrix, ritz.eigenvalues.clamp(max=1.0), ritz.vectors)
-        return RitzPairs(ritz, root, torch.arange(inner.shape[1], device=inner.device) < ranks.unsqueeze(1))
+        """From sums over all pixels.
+
+        Args:
+            grams: ``F F^T`` and, where W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
+            dtype: of the factor, which determines their rounding error.
+        """
+        gram = SymmetricMatrix.of(grams[:, 0])
+        kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
+        root = gram.apply(torch.rsqrt, kept)
+        # G^(-1/2) G^2 G^(-1/2) is G where it is kept; as a product it would be rounding in its smallest eigenvalues.
+        projected = gram.apply(lambda values: values, kept) + root @ grams[:, 1:].sum(1) @ root
+        ritz = SymmetricMatrix.of((projected + projected.mT) / 2)
+        ritz = replace(ritz, eigenvalues=ritz.eigenvalues.clamp(max=1.0))
+        return RitzPairs(ritz, root, torch.arange(kept.shape[1], device=kept.device) < kept.sum(1, keepdim=True))
 
     def basis(self, response: Response) -> Tensor:
         """``f(T) G^(-1/2)``, (B, M, M) in float64: ``B^T B`` is the core of ``f(W)^2``."""
@@ -227,21 +236,6 @@ def compute_spectrum(
     return Spectrum(
         pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, among
     )
-
-
-def rayleigh_ritz(grams: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """``G^(-1/2)`` and T, (B, M, M), and their ranks (B,), from sums over all pixels.
-
-    Args:
-        grams: ``F F^T`` and, where W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
-        dtype: of the factor, which determines their rounding error.
-    """
-    gram = SymmetricMatrix.of(grams[:, 0])
-    kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
-    root = gram.apply(torch.rsqrt, kept)
-    # G^(-1/2) G^2 G^(-1/2) is G where it is kept; as a product it would be rounding in its smallest eigenvalues.
-    projected = gram.apply(lambda values: values, kept) + root @ grams[:, 1:].sum(1) @ root
-    return root, (projected + projected.mT) / 2, kept.sum(1)
 
 
 def compute_grams(

@@ -10,27 +10,6 @@ from nlfilter_torch.core.kernels.library import contiguous, register, run
 CACHED_SCORES = 1 << 20  # of points against centres; on a processor a batch goes in parts with no more
 
 
-def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
-    """Pivots (B, M) of a random Cholesky decomposition of the affinities of points (B, D, S).
-
-    Args:
-        points: (B, D, S).
-        draws: (M,) in [0, 1), what each pivot is drawn by.
-        captured: a residual of the unit diagonal that counts as none.
-    """
-    found: Tensor = _pivots(points, draws, captured)
-    return found
-
-
-def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
-    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M).
-
-    The first of those that are as near but for ``margin`` times the terms of which scores are the sums.
-    """
-    nearest: Tensor = _lloyd(points, start, iterations, margin)
-    return nearest
-
-
 def draw_pivots(
     affinities: Callable[[Tensor], Tensor], residual: Tensor, divisor: Tensor, draws: Tensor, captured: float
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -75,16 +54,6 @@ def pick(planes: Tensor, at: Tensor) -> Tensor:
     return planes.gather(2, at.expand(-1, planes.shape[1], -1))
 
 
-def _define_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
-    norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
-    ones = torch.ones_like(norms)
-
-    def affinities(pivot: Tensor) -> Tensor:
-        return affinities_between(points, norms, pick(points, pivot), pick(norms, pivot))
-
-    return draw_pivots(affinities, ones, ones, draws, captured)[0].squeeze(1)
-
-
 def _compiled_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     points, draws = contiguous(points, draws)
     batch, size, count = points.shape
@@ -98,11 +67,49 @@ def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     return points.new_empty(points.shape[0], draws.shape[0], dtype=torch.long)
 
 
-def _define_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+@register("pivots(Tensor points, Tensor draws, float captured) -> Tensor", _compiled_pivots, _fake_pivots)
+def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
+    """Pivots (B, M) of a random Cholesky decomposition of the affinities of points (B, D, S).
+
+    Args:
+        points: (B, D, S).
+        draws: (M,) in [0, 1), what each pivot is drawn by.
+        captured: a residual of the unit diagonal that counts as none.
+    """
+    norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
+    ones = torch.ones_like(norms)
+
+    def affinities(pivot: Tensor) -> Tensor:
+        return affinities_between(points, norms, pick(points, pivot), pick(norms, pivot))
+
+    return draw_pivots(affinities, ones, ones, draws, captured)[0].squeeze(1)
+
+
+def _compiled_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    points, start = contiguous(points, start)
+    batch, size, count = points.shape
+    nearest = torch.empty(batch, count, dtype=torch.int32)
+    run(
+        "lloyd", torch.get_num_threads(), batch, size, count, start.shape[2], iterations, margin, points.data_ptr(),
+        start.data_ptr(), nearest.data_ptr(),
+    )  # fmt: skip
+    return nearest.long()
+
+
+def _fake_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    return points.new_empty(points.shape[0], points.shape[2], dtype=torch.long)
+
+
+@register("lloyd(Tensor points, Tensor start, int iterations, float margin) -> Tensor", _compiled_lloyd, _fake_lloyd)
+def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
+    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M).
+
+    The first of those that are as near but for ``margin`` times the terms of which scores are the sums.
+    """
     together = max(1, CACHED_SCORES // (points.shape[2] * start.shape[2]))
     if points.device.type == "cpu" and together < points.shape[0]:
         parts = zip(points.split(together), start.split(together), strict=True)
-        return torch.cat([_define_lloyd(*part, iterations, margin) for part in parts])
+        return torch.cat([lloyd(*part, iterations, margin) for part in parts])
     extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # distances, or sums and sizes, in a product
     slack = margin * points.square().sum(1).unsqueeze(2)  # (B, S, 1)
     centres = start
@@ -122,29 +129,3 @@ def _define_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float)
 def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
     """Half the squared length of points, (B, D + 1, S) with ones, less half their squared distance to centres."""
     return extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)  # (B, S, M)
-
-
-def _compiled_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
-    points, start = contiguous(points, start)
-    batch, size, count = points.shape
-    nearest = torch.empty(batch, count, dtype=torch.int32)
-    run(
-        "lloyd", torch.get_num_threads(), batch, size, count, start.shape[2], iterations, margin, points.data_ptr(),
-        start.data_ptr(), nearest.data_ptr(),
-    )  # fmt: skip
-    return nearest.long()
-
-
-def _fake_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
-    return points.new_empty(points.shape[0], points.shape[2], dtype=torch.long)
-
-
-_pivots = register(
-    "pivots(Tensor points, Tensor draws, float captured) -> Tensor", _define_pivots, _compiled_pivots, _fake_pivots
-)
-_lloyd = register(
-    "lloyd(Tensor points, Tensor start, int iterations, float margin) -> Tensor",
-    _define_lloyd,
-    _compiled_lloyd,
-    _fake_lloyd,
-)

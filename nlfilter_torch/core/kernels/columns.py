@@ -10,7 +10,40 @@ from nlfilter_torch.core.kernels.affinity import Affinity
 from nlfilter_torch.core.kernels.library import by_rows, contiguous, place, pointer, register, run, threads
 
 
-def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, *, limited: bool) -> tuple[Tensor, Tensor]:
+def _empty(features: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
+    """A factor to be filled, and norms that are 1 where nothing else is written."""
+    batch, _, pixels = features.shape
+    return large_empty((batch, landmarks.shape[2], pixels), features), features.new_ones(batch, pixels)
+
+
+def _fake_columns(features: Tensor, landmarks: Tensor, *others: object) -> tuple[Tensor, Tensor]:
+    batch, _, pixels = features.shape
+    return features.new_empty(batch, landmarks.shape[2], pixels), features.new_empty(batch, pixels)
+
+
+def _compiled_columns(
+    features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool
+) -> tuple[Tensor, Tensor] | None:
+    affinity = Affinity(landmarks, limited)
+    if affinity.exact:
+        return None
+    factor, norms = _empty(features, landmarks)
+    features = by_rows(features)
+    centre, rows, inverse_cholesky = contiguous(affinity.centre, affinity.rows, inverse_cholesky)
+    batch, size, pixels = features.shape
+    run(
+        "columns", threads(factor), pixels, batch, size, factor.shape[1], *place(features), centre.data_ptr(),
+        rows.data_ptr(), inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor), norms.data_ptr(),
+    )  # fmt: skip
+    return factor, norms
+
+
+@register(
+    "columns(Tensor features, Tensor landmarks, Tensor inverse_cholesky, bool limited) -> (Tensor, Tensor)",
+    _compiled_columns,
+    _fake_columns,
+)
+def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool) -> tuple[Tensor, Tensor]:
     """Columns of the Nystrom factor.
 
     Args:
@@ -22,15 +55,73 @@ def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, *, li
     Returns:
         factor (B, M, N), and the squared norms (B, N) of columns before they were shortened; ones if they are not.
     """
-    factor, norms = _columns(features, landmarks, inverse_cholesky, limited)
+    factor, norms = _empty(features, landmarks)
+    batch, pixels = norms.shape
+    count = strip_count(batch, pixels, features.device)
+    affinity = Affinity(_repeat(landmarks, count), limited)
+    inverses = _repeat(inverse_cholesky, count)
+    parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
+    for block, (first, second) in buffered_blocks(columns_of, 2):
+        kernel, _ = affinity(parts[:, :, block], first)
+        found = torch.bmm(inverses, kernel, out=second)  # into a buffer: rows of the factor are far apart
+        if limited:
+            norm = torch.sum(torch.square(found, out=first), 1, out=norms_of[:, block])
+            # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
+            if features.device.type != "cpu" or norm.max().item() > 1.0:
+                found.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
+        columns_of[:, :, block] = found
     return factor, norms
 
 
+def _fake_backward(*arguments: Tensor) -> tuple[Tensor, ...]:
+    return tuple(tensor.new_empty(tensor.shape) for tensor in arguments[:3])
+
+
+def _compiled_backward(
+    features: Tensor,
+    landmarks: Tensor,
+    inverse_cholesky: Tensor,
+    limited: bool,
+    factor: Tensor,
+    scale: Tensor,
+    gradient: Sequence[Tensor],
+    diagonal: Tensor,
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    affinity = Affinity(landmarks, limited)
+    if affinity.exact:
+        return None
+    # The products of these with the derivatives by the exponents move the features.
+    points = 2.0 * torch.cat([affinity.landmarks, torch.ones_like(landmarks[:, :1])], dim=1)  # (B, D + 1, M)
+    grad_features = large_empty(features.shape, features)
+    features, factor, right = map(by_rows, (features, factor, gradient[-1]))
+    left = gradient[0].contiguous() if len(gradient) == 2 else None
+    centre, rows, inverse_cholesky, points = contiguous(affinity.centre, affinity.rows, inverse_cholesky, points)
+    scale, diagonal = contiguous(scale, diagonal)
+    (batch, size, pixels), count = features.shape, factor.shape[1]
+    sums = torch.empty(batch, count * (count + size + 1), dtype=torch.float64)
+    run(
+        "backward", threads(factor), pixels, batch, size, count, *place(features), centre.data_ptr(), rows.data_ptr(),
+        inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor), scale.data_ptr(), right.shape[1],
+        pointer(left), *place(right), diagonal.data_ptr(), points.data_ptr(), grad_features.data_ptr(),
+        sums.data_ptr(),
+    )  # fmt: skip
+    grad_inverse, products = sums.split([count * count, count * (size + 1)], dim=1)
+    products = products.unflatten(1, (count, size + 1))  # of the derivatives by the exponents with features and 1
+    grad_landmarks = 2.0 * (products[:, :, :-1].mT - affinity.landmarks * products[:, None, :, -1])
+    by_landmarks, by_inverse = contiguous(grad_landmarks.float(), grad_inverse.unflatten(1, (count, count)).float())
+    return grad_features, by_landmarks, by_inverse
+
+
+@register(
+    "columns_backward(Tensor features, Tensor landmarks, Tensor inverse_cholesky, bool limited, Tensor factor, "
+    "Tensor scale, Tensor[] gradient, Tensor diagonal) -> (Tensor, Tensor, Tensor)",
+    _compiled_backward,
+    _fake_backward,
+)
 def columns_backward(
     features: Tensor,
     landmarks: Tensor,
     inverse_cholesky: Tensor,
-    *,
     limited: bool,
     factor: Tensor,
     scale: Tensor,
@@ -53,72 +144,6 @@ def columns_backward(
         The derivatives by features, landmarks and the inverse Cholesky factor. Of one that is a triangle, entries above
         the diagonal may be left out.
     """
-    arguments = (features, landmarks, inverse_cholesky, limited, factor, scale, list(gradient), diagonal)
-    by_features, by_landmarks, by_inverse = _backward(*arguments)
-    return by_features, by_landmarks, by_inverse
-
-
-def _define_columns(
-    features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool
-) -> tuple[Tensor, Tensor]:
-    factor, norms = _empty(features, landmarks)
-    batch, pixels = norms.shape
-    count = strip_count(batch, pixels, features.device)
-    affinity = Affinity(_repeat(landmarks, count), limited)
-    inverses = _repeat(inverse_cholesky, count)
-    parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
-    for block, (first, second) in buffered_blocks(columns_of, 2):
-        kernel, _ = affinity(parts[:, :, block], first)
-        found = torch.bmm(inverses, kernel, out=second)  # into a buffer: rows of the factor are far apart
-        if limited:
-            norm = torch.sum(torch.square(found, out=first), 1, out=norms_of[:, block])
-            # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
-            if features.device.type != "cpu" or norm.max().item() > 1.0:
-                found.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
-        columns_of[:, :, block] = found
-    return factor, norms
-
-
-def _compiled_columns(
-    features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool
-) -> tuple[Tensor, Tensor]:
-    affinity = Affinity(landmarks, limited)
-    if affinity.exact:
-        return _define_columns(features, landmarks, inverse_cholesky, limited)
-    factor, norms = _empty(features, landmarks)
-    features = by_rows(features)
-    centre, rows, inverse_cholesky = contiguous(affinity.centre, affinity.rows, inverse_cholesky)
-    batch, size, pixels = features.shape
-    run(
-        "columns", threads(factor), pixels, batch, size, factor.shape[1], *place(features), centre.data_ptr(),
-        rows.data_ptr(), inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor), norms.data_ptr(),
-    )  # fmt: skip
-    return factor, norms
-
-
-def _empty(features: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
-    """A factor to be filled, and norms that are 1 where nothing else is written."""
-    batch, _, pixels = features.shape
-    return large_empty((batch, landmarks.shape[2], pixels), features), features.new_ones(batch, pixels)
-
-
-def _fake_columns(
-    features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool
-) -> tuple[Tensor, Tensor]:
-    batch, _, pixels = features.shape
-    return features.new_empty(batch, landmarks.shape[2], pixels), features.new_empty(batch, pixels)
-
-
-def _define_backward(
-    features: Tensor,
-    landmarks: Tensor,
-    inverse_cholesky: Tensor,
-    limited: bool,
-    factor: Tensor,
-    scale: Tensor,
-    gradient: list[Tensor],
-    diagonal: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
     grad_features = large_empty(features.shape, features)
     batch, pixels = scale.shape
     count = strip_count(batch, pixels, features.device)
@@ -151,73 +176,6 @@ def _define_backward(
     return grad_features, by_landmarks, by_inverse
 
 
-def _compiled_backward(
-    features: Tensor,
-    landmarks: Tensor,
-    inverse_cholesky: Tensor,
-    limited: bool,
-    factor: Tensor,
-    scale: Tensor,
-    gradient: list[Tensor],
-    diagonal: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    affinity = Affinity(landmarks, limited)
-    if affinity.exact:
-        return _define_backward(
-            features, landmarks, inverse_cholesky, limited, factor, scale, gradient, diagonal
-        )  # fmt: skip
-    # The products of these with the derivatives by the exponents move the features.
-    points = 2.0 * torch.cat([affinity.landmarks, torch.ones_like(landmarks[:, :1])], dim=1)  # (B, D + 1, M)
-    grad_features = large_empty(features.shape, features)
-    features, factor, right = map(by_rows, (features, factor, gradient[-1]))
-    left = gradient[0].contiguous() if len(gradient) == 2 else None
-    centre, rows, inverse_cholesky, points = contiguous(affinity.centre, affinity.rows, inverse_cholesky, points)
-    scale, diagonal = contiguous(scale, diagonal)
-    (batch, size, pixels), count = features.shape, factor.shape[1]
-    sums = torch.empty(batch, count * (count + size + 1), dtype=torch.float64)
-    run(
-        "backward", threads(factor), pixels, batch, size, count, *place(features), centre.data_ptr(), rows.data_ptr(),
-        inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor), scale.data_ptr(), right.shape[1],
-        pointer(left), *place(right), diagonal.data_ptr(), points.data_ptr(), grad_features.data_ptr(),
-        sums.data_ptr(),
-    )  # fmt: skip
-    grad_inverse, products = sums.split([count * count, count * (size + 1)], dim=1)
-    products = products.unflatten(1, (count, size + 1))  # of the derivatives by the exponents with features and 1
-    grad_landmarks = 2.0 * (products[:, :, :-1].mT - affinity.landmarks * products[:, None, :, -1])
-    by_landmarks, by_inverse = contiguous(grad_landmarks.float(), grad_inverse.unflatten(1, (count, count)).float())
-    return grad_features, by_landmarks, by_inverse
-
-
-def _fake_backward(
-    features: Tensor,
-    landmarks: Tensor,
-    inverse_cholesky: Tensor,
-    limited: bool,
-    factor: Tensor,
-    scale: Tensor,
-    gradient: list[Tensor],
-    diagonal: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    inputs = (features, landmarks, inverse_cholesky)
-    by_features, by_landmarks, by_inverse = (tensor.new_empty(tensor.shape) for tensor in inputs)
-    return by_features, by_landmarks, by_inverse
-
-
 def _repeat(matrices: Tensor, count: int) -> Tensor:
     """Matrices (1, ., .) for each of the strips of an image; those of a batch, (B, ., .), which counts as one, once."""
     return matrices.repeat(count, 1, 1)
-
-
-_columns = register(
-    "columns(Tensor features, Tensor landmarks, Tensor inverse_cholesky, bool limited) -> (Tensor, Tensor)",
-    _define_columns,
-    _compiled_columns,
-    _fake_columns,
-)
-_backward = register(
-    "columns_backward(Tensor features, Tensor landmarks, Tensor inverse_cholesky, bool limited, Tensor factor, "
-    "Tensor scale, Tensor[] gradient, Tensor diagonal) -> (Tensor, Tensor, Tensor)",
-    _define_backward,
-    _compiled_backward,
-    _fake_backward,
-)

@@ -4,9 +4,23 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import buffered_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import by_rows, contiguous, register, run_on_factor
+from nlfilter_torch.core.kernels.library import by_rows, register, run_on_factor
 
 
+def _fake_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
+    batch, landmarks, _ = factor.shape
+    return factor.new_empty(batch, count, landmarks, landmarks, dtype=torch.float64)
+
+
+def _compiled_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
+    out = _fake_grams(factor, scaling, remainder, count)
+    factor, scaling = by_rows(factor), scaling.contiguous()
+    remainder = scaling if remainder is None else remainder.contiguous()
+    run_on_factor("grams", factor, count, scaling.data_ptr(), remainder.data_ptr(), out.data_ptr())
+    return out
+
+
+@register("grams(Tensor factor, Tensor scaling, Tensor? remainder, int count) -> Tensor", _compiled_grams, _fake_grams)
 def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
     """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64, block by block.
 
@@ -19,20 +33,10 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
         remainder: r, (B, N).
         count: of the powers.
     """
-    total: Tensor = _grams(factor, scaling, scaling if remainder is None else remainder, count)
-    return total
-
-
-def gram(factor: Tensor, weights: Tensor) -> Tensor:
-    """``factor diag(weights) factor^T``, (B, M, M) in the precision of the factor, for weights (B, N) from zero."""
-    total: Tensor = _gram(factor, weights)
-    return total
-
-
-def _define_grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
     batch, landmarks, pixels = factor.shape
     parts = strip_count(batch, pixels, factor.device)
-    factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), remainder.unsqueeze(1)))
+    each = scaling if remainder is None else remainder
+    factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), each.unsqueeze(1)))
     total = factor.new_zeros(len(factor), count, landmarks, landmarks, dtype=torch.float64)
     for block, (rows, weighted) in buffered_blocks(factor, 2):
         left = torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
@@ -43,36 +47,16 @@ def _define_grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int
     return total.sum(0, keepdim=True) if parts > 1 else total
 
 
-def _compiled_grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
-    out = _fake_grams(factor, scaling, remainder, count)
-    factor = by_rows(factor)
-    scaling, remainder = contiguous(scaling, remainder)
-    run_on_factor("grams", factor, count, scaling.data_ptr(), remainder.data_ptr(), out.data_ptr())
-    return out
-
-
-def _fake_grams(factor: Tensor, scaling: Tensor, remainder: Tensor, count: int) -> Tensor:
-    batch, landmarks, _ = factor.shape
-    return factor.new_empty(batch, count, landmarks, landmarks, dtype=torch.float64)
-
-
-def _define_gram(factor: Tensor, weights: Tensor) -> Tensor:
-    return (factor * weights.unsqueeze(1)) @ factor.mT
-
-
-def _compiled_gram(factor: Tensor, weights: Tensor) -> Tensor:
-    return _compiled_grams(factor, weights.sqrt(), weights, 1)[:, 0].to(factor.dtype)
-
-
 def _fake_gram(factor: Tensor, weights: Tensor) -> Tensor:
     batch, landmarks, _ = factor.shape
     return factor.new_empty(batch, landmarks, landmarks)
 
 
-_grams = register(
-    "grams(Tensor factor, Tensor scaling, Tensor remainder, int count) -> Tensor",
-    _define_grams,
-    _compiled_grams,
-    _fake_grams,
-)
-_gram = register("gram(Tensor factor, Tensor weights) -> Tensor", _define_gram, _compiled_gram, _fake_gram)
+def _compiled_gram(factor: Tensor, weights: Tensor) -> Tensor:
+    return _compiled_grams(factor, weights.sqrt(), None, 1)[:, 0].to(factor.dtype)
+
+
+@register("gram(Tensor factor, Tensor weights) -> Tensor", _compiled_gram, _fake_gram)
+def gram(factor: Tensor, weights: Tensor) -> Tensor:
+    """``factor diag(weights) factor^T``, (B, M, M) in the precision of the factor, for weights (B, N) from zero."""
+    return (factor * weights.unsqueeze(1)) @ factor.mT

@@ -9,7 +9,7 @@ import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from nlfilter_torch.core import instruction_sets
 
 SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
 OPERATORS = torch.library.Library("nlfilter", "DEF")
+Definition = TypeVar("Definition", bound=Callable[..., Any])
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
 
@@ -76,56 +77,46 @@ def definitions_only() -> Iterator[None]:
 
 
 def register(
-    schema: str, definition: Callable[..., Any], compiled: Callable[..., Any], fake: Callable[..., Any]
-) -> Any:
-    """Make an operator of ``torch.ops.nlfilter``.
+    schema: str, compiled: Callable[..., Any], fake: Callable[..., Any], *, differentiable: bool = False
+) -> Callable[[Definition], Definition]:
+    """Make a function an operator of ``torch.ops.nlfilter``: it defines what that computes, for every dtype and device.
 
     Args:
         schema: its name and signature.
-        definition: what it computes, for every dtype and device.
-        compiled: the same by a kernel in C, for tensors that are float32 and not empty, on processors.
+        compiled: the same by a kernel in C, for tensors that are float32 and not empty, on processors; None where it
+            leaves the work to the definition.
         fake: uninitialised results, from the shapes of the arguments.
+        differentiable: whether the definition is made of differentiable operations. Autograd, in reverse and forward
+            mode and of any order, and the transforms of ``torch.func`` then see these operations.
     """
     name = schema.partition("(")[0]
 
-    OPERATORS.define(schema)
-    OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
-    OPERATORS.impl(name, _on_processors(definition, compiled), "CPU")
-    torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
-    return getattr(torch.ops.nlfilter, name).default
+    def decorate(definition: Definition) -> Definition:
+        def on_processors(*arguments: Any) -> Any:
+            found = compiled(*arguments) if level and _suit(arguments) else None
+            return definition(*arguments) if found is None else found
 
+        def under_autograd(keys: Any, *arguments: Any) -> Any:
+            if _are_derived(arguments):
+                return definition(*arguments)
+            keys = keys & below
+            if (
+                keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU
+            ):  # what redispatching comes to, without its 4 us
+                return on_processors(*arguments)
+            return operator.redispatch(keys, *arguments)
 
-def register_differentiable(
-    schema: str, definition: Callable[..., Any], compiled: Callable[..., Any], fake: Callable[..., Any]
-) -> Any:
-    """:func:`register` an operator whose definition is made of differentiable operations.
+        OPERATORS.define(schema)
+        OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
+        OPERATORS.impl(name, on_processors, "CPU")
+        torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
+        operator, below = getattr(torch.ops.nlfilter, name).default, torch._C._after_autograd_keyset
+        if differentiable:
+            OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
+            OPERATORS.impl(name, definition, "FuncTorchBatched")
+        return cast(Definition, operator)
 
-    Autograd, in reverse and forward mode and of any order, and the transforms of ``torch.func`` see these operations.
-    """
-    operator, below = register(schema, definition, compiled, fake), torch._C._after_autograd_keyset
-    on_processors = _on_processors(definition, compiled)
-
-    def under_autograd(keys: Any, *arguments: Any) -> Any:
-        if _are_derived(arguments):
-            return definition(*arguments)
-        keys = keys & below
-        if keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU:  # what redispatching comes to, without its 4 us
-            return on_processors(*arguments)
-        return operator.redispatch(keys, *arguments)
-
-    name = schema.partition("(")[0]
-    OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
-    OPERATORS.impl(name, definition, "FuncTorchBatched")
-    return operator
-
-
-def _on_processors(definition: Callable[..., Any], compiled: Callable[..., Any]) -> Callable[..., Any]:
-    """The kernel in C where it can work on the arguments, otherwise the definition."""
-
-    def on_processors(*arguments: Any) -> Any:
-        return (compiled if level and _suit(arguments) else definition)(*arguments)
-
-    return on_processors
+    return decorate
 
 
 # The two below run before every product; as loops they take half the time that generators would.

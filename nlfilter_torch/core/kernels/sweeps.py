@@ -16,63 +16,10 @@ def positive_root(half: Tensor, diagonal: Tensor) -> Tensor:
     return torch.where(half < 0, (root - half) / diagonal.clamp(min=least), (root + half).clamp(min=least).reciprocal())
 
 
-def sweep(
-    factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """The scaling d of every pixel for a guess at the moment, and the moment that it has.
-
-    Args:
-        factor: (B, M, N).
-        diagonal: (B, N).
-        half: of the guess t, (B, M).
-        most: of d.
-        weights: how many pixels each of them stands for, (B, N); None is one.
-
-    Returns:
-        d (B, N), and ``factor @ (weights * d)`` (B, M) in float64.
-    """
-    scaling, found = _sweep(factor, diagonal, half, most, weights)
-    return scaling, found
-
-
-def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
-    """``factor diag(weights) factor^T vector``, (B, M) in float64, of a factor (B, M, N), (B, N) and (B, M)."""
-    found: Tensor = _weigh(factor, weights, vector)
-    return found
-
-
-def _define_sweep(
-    factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    scaling, found = _empty(factor)
-    row = half.unsqueeze(2).mT
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        columns = factor[:, :, block]
-        root = positive_root(spread(row, columns).squeeze(1), diagonal[:, block])
-        part = torch.clamp(root, max=most, out=scaling[:, block])
-        part = part if weights is None else part * weights[:, block]
-        found += gather(part.unsqueeze(1), columns).squeeze(1)
-    return scaling, found
-
-
-def _compiled_sweep(
-    factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    scaling, found = _run(factor, half, None, diagonal, most)
-    return scaling, found if weights is None else moment(factor, (weights * scaling).unsqueeze(1)).squeeze(2)
-
-
-def _define_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
-    _, found = _empty(factor)
-    row = vector.unsqueeze(2).mT
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        columns = factor[:, :, block]
-        found += gather(weights[:, None, block] * spread(row, columns), columns).squeeze(1)
-    return found
-
-
-def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
-    return _run(factor, vector, weights, None, 0.0)[1]
+def _empty(factor: Tensor) -> tuple[Tensor, Tensor]:
+    """Room for a number of every pixel, (B, N), and a moment of zeros, (B, M) in float64."""
+    batch, landmarks, pixels = factor.shape
+    return factor.new_empty(batch, pixels), factor.new_zeros(batch, landmarks, dtype=torch.float64)
 
 
 def _run(
@@ -89,28 +36,58 @@ def _run(
     return out, found
 
 
-def _empty(factor: Tensor) -> tuple[Tensor, Tensor]:
-    """Room for a number of every pixel, (B, N), and a moment of zeros, (B, M) in float64."""
-    batch, landmarks, pixels = factor.shape
-    return factor.new_empty(batch, pixels), factor.new_zeros(batch, landmarks, dtype=torch.float64)
-
-
-def _fake_sweep(
+def _compiled_sweep(
     factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    return _empty(factor)
+    scaling, found = _run(factor, half, None, diagonal, most)
+    return scaling, found if weights is None else moment(factor, (weights * scaling).unsqueeze(1)).squeeze(2)
 
 
-def _fake_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
-    return _empty(factor)[1]
-
-
-_sweep = register(
+@register(
     "sweep(Tensor factor, Tensor diagonal, Tensor half, float most, Tensor? weights=None) -> (Tensor, Tensor)",
-    _define_sweep,
     _compiled_sweep,
-    _fake_sweep,
+    lambda factor, *_: _empty(factor),
 )
-_weigh = register(
-    "weigh(Tensor factor, Tensor weights, Tensor vector) -> Tensor", _define_weigh, _compiled_weigh, _fake_weigh
+def sweep(
+    factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """The scaling d of every pixel for a guess at the moment, and the moment that it has.
+
+    Args:
+        factor: (B, M, N).
+        diagonal: (B, N).
+        half: of the guess t, (B, M).
+        most: of d.
+        weights: how many pixels each of them stands for, (B, N); None is one.
+
+    Returns:
+        d (B, N), and ``factor @ (weights * d)`` (B, M) in float64.
+    """
+    scaling, found = _empty(factor)
+    row = half.unsqueeze(2).mT
+    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+        columns = factor[:, :, block]
+        root = positive_root(spread(row, columns).squeeze(1), diagonal[:, block])
+        part = torch.clamp(root, max=most, out=scaling[:, block])
+        part = part if weights is None else part * weights[:, block]
+        found += gather(part.unsqueeze(1), columns).squeeze(1)
+    return scaling, found
+
+
+def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
+    return _run(factor, vector, weights, None, 0.0)[1]
+
+
+@register(
+    "weigh(Tensor factor, Tensor weights, Tensor vector) -> Tensor",
+    _compiled_weigh,
+    lambda factor, *_: _empty(factor)[1],
 )
+def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
+    """``factor diag(weights) factor^T vector``, (B, M) in float64, of a factor (B, M, N), (B, N) and (B, M)."""
+    _, found = _empty(factor)
+    row = vector.unsqueeze(2).mT
+    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
+        columns = factor[:, :, block]
+        found += gather(weights[:, None, block] * spread(row, columns), columns).squeeze(1)
+    return found

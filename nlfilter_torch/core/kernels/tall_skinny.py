@@ -13,7 +13,7 @@ from nlfilter_torch.core.kernels.library import (
     by_rows,
     place,
     pointer,
-    register_differentiable,
+    register,
     repeated,
     run_on_factor,
 )
@@ -23,13 +23,30 @@ MOST_SPREAD = 9  # rows; from there on undivided products are no slower
 MOST_GATHERED = 24
 
 
+def _compiled_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor | None:
+    if rows.shape[1] not in FEW:
+        return None
+    factor = by_rows(factor)
+    batch, landmarks, pixels = factor.shape
+    rows = repeated(rows, batch, landmarks)
+    scaling = None if scaling is None else repeated(scaling, batch, pixels)
+    out = factor.new_empty(batch, rows.shape[1], pixels)
+    run_on_factor("spread", factor, rows.shape[1], rows.data_ptr(), pointer(scaling), out.data_ptr())
+    return out
+
+
+def _fake_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
+    return factor.new_empty(factor.shape[0], rows.shape[1], factor.shape[2])
+
+
+@register(
+    "spread(Tensor rows, Tensor factor, Tensor? scaling=None) -> Tensor",
+    _compiled_spread,
+    _fake_spread,
+    differentiable=True,
+)
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
     """``rows @ factor diag(scaling)``, (B, R, N), of rows (B, R, M), a factor (B, M, N), perhaps a scaling (B, N)."""
-    found: Tensor = _spread(rows, factor, scaling)
-    return found
-
-
-def _define_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
     if scaling is not None:
         return spread(rows, factor) * scaling.unsqueeze(1)
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
@@ -48,22 +65,6 @@ def _spread_one(row: Tensor, factor: Tensor) -> Tensor:
     return torch.bmm(row.expand(len(parts), -1, -1), parts).view(1, 1, -1)
 
 
-def _compiled_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
-    if rows.shape[1] not in FEW:
-        return _define_spread(rows, factor, scaling)
-    factor = by_rows(factor)
-    batch, landmarks, pixels = factor.shape
-    rows = repeated(rows, batch, landmarks)
-    scaling = None if scaling is None else repeated(scaling, batch, pixels)
-    out = factor.new_empty(batch, rows.shape[1], pixels)
-    run_on_factor("spread", factor, rows.shape[1], rows.data_ptr(), pointer(scaling), out.data_ptr())
-    return out
-
-
-def _fake_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
-    return factor.new_empty(factor.shape[0], rows.shape[1], factor.shape[2])
-
-
 def gather(images: Tensor, factor: Tensor) -> Tensor:
     """``images @ factor^T``, (B, R, M), of images (B, R, N) and a factor (B, M, N)."""
     if torch.compiler.is_compiling():  # the layout of the other would tie a compiler to the number of rows
@@ -73,35 +74,9 @@ def gather(images: Tensor, factor: Tensor) -> Tensor:
     return torch.bmm(_parts(images), _parts(factor).mT).sum(0, keepdim=True)
 
 
-def moment(factor: Tensor, images: Tensor) -> Tensor:
-    """``factor @ images^T``, a sum over pixels, added up in float64.
-
-    In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
-
-    Args:
-        factor: (B, M, N).
-        images: (B, C, N).
-
-    Returns:
-        (B, M, C) in float64.
-    """
-    found: Tensor = _moment(factor, images)
-    return found
-
-
-def _define_moment(factor: Tensor, images: Tensor) -> Tensor:
-    batch, landmarks, _ = factor.shape
-    step = block_length(batch, factor.device, SWEPT)
-    total = factor.new_zeros(batch, landmarks, images.shape[1], dtype=torch.float64)
-    # Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
-    for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
-        total = total + gather(part, rows).mT
-    return total
-
-
-def _compiled_moment(factor: Tensor, images: Tensor) -> Tensor:
+def _compiled_moment(factor: Tensor, images: Tensor) -> Tensor | None:
     if images.shape[1] not in FEW:
-        return _define_moment(factor, images)
+        return None
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
     if images.shape[0] != batch or images.shape[2] != pixels:
@@ -116,6 +91,28 @@ def _fake_moment(factor: Tensor, images: Tensor) -> Tensor:
     return factor.new_empty(factor.shape[0], factor.shape[1], images.shape[1], dtype=torch.float64)
 
 
+@register("moment(Tensor factor, Tensor images) -> Tensor", _compiled_moment, _fake_moment, differentiable=True)
+def moment(factor: Tensor, images: Tensor) -> Tensor:
+    """``factor @ images^T``, a sum over pixels, added up in float64.
+
+    In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
+
+    Args:
+        factor: (B, M, N).
+        images: (B, C, N).
+
+    Returns:
+        (B, M, C) in float64.
+    """
+    batch, landmarks, _ = factor.shape
+    step = block_length(batch, factor.device, SWEPT)
+    total = factor.new_zeros(batch, landmarks, images.shape[1], dtype=torch.float64)
+    # Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
+    for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
+        total = total + gather(part, rows).mT
+    return total
+
+
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:
     """Whether parts pay: for one image on a processor. Autograd would keep every part, and has one product instead."""
     if torch.compiler.is_compiling():  # it would take the size of the batch for a constant
@@ -127,14 +124,3 @@ def _is_parted(thin: Tensor, factor: Tensor) -> bool:
 def _parts(planes: Tensor) -> Tensor:
     """Planes (1, R, n) as a batch of strips."""
     return strips(planes, strip_count(1, planes.shape[2], planes.device))
-
-
-_spread = register_differentiable(
-    "spread(Tensor rows, Tensor factor, Tensor? scaling=None) -> Tensor",
-    _define_spread,
-    _compiled_spread,
-    _fake_spread,
-)
-_moment = register_differentiable(
-    "moment(Tensor factor, Tensor images) -> Tensor", _define_moment, _compiled_moment, _fake_moment
-)
