@@ -21,7 +21,9 @@ body { background: #17181b; }
 .stroke { fill: none; stroke-linecap: round; stroke-linejoin: round; opacity: .6; }
 .welcome { text-align: center; color: #b9bcc4; border: 2px dashed #44474f; border-radius: 12px; padding: 60px 80px; }
 .panel { width: 376px; overflow-y: auto; background: #212328; padding: 4px 12px 18px; color: #dfe1e6; gap: 2px; }
-.panel .q-tab { min-height: 40px; padding: 0 9px; }
+.panel .q-tabs__content { display: grid; grid-template-columns: repeat(4, 1fr); }
+.panel .q-tabs__arrow { display: none; }
+.panel .q-tab { min-height: 36px; padding: 0 6px; }
 .panel .q-tab-panel { padding: 10px 8px 14px; }
 .hint { font-size: 12px; color: #9aa0aa; line-height: 1.35; }
 .group { font-size: 12px; text-transform: uppercase; letter-spacing: .06em; color: #9aa0aa; margin-top: 10px; }
