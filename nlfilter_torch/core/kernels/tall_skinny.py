@@ -9,14 +9,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import (
-    by_rows,
-    place,
-    pointer,
-    register,
-    repeated,
-    run_on_factor,
-)
+from nlfilter_torch.core.kernels.library import by_rows, place, pointer, register, repeated, run_on_factor
 
 FEW = range(1, 9)  # rows for which the kernels in C are the quickest
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
