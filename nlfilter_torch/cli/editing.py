@@ -82,11 +82,11 @@ def edit_file(
     by_rows: Callable[[Job], Rows],
     coloured: bool = False,
 ) -> None:
-    """Write ``edit`` of the photograph in one file to another, at its depth and with all that the file carries.
+    """Write ``edit`` of the photograph in one file to another or the same, with all that the file carries.
 
     Args:
         source: the file to read.
-        target: the file to write; may be the same.
+        target: the file to write.
         depth: of the output, None for that of the input.
         edit: from the photograph to new pixels (1, C, H, W).
         bytes_per_pixel: memory that the edit needs for each pixel of an image.

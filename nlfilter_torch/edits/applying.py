@@ -119,12 +119,9 @@ def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None =
 
 
 def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], Tensor]:
-    """What steps that agree in :func:`shared` make of an image; the filter is made once, for the first of them.
+    """What steps that agree in :func:`shared` make of an image (1, C, H, W) in [0, 1].
 
-    Args:
-        step: the first of them.
-        image: (1, C, H, W) in [0, 1].
-        stride: every how many pixels of the photograph the image has one.
+    The filter is made once, for the first of them. The image has one pixel in ``stride`` of the photograph.
     """
     source = InMemory(image.to(working_dtype(image)), {})
 

@@ -86,16 +86,9 @@ def _fake_moment(factor: Tensor, images: Tensor) -> Tensor:
 
 @register("moment(Tensor factor, Tensor images) -> Tensor", _compiled_moment, _fake_moment, differentiable=True)
 def moment(factor: Tensor, images: Tensor) -> Tensor:
-    """``factor @ images^T``, a sum over pixels, added up in float64.
+    """``factor @ images^T``, (B, M, C) in float64, of a factor (B, M, N) and images (B, C, N): sums over pixels.
 
     In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
-
-    Args:
-        factor: (B, M, N).
-        images: (B, C, N).
-
-    Returns:
-        (B, M, C) in float64.
     """
     batch, landmarks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
