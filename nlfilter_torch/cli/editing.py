@@ -9,7 +9,14 @@ from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import stages, steps
-from nlfilter_torch.io.photographs import Photograph, TooLarge, check_output, read_photograph, write_photograph
+from nlfilter_torch.io.photographs import (
+    Photograph,
+    TooLarge,
+    check_depth,
+    check_output,
+    read_photograph,
+    write_photograph,
+)
 from nlfilter_torch.io.rows import StoredPicture, check_place, free_memory, is_zarr, open_picture, write_picture
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import Rows
@@ -108,7 +115,8 @@ def edit_file(
             return
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(Path(source), allowed))
-        stored = kind or str(picture.rows.dtype)
+        found = check_depth(source, picture.rows.dtype)
+        stored = kind or found
         written = picture.in_colour() if coloured else picture
         check_place(Path(target), stored, written, allowed)
         job = Job(picture, stored, allowed - picture.cached, stack.enter_context(stages()), stack)
