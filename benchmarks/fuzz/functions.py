@@ -7,70 +7,17 @@ import math
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import nlfilter_torch as nlf
-from benchmarks.fuzz.cases import SAMPLINGS, log_uniform
+from benchmarks.fuzz.cases import SAMPLINGS
 from benchmarks.fuzz.checks import Findings, judged
+from benchmarks.fuzz.scene import Scene
 
-SIDES = (4, 24)
 TOO_LARGE = 1_000_001  # as a patch size, 8 TB of weights
-
-
-class Scene:
-    """An image, its operator and all other arguments that fit them."""
-
-    def __init__(self, rng: random.Random) -> None:
-        self.rng = rng
-        self.batch = rng.choice((1, 1, 2))
-        self.size = (rng.randint(*SIDES), rng.randint(*SIDES))
-        self.dtype = rng.choice((torch.float32, torch.float32, torch.float64))
-        self.order = rng.randint(1, 4)
-        self.regions = rng.randint(1, 3)
-        self.generator = torch.Generator().manual_seed(rng.randint(0, 1 << 20))
-
-    def noise(self, *shape: int) -> Tensor:
-        """In [0, 1], sometimes of few levels."""
-        levels = self.rng.choice((2, 4, 255, 1 << 20))
-        values = torch.rand(shape, generator=self.generator, dtype=torch.float64)
-        return ((values * levels).round() / levels).to(self.dtype)
-
-    def image(self, channels: int) -> Tensor:
-        """(B, C, H, W), flat in one half at times."""
-        image = self.noise(self.batch, channels, *self.size)
-        if self.rng.random() < 0.3:
-            image[..., self.size[1] // 2 :] = self.rng.random()
-        return image
-
-    def mask(self, channels: int) -> Tensor:
-        """(B, C, H, W) in [0, 1], of which every channel holds a rectangle."""
-        mask = torch.zeros(self.batch, channels, *self.size, dtype=self.dtype)
-        for plane in mask.flatten(0, 1):
-            top, left = (self.rng.randint(0, side - 2) for side in self.size)
-            plane[top : top + self.rng.randint(1, 8), left : left + self.rng.randint(1, 8)] = self.rng.choice((1, 0.5))
-        return mask
-
-    @cached_property
-    def guide(self) -> Tensor:
-        """What the operator is made from."""
-        return self.image(self.rng.choice((1, 3, 2)))
-
-    @cached_property
-    def operator(self) -> nlf.NonlocalOperator:
-        """Of a bandwidth that suits noise."""
-        bandwidth = log_uniform(self.rng, 0.03, 1.0)
-        return nlf.nonlocal_operator(self.guide, photometric_bandwidth=bandwidth, num_landmarks=self.rng.randint(1, 16))
-
-    @cached_property
-    def spectrum(self) -> nlf.Spectrum:
-        """Of the operator."""
-        return self.operator.spectrum()
-
-
 Kind = Callable[[Scene], Any]
 
 

@@ -13,15 +13,8 @@ from nlfilter_torch.edits.scribbles import Stroke
 class Canvas:
     """A photograph with its mask, its scribbles and the version before the edit, built into the open element.
 
-    Args:
-        session: of the photograph.
-        brush: to draw with.
-        token: in the addresses of the pictures.
-        drawn: called when a stroke is complete.
-        show_error: called with a sentence for the user.
-
-    Attributes:
-        pictures: image files, by their kind.
+    Pictures are image files, by their kind, at addresses that hold the token. ``drawn`` is called when a stroke is
+    complete, ``show_error`` with a sentence for the user.
     """
 
     def __init__(

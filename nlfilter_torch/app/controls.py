@@ -104,13 +104,9 @@ class SteadySlider(ui.slider):
 
 
 class Slider:
-    """A slider on the page that shows and changes the edit.
+    """A slider on the page that shows the current edit and calls ``change`` with changes.
 
-    Args:
-        control: what it sets.
-        recipe: returns the current edit.
-        change: called with changes.
-        suffix: appended to the label for screen readers, where two sliders have the same one.
+    For screen readers ``suffix`` is appended to the label, where two sliders have the same one.
     """
 
     def __init__(self, control: Control, recipe: Callable[[], Recipe], change: Change, suffix: str = "") -> None:

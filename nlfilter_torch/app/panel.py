@@ -41,11 +41,8 @@ class Brush:
 class Panel:
     """Tabs with sliders, brushes and presets, built into the open element.
 
-    Args:
-        session: of the photograph.
-        brush: whose settings are shown.
-        change: called with changes of a step.
-        switch: called with the step of a tab that was opened.
+    They show the settings of the brush, call ``change`` with changes of a step, and ``switch`` with the step of a tab
+    that was opened.
     """
 
     def __init__(self, session: Session, brush: Brush, change: Change, switch: Callable[[str], None]) -> None:

@@ -21,17 +21,10 @@ LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
-    """Run the editor until it is interrupted.
-
-    Args:
-        image: to begin with, or None.
-        folder: where it saves.
-        host: address to listen on.
-        port: 0 for a free one.
-        open_page: open it in the browser.
+    """Run the editor until it is interrupted; it begins with an image, if there is one, and saves in the folder.
 
     Raises:
-        ValueError: if the address cannot be listened on.
+        ValueError: if it cannot listen on that address; port 0 is a free one.
     """
     port = _check_address(host, port)
     if host in LOCAL:

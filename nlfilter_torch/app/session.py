@@ -57,12 +57,9 @@ class Session:
     def open(self, path: Path, name: str | None = None) -> None:
         """Read a photograph and begin a new edit; a failure changes nothing.
 
-        Args:
-            path: of the file.
-            name: of the file, if ``path`` is a copy of it.
-
         Raises:
-            ValueError, OSError, MemoryError: see :func:`read_photograph`; the message names the file as ``name``.
+            ValueError, OSError, MemoryError: see :func:`read_photograph`; the message names the file as ``name``, of
+                which ``path`` may be a copy.
         """
         try:
             # At least as much memory as saving will need.
@@ -119,16 +116,10 @@ class Session:
         return True
 
     def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
-        """Add a stroke to a step.
-
-        Args:
-            step: name of the step.
-            points: (x, y) in pixels of the preview.
-            radius: of the brush, as a share of the short side.
-            paint: its meaning or colour.
+        """Add a stroke to a step: points (x, y) in pixels of the preview, and a radius as a share of its short side.
 
         Raises:
-            ValueError: if no photograph is open, or the step takes no such stroke.
+            ValueError: if no photograph is open, or the step takes no stroke of that meaning or colour.
         """
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)

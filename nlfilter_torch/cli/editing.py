@@ -9,7 +9,14 @@ from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import stages, steps
-from nlfilter_torch.io.photographs import Photograph, TooLarge, check_output, read_photograph, write_photograph
+from nlfilter_torch.io.photographs import (
+    Photograph,
+    TooLarge,
+    check_depth,
+    check_output,
+    read_photograph,
+    write_photograph,
+)
 from nlfilter_torch.io.rows import StoredPicture, check_place, free_memory, is_zarr, open_picture, write_picture
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import Rows
@@ -82,11 +89,11 @@ def edit_file(
     by_rows: Callable[[Job], Rows],
     coloured: bool = False,
 ) -> None:
-    """Write ``edit`` of the photograph in one file to another, at its depth and with all that the file carries.
+    """Write ``edit`` of the photograph in one file to another or the same, with all that the file carries.
 
     Args:
         source: the file to read.
-        target: the file to write; may be the same.
+        target: the file to write.
         depth: of the output, None for that of the input.
         edit: from the photograph to new pixels (1, C, H, W).
         bytes_per_pixel: memory that the edit needs for each pixel of an image.
@@ -108,7 +115,8 @@ def edit_file(
             return
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(Path(source), allowed))
-        stored = kind or str(picture.rows.dtype)
+        found = check_depth(source, picture.rows.dtype)
+        stored = kind or found
         written = picture.in_colour() if coloured else picture
         check_place(Path(target), stored, written, allowed)
         job = Job(picture, stored, allowed - picture.cached, stack.enter_context(stages()), stack)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable
-from nlfilter_torch.core.compilation import uncompiled
+from nlfilter_torch.core.precision import uncompiled
 
 # Eigenvalues with a relative distance below MEETING use f' at their midpoint: the errors of f''' and of
 # cancellation are then both near 1e-10. Below FLOOR the distance is absolute, since zero eigenvalues are zero only to

@@ -1,7 +1,8 @@
-"""Numerical precision: the filter always runs in float32 or float64.
+"""How functions are run: in float32 or float64 whatever the precision outside, and uncompiled where that is needed.
 
 Cholesky and eigen-decompositions reject half precision, and TF32 is too coarse for distances between patches. Every
-public function therefore leaves autocast, computes in :func:`working_dtype` and casts its result back.
+public function therefore leaves autocast, computes in :func:`working_dtype` and casts its result back. Data-dependent
+control flow and loops over blocks of pixels are kept out of ``torch.compile``.
 """
 
 import functools
@@ -43,5 +44,20 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
                 with _no_tf32():
                     return function(*args, **kwargs)
             return function(*args, **kwargs)
+
+    return wrapper
+
+
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """Run ``function`` uncompiled inside compiled code, at the cost of one graph break.
+
+    Unlike :func:`torch.compiler.disable` as a decorator, this does not import the compiler with the package.
+    """
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
 
     return wrapper

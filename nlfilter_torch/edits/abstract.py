@@ -87,19 +87,10 @@ def abstract(
 
 
 def fit_abstract(
-    source: Source,
-    *,
-    power: float | Tensor = ABSTRACT.defaults["power"],
-    edges: float = ABSTRACT.defaults["edges"],
-    edge_width: float | None = None,
-    tones: int | None = ABSTRACT.defaults["tones"],
-    spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = ABSTRACT.defaults["patch_size"],
-    num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
-    **options: Any,
+    source: Source, *, power: float | Tensor, edges: float, edge_width: float | None, tones: int | None, **options: Any
 ) -> Fitted:
     """:func:`abstract` for any source."""
-    check_count(num_landmarks, "num_landmarks")
+    check_count(options["num_landmarks"], "num_landmarks")
     ABSTRACT["power"].check_argument(power, source.batch)
     ABSTRACT["edges"].check_argument(edges)
     ABSTRACT["edge_width"].check_argument(edge_width)
@@ -109,9 +100,8 @@ def fit_abstract(
     if (edges > 0 or tones is not None) and source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select some")
     options |= {
-        "patch_size": patch_size,
-        "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
-        "spatial_bandwidth": nearby(spatial_bandwidth, ABSTRACT["spatial_bandwidth"].share, source.size),
+        "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
+        "spatial_bandwidth": nearby(options["spatial_bandwidth"], ABSTRACT["spatial_bandwidth"].share, source.size),
         "guide_channels": "all",
     }
     operator = source.operator(Guide(options, spectral=True))

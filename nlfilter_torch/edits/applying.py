@@ -86,8 +86,8 @@ def fit_step(
 
     Args:
         step: of an edit.
-        source: the picture.
-        scribbles: in the form that the source has them, and so are those in ``named``.
+        source: the picture; in its form are the scribbles, also those in ``named``.
+        scribbles: what the edit takes after the picture.
         named: further arguments of the edit.
         stride: every how many pixels of the photograph the source has one.
         generator: source of randomness; None is that of the command line.
@@ -114,23 +114,14 @@ def apply_to(
 
 
 def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-    """The edited image, from (B, C, H, W) in [0, 1].
-
-    Args:
-        step: of an edit.
-        image: (B, C, H, W).
-        generator: source of randomness; None is that of the command line.
-    """
+    """The edited image, from (B, C, H, W) in [0, 1]; without a generator, with the randomness of the command line."""
     return apply_to(step, image, *scribbles_of(step, (image.shape[-2], image.shape[-1])), generator=generator)
 
 
 def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], Tensor]:
-    """What steps that agree in :func:`shared` make of an image; the filter is made once, for the first of them.
+    """What steps that agree in :func:`shared` make of an image (1, C, H, W) in [0, 1].
 
-    Args:
-        step: the first of them.
-        image: (1, C, H, W) in [0, 1].
-        stride: every how many pixels of the photograph the image has one.
+    The filter is made once, for the first of them. The image has one pixel in ``stride`` of the photograph.
     """
     source = InMemory(image.to(working_dtype(image)), {})
 

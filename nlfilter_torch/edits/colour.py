@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from nlfilter_torch.operator.features import reduce_channels
+
 
 def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
     """Put ``image`` under another luminance, with the two chroma channels of YCbCr kept.
@@ -29,9 +31,7 @@ def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
     """
     if image.shape[1] != 3:
         return edit(image)
-    from kornia.color import rgb_to_grayscale  # kornia takes half a second to import
-
-    luminance = rgb_to_grayscale(image)
+    luminance = reduce_channels(image, "luminance")
     return image + (edit(luminance) - luminance)
 
 
@@ -41,9 +41,7 @@ ALIKE = 0.05  # strokes whose chroma differs by less, in units of RGB, are one c
 
 def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
     """Luminance (B, 1, H, W) and chroma ``image - luminance`` (B, 3, H, W), a multiple of YCbCr's, of an RGB image."""
-    from kornia.color import rgb_to_grayscale  # kornia takes half a second to import
-
-    luminance = rgb_to_grayscale(image)
+    luminance = reduce_channels(image, "luminance")
     return luminance, image - luminance
 
 

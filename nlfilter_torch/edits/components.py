@@ -86,16 +86,10 @@ class Components:
 def find_components(
     scribbles: Scribbles, columns: Callable[[], Iterable[Tensor]], basis: Tensor, size: tuple[int, int]
 ) -> list[Components]:
-    """The connected components on every image.
+    """The connected components on every image; at least one pixel of it is scribbled on.
 
-    Args:
-        scribbles: at least one pixel in every image.
-        columns: of the scribbled pixels, (B, M, n), block by block.
-        basis: of :func:`walk_basis`, (B, M, M).
-        size: (H, W).
-
-    Returns:
-        Differentiable in columns, weights and basis.
+    Differentiable in the columns (B, M, n) of the scribbled pixels, which come block by block, in the weights and in
+    the basis (B, M, M) of :func:`walk_basis`.
     """
     found = []
     for b, weights in enumerate(scribbles.weights):

@@ -75,22 +75,19 @@ def denoise(
 def fit_denoise(
     source: Source,
     *,
-    noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
-    photometric_bandwidth: float | Tensor | None = None,
-    spatial_bandwidth: float | Tensor | None = None,
-    num_landmarks: int = DENOISE.defaults["num_landmarks"],
+    noise_level: float | Tensor | None,
+    photometric_bandwidth: float | Tensor | None,
     **options: Any,
 ) -> Fitted:
     """:func:`denoise` for any source."""
-    check_count(num_landmarks, "num_landmarks")
+    check_count(options["num_landmarks"], "num_landmarks")
     DENOISE["noise_level"].check_argument(noise_level, source.batch)
     level = noise_of(source) if noise_level is None else torch.as_tensor(noise_level, dtype=source.dtype).reshape(-1)
     assumed = level.clamp(min=QUIET)
-    options = {"patch_size": DENOISE.defaults["patch_size"]} | options
     options |= {
         "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
-        "spatial_bandwidth": nearby(spatial_bandwidth, DENOISE["spatial_bandwidth"].share, source.size),
-        "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
+        "spatial_bandwidth": nearby(options["spatial_bandwidth"], DENOISE["spatial_bandwidth"].share, source.size),
+        "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
         "guide_channels": "all",
     }
     operator = source.operator(Guide(options, blur=GUIDE_BLUR))

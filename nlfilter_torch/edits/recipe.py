@@ -121,13 +121,9 @@ class Recipe:
     def from_json(text: str, name: str, remedy: str = REMEDY) -> "Recipe":
         """Read what :meth:`to_json` wrote, or a file from before there was a list of steps.
 
-        Args:
-            text: the file's content.
-            name: what errors call it.
-            remedy: end of the sentence for files that hold something else.
-
         Raises:
-            ValueError: if ``text`` is no JSON object, or an entry is unknown or not of its kind.
+            ValueError: if ``text`` is no JSON object, or an entry is unknown or not of its kind. The message calls the
+                file ``name``, and ends in ``remedy`` where it holds something else.
         """
         entries = parse_json(text, name, remedy)
         if isinstance(entries, dict) and "alpha" in entries:

@@ -39,15 +39,10 @@ class Stroke:
 
     @staticmethod
     def from_entries(value: Any, words: tuple[str, ...], place: str) -> "Stroke":
-        """Check what JSON holds.
-
-        Args:
-            value: what should be a stroke.
-            words: that may stand in place of a colour; the word ``colour`` allows any colour.
-            place: what errors call it.
+        """The stroke that a value of JSON is; the word ``colour`` allows any colour, others stand in place of one.
 
         Raises:
-            ValueError: if ``value`` is no stroke.
+            ValueError: if ``value`` is no stroke; the message says that it is in ``place``.
         """
         if not isinstance(value, dict) or set(value) != {"points", "radius", "paint"}:
             raise ValueError(f"{place} must hold strokes with points, radius and paint, got {shown(value)}; correct it")

@@ -169,39 +169,21 @@ class Fitted:
     step: int = 1
 
 
-@dataclass(frozen=True, eq=False)
 class InMemory:
     """An image as a source, and all of its pixels.
 
-    Attributes:
+    Args:
         image: (B, C, H, W), float32 or float64.
         kept: its operators by their options, if they are to be kept.
     """
 
-    image: Tensor
-    kept: dict[Any, "InMemoryOperator"] | None = None
     first = 0
     whole = True
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W)."""
-        return (self.image.shape[-2], self.image.shape[-1])
-
-    @property
-    def batch(self) -> int:
-        """B."""
-        return self.image.shape[0]
-
-    @property
-    def channels(self) -> int:
-        """C."""
-        return self.image.shape[1]
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of the image."""
-        return self.image.dtype
+    def __init__(self, image: Tensor, kept: dict[Any, "InMemoryOperator"] | None = None) -> None:
+        self.image, self.kept, self.dtype = image, kept, image.dtype
+        self.batch, self.channels, *size = image.shape
+        self.size = (size[0], size[1])
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """:func:`nonlocal_operator` of the guide."""

@@ -143,9 +143,9 @@ def fit_strokes(
             weights (B, 1, n) and values (B, C, n).
         pairs: of the operator.
         pixels: N, of the whole image.
-        strength: as of :func:`propagate_strokes`, and so are ``reach`` and ``smoothness``.
-        reach: s of the walks.
-        smoothness: scales the noise.
+        strength: see there.
+        reach: see there; s of the walks.
+        smoothness: see there; scales the noise.
         among: ranks that the rows of the image are spread over.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T

@@ -16,7 +16,7 @@ from collections.abc import Callable, Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import imagecodecs
 import numpy as np
@@ -28,7 +28,7 @@ from torch import Tensor
 
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
-from nlfilter_torch.tiled.sources import WHITE, stored_as
+from nlfilter_torch.tiled.sources import Picture, stored_as
 
 if sys.platform != "win32":
     import fcntl
@@ -105,20 +105,20 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     path = Path(path)
     channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
 
-    depth = channels.dtype.name
-    if depth not in BITS:
-        raise ValueError(
-            f"{path} stores its channels as {depth}, which is not handled; convert it to 8 or 16 bits or floats"
-        )
-    values: NDArray[np.floating] = channels.astype(depth if depth == "float64" else "float32")
-    if depth in WHITE:
-        values = values / np.float32(WHITE[depth])
-    elif not np.isfinite(values).all():
-        raise ValueError(f"{path} holds NaN or infinite pixels; replace them first")
-    planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]  # (1, S, H, W)
+    depth = check_depth(path, channels.dtype)
+    planes = Picture(channels, str(path), planes=channels.shape[2]).tile(0, len(channels), 0).pixels  # (1, S, H, W)
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
     return Photograph(planes[:, :colours], depth, alpha, icc, exif)  # type: ignore[arg-type]
+
+
+def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
+    """The depth of a file whose channels have that dtype; raises ValueError if it is not handled."""
+    if dtype.name not in BITS:
+        raise ValueError(
+            f"{path} stores its channels as {dtype.name}, which is not handled; convert it to 8 or 16 bits or floats"
+        )
+    return dtype.name
 
 
 def first_bytes(path: Path) -> bytes:

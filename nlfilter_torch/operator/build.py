@@ -25,8 +25,7 @@ from nlfilter_torch.core.checks import (
     warn_of_scale,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
-from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.precision import full_precision, uncompiled, working_dtype
 from nlfilter_torch.operator.balancing import balance, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window

@@ -64,15 +64,9 @@ def exceeds(gram: ShiftedGram, moment: Tensor, slack: float) -> bool:
 
 
 def limiter(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:
-    """The ``X^(1/2)`` (B, M, M) in float64 by which the factor is multiplied for no eigenvalue to exceed 1.
+    """The ``X^(1/2)`` (B, M, M) in float64 by which the factor is multiplied for no eigenvalue to exceed 1 + ``slack``.
 
-    Args:
-        gram: of W.
-        moment: t = F 1, (B, M, 1) in float64.
-        slack: by how much eigenvalues may exceed 1.
-
-    Returns:
-        Differentiable in what ``gram`` and ``moment`` are.
+    Differentiable in what the matrices S and the moment t = F 1, (B, M, 1) in float64, are.
     """
     matrix = gram(torch.full_like(moment[:, 0, 0], 1 + slack), 1)
     # t is an eigenvector up to the slack; made one exactly, it keeps the row sums exact.
@@ -88,10 +82,7 @@ def limiter(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:
 def largest_eigenvalue(gram: ShiftedGram, remainder: Tensor, dtype: torch.dtype) -> Tensor:
     """An upper bound of the eigenvalues of W, (B,) in float64: 1 if none exceeds 1 but for rounding.
 
-    Args:
-        gram: of W.
-        remainder: the largest r of each image, (B,).
-        dtype: of the factor.
+    It takes the matrices S of W, the largest r of each image, (B,), and the dtype of the factor.
     """
     limit = 1 + SLACK[dtype]
     # Right above the largest r the matrix is singular; where r exceeds 1, the bound is a thousandth above it.

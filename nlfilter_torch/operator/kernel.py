@@ -32,14 +32,10 @@ class GuideFeatures:
     def __call__(
         self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0), stride: int = 1
     ) -> Tensor:
-        """Features (B, D, N) of the pixels of any guide (B, C, H, W).
+        """Features (B, D, N) of the pixels of any guide (B, C, H, W), or of a tile; see :func:`extract_features`.
 
-        Args:
-            guide: with the channels of the guide that the landmarks come from.
-            origin: row and column of its first pixel in the coordinates of that guide, for tiles.
-            halo: rows at the top and at the bottom of a tile that patches reach into but that get no features: half a
-                patch, or fewer at the border of the whole guide.
-            stride: n, for features of only the pixel in the middle of each square of n x n pixels.
+        The guide has the channels of the one that the landmarks come from, and the origin is in the coordinates of that
+        one. A halo is half a patch, or less at the border of the whole guide.
         """
         return extract_features(
             reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels),

@@ -47,15 +47,9 @@ def nystrom_factor(
 ) -> tuple[Tensor, Tensor]:
     """Nystrom factor of the affinities of every pixel, and the diagonal that completes it.
 
-    Args:
-        features: (B, D, N).
-        landmarks: (B, D, M).
-        inverse: (B, M, M) of :func:`inverse_cholesky`.
-        completion: ``"diagonal"`` or ``"none"``.
-
-    Returns:
-        factor (B, M, N) with columns of norm at most 1, and diagonal (B, N) in [0, 1] (zero without completion).
-        Differentiable once in the three tensors; the backward pass recomputes the affinities block by block.
+    From features (B, D, N), landmarks (B, D, M) and their :func:`inverse_cholesky`. The factor (B, M, N) has columns of
+    norm at most 1, and the diagonal (B, N) lies in [0, 1] (zero without completion). Differentiable once in the three
+    tensors; the backward pass recomputes the affinities block by block.
     """
     factor, diagonal, _ = _NystromFactor.apply(features, landmarks, inverse, completion == "diagonal")  # type: ignore[no-untyped-call]
     return factor, diagonal

@@ -14,8 +14,7 @@ from nlfilter_torch.core.checks import (
     check_same_size,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.compilation import uncompiled
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.precision import full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.products import apply_powers

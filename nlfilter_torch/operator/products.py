@@ -20,20 +20,10 @@ def apply_powers(
     among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """``W y, W^2 y, ..., W^k y``.
+    """``W y, W^2 y, ..., W^k y``, (B, k, C, N), for y (B, C, N), a factor (B, M, N), d, r and weights (B, N).
 
-    Args:
-        factor: (B, M, N).
-        scaling: d, (B, N).
-        remainder: r, (B, N).
-        image: y, (B, C, N).
-        order: k, at least 1.
-        among: ranks that the rows of the image are spread over.
-        weights: number of equal pixels that each point stands for, (B, N); None is one each.
-
-    Returns:
-        (B, k, C, N). Differentiable in everything. If the operator needs no gradient, differentiable any number of
-        times in the image, and in forward mode.
+    Differentiable in everything. If the operator needs no gradient, differentiable any number of times in the image,
+    and in forward mode.
     """
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, among, weights)  # type: ignore[no-untyped-call]

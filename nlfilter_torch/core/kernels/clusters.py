@@ -71,10 +71,7 @@ def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
 def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     """Pivots (B, M) of a random Cholesky decomposition of the affinities of points (B, D, S).
 
-    Args:
-        points: (B, D, S).
-        draws: (M,) in [0, 1), what each pivot is drawn by.
-        captured: a residual of the unit diagonal that counts as none.
+    Each is drawn by one of the ``draws`` (M,) in [0, 1). A residual ``captured`` of the unit diagonal counts as none.
     """
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
     ones = torch.ones_like(norms)

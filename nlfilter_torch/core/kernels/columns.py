@@ -44,16 +44,10 @@ def _compiled_columns(
     _fake_columns,
 )
 def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool) -> tuple[Tensor, Tensor]:
-    """Columns of the Nystrom factor.
+    """Columns (B, M, N) of the Nystrom factor, and their squared norms (B, N) before they were shortened to norm 1.
 
-    Args:
-        features: (B, D, N).
-        landmarks: (B, D, M).
-        inverse_cholesky: of their affinities, (B, M, M).
-        limited: whether columns are shortened to norm 1.
-
-    Returns:
-        factor (B, M, N), and the squared norms (B, N) of columns before they were shortened; ones if they are not.
+    From features (B, D, N), landmarks (B, D, M) and the inverse Cholesky factor (B, M, M) of their affinities. If
+    columns are not ``limited`` to norm 1, the squared norms are ones.
     """
     factor, norms = _empty(features, landmarks)
     batch, pixels = norms.shape
@@ -128,21 +122,12 @@ def columns_backward(
     gradient: Sequence[Tensor],
     diagonal: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of :func:`columns`.
+    """Derivatives of :func:`columns` by features, landmarks and the inverse Cholesky factor.
 
-    Args:
-        features: (B, D, N).
-        landmarks: (B, D, M).
-        inverse_cholesky: (B, M, M).
-        limited: whether columns were shortened to norm 1.
-        factor: (B, M, N), the columns.
-        scale: (B, N), what they were shortened by.
-        gradient: of the loss by the columns, (B, M, r) and (B, r, N) whose product it is, or itself alone, (B, M, N).
-        diagonal: (B, N), of the loss by 1 - |u|^2 where that is not negative.
-
-    Returns:
-        The derivatives by features, landmarks and the inverse Cholesky factor. Of one that is a triangle, entries above
-        the diagonal may be left out.
+    Of a factor that is a triangle, entries above the diagonal may be left out. Beside the arguments of the columns
+    (B, M, N), it takes these, what they were shortened by, (B, N), and the gradient of the loss: by the columns, as
+    (B, M, r) and (B, r, N) whose product it is or as itself alone, (B, M, N), and by 1 - |u|^2, (B, N), where that is
+    not negative.
     """
     grad_features = large_empty(features.shape, features)
     batch, pixels = scale.shape

@@ -24,14 +24,8 @@ def _compiled_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, c
 def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
     """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64, block by block.
 
-    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small. Of r
-    there is no need for one sum.
-
-    Args:
-        factor: (B, M, N).
-        scaling: d, (B, N).
-        remainder: r, (B, N).
-        count: of the powers.
+    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small. The
+    factor is (B, M, N), d and r are (B, N); one sum needs no r.
     """
     batch, landmarks, pixels = factor.shape
     parts = strip_count(batch, pixels, factor.device)

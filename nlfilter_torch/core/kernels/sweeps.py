@@ -51,17 +51,10 @@ def _compiled_sweep(
 def sweep(
     factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The scaling d of every pixel for a guess at the moment, and the moment that it has.
+    """The scaling d (B, N) of every pixel for a guess at the moment, and the moment (B, M) in float64 that it has.
 
-    Args:
-        factor: (B, M, N).
-        diagonal: (B, N).
-        half: of the guess t, (B, M).
-        most: of d.
-        weights: how many pixels each of them stands for, (B, N); None is one.
-
-    Returns:
-        d (B, N), and ``factor @ (weights * d)`` (B, M) in float64.
+    It takes ``half`` of the guess t, (B, M), the ``most`` that d may be, and how many pixels each of them stands for,
+    (B, N); None is one. The moment is ``factor @ (weights * d)``.
     """
     scaling, found = _empty(factor)
     row = half.unsqueeze(2).mT

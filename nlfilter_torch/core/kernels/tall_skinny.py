@@ -9,14 +9,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import (
-    by_rows,
-    place,
-    pointer,
-    register,
-    repeated,
-    run_on_factor,
-)
+from nlfilter_torch.core.kernels.library import by_rows, place, pointer, register, repeated, run_on_factor
 
 FEW = range(1, 9)  # rows for which the kernels in C are the quickest
 MOST_SPREAD = 9  # rows; from there on undivided products are no slower
@@ -93,16 +86,9 @@ def _fake_moment(factor: Tensor, images: Tensor) -> Tensor:
 
 @register("moment(Tensor factor, Tensor images) -> Tensor", _compiled_moment, _fake_moment, differentiable=True)
 def moment(factor: Tensor, images: Tensor) -> Tensor:
-    """``factor @ images^T``, a sum over pixels, added up in float64.
+    """``factor @ images^T``, (B, M, C) in float64, of a factor (B, M, N) and images (B, C, N): sums over pixels.
 
     In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
-
-    Args:
-        factor: (B, M, N).
-        images: (B, C, N).
-
-    Returns:
-        (B, M, C) in float64.
     """
     batch, landmarks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
