@@ -1,9 +1,61 @@
 """What edits share: luminance edited with the colours kept, chroma in gamut, the default of spatial bandwidths."""
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
+
+from nlfilter_torch.core.checks import check_choice
+
+TINY = 1e-6  # room for a change of brightness below which there is none
+Limits = Literal["soft", "none"]
+
+
+def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft") -> Tensor:
+    """Brighten and darken an image without clipping it: highlights and shadows keep what they show.
+
+    A change d of luminance becomes ``h (1 - exp(-d / h))``, with h the room that is left towards white (or black):
+    small changes remain as they are, and none reaches the end. The chroma channels of YCbCr are kept as by
+    :func:`edit_luminance` as far as the room of the channels lets them, by the same curve; what they have no room for
+    goes towards white (or black) in proportion, which keeps the hue. A proportional change of all of it would lose
+    chroma where a picture becomes darker and where it becomes brighter, clipped channels would change the hue.
+
+    Args:
+        image: (B, C, H, W) in [0, 1]; what is outside moves inwards only.
+        change: of luminance, (B, 1, H, W), or of every channel by itself, (B, C, H, W).
+        limits: ``"none"`` adds the change.
+
+    Returns:
+        (B, C, H, W); the image to the last bit where the change is 0. Differentiable in both.
+
+    Example:
+        >>> import torch
+        >>> sky = torch.tensor([0.6, 0.8, 0.95]).view(1, 3, 1, 1)
+        >>> change_luminance(sky, torch.full((1, 1, 1, 1), 0.5)).flatten()
+        tensor([0.9309, 0.9670, 0.9941])
+    """
+    if limits == "none":
+        return image + change
+    up = change >= 0
+    room = torch.where(up, 1 - image, image)  # of every channel
+    whole = least = room.clamp(min=TINY)
+    if change.shape[1] != image.shape[1]:
+        from kornia.color import rgb_to_grayscale  # kornia takes half a second to import
+
+        luminance = rgb_to_grayscale(image)
+        whole = torch.where(up, 1 - luminance, luminance).clamp(min=TINY)
+        least = (room.amin(1, keepdim=True) / 2).clamp(min=TINY)  # the other half remains for the proportional part
+    taken = _within(torch.where(up, change, -change), whole)
+    shift = _within(taken, least)  # of all channels alike
+    left = (room - shift) * ((whole - taken).clamp(min=TINY) / (whole - shift).clamp(min=TINY))
+    moved = room - left
+    return image + torch.where(up, moved, -moved)
+
+
+def _within(change: Tensor, room: Tensor) -> Tensor:
+    """A change of at least 0 that stays within its room."""
+    return -room * torch.expm1(-change / room)
 
 
 def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
@@ -102,6 +154,18 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
         distance = (paint[:, left].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
         numbers[left] = distance.argmin(1)
     return torch.full_like(painted, -1, dtype=torch.long).masked_scatter(painted, numbers)
+
+
+def nearby_or_far(given: float | Tensor | str | None, share: float, size: Sequence[int]) -> float | Tensor | None:
+    """The same, and None, for no spatial bandwidth, where ``"none"`` is given.
+
+    Raises:
+        ValueError: if another word is given.
+    """
+    if isinstance(given, str):
+        check_choice(given, "spatial_bandwidth", ("none",))
+        return None
+    return nearby(given, share, size)
 
 
 def nearby(given: float | Tensor | None, share: float, size: Sequence[int]) -> float | Tensor:

@@ -14,7 +14,7 @@ from nlfilter_torch.core.checks import (
     check_weight,
 )
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.colour import Limits, change_luminance, nearby_or_far
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
 from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
@@ -22,7 +22,6 @@ from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.operator.build import nonlocal_operator
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
-SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter
 
 
 @full_precision
@@ -38,6 +37,10 @@ def enhance(
     time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    limits: Limits = DETAIL.defaults["limits"],
+    photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
+    num_landmarks: int = DETAIL.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
     """Move the detail sliders of a photograph, each region's own sliders for all that looks like it.
@@ -56,8 +59,13 @@ def enhance(
         time: diffusion time of the masks; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         mask_bandwidth: photometric bandwidth of the masks.
-        **options: of :func:`nonlocal_operator`, for the filter; ``num_landmarks``, ``spatial_bandwidth`` and
-            ``generator`` hold for the masks as well.
+        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+            clip.
+        photometric_bandwidth: h_y of the filter, or ``"auto"``.
+        spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares spots
+            however far apart they are, so that shading is detail, too. One that is given holds for the masks as well.
+        num_landmarks: M, of the masks as well; a spatial term needs more.
+        **options: further ones of :func:`nonlocal_operator`, for the filter; ``generator`` holds for the masks as well.
 
     Returns:
         (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image, sliders and regions.
@@ -89,6 +97,10 @@ def enhance(
         time=time,
         width=width,
         mask_bandwidth=mask_bandwidth,
+        limits=limits,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=num_landmarks,
         **options,
     )
 
@@ -105,44 +117,60 @@ def fit_detail(
     time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    limits: Limits = DETAIL.defaults["limits"],
+    photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
+    num_landmarks: int = DETAIL.defaults["num_landmarks"],
     **options: Any,
 ) -> Fitted:
     """:func:`enhance` for any source."""
     check_alpha(alpha)
     DETAIL["channels"].check_argument(channels)
+    DETAIL["limits"].check_argument(limits)
     check_positive(time, "time", source.batch)
     check_positive(width, "width", source.batch)
     check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
     if residual is not None:
         check_weight(residual, "residual", source.batch)
+    nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, source.size)
     masks = None
     if regions is not None:
-        shared = {name: value for name, value in options.items() if name in SHARED}
-        if isinstance(shared.get("generator"), torch.Generator):  # both filters draw from the same state
-            shared["generator"] = shared["generator"].clone_state()
-        shared |= {"photometric_bandwidth": mask_bandwidth, "guide_channels": "all"}
+        shared = {
+            "photometric_bandwidth": mask_bandwidth,
+            "spatial_bandwidth": None if spatial_bandwidth is None else nearness,
+            "num_landmarks": num_landmarks,
+            "guide_channels": "all",
+        }
+        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
+            shared["generator"] = options["generator"].clone_state()
         seen = Guide(shared, spectral=True)
         masks = source.masks(seen, regions, negative, time=time, width=width)
     elif negative is not None or outside is not None:
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
+    options |= {
+        "photometric_bandwidth": photometric_bandwidth,
+        "spatial_bandwidth": nearness,
+        "num_landmarks": num_landmarks,
+    }
     operator = source.operator(Guide(options, exact=residual is not None))
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
-    filtered = polynomial(operator, planes, order, residual)
+    # The change, which the sliders less 1 give, is 0 to the last bit where they are 1.
+    changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
+    sliders = alpha - 1
 
-    def edit(pixels: Pixels) -> Tensor:
+    def change(pixels: Pixels) -> Tensor:
         if masks is None:
-            return filtered(pixels, alpha)
+            return changed(pixels, sliders)
         found = masks(pixels)
-        sliders = alpha.expand(found.shape[1], -1) if alpha.ndim == 1 else alpha
+        inside = sliders.expand(found.shape[1], -1) if sliders.ndim == 1 else sliders
         if outside is not None:
-            return filtered(pixels, blend_sliders(found, sliders, outside))
-        return blend_regions(planes(pixels), found, sliders, lambda inside: filtered(pixels, inside))
+            return changed(pixels, blend_sliders(found, inside, outside - 1))
+        still = torch.zeros_like(planes(pixels))
+        return blend_regions(still, found, inside, lambda moved: changed(pixels, moved))
 
-    if channels == "all":
-        return Fitted(edit)
-    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: edit(pixels)))
+    return Fitted(lambda pixels: change_luminance(pixels.image, change(pixels), limits))
 
 
 def colour_masks(
