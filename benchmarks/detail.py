@@ -29,7 +29,10 @@ from benchmarks.detail_peers import clahe, detail_enhance, smoothers
 from benchmarks.photographs import pictures
 from benchmarks.unsharp import gaussian
 from nlfilter_torch import enhance
+from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.colour import change_luminance, edit_luminance
+from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.operator.features import reduce_channels
 
 CHOSEN_ON = ("astronaut", "coffee", "chelsea", "rocket")
@@ -39,6 +42,8 @@ RADIUS = 2.0
 TEXTURE = (0.5, 0.85)  # quantiles of activity
 NOISE = 5 / 255
 STRONGEST = 60.0
+LARGE = "retina"
+FACTORS = (1, 2, 4)  # of the sides
 OURS = "nlfilter-torch"
 
 Strength = Callable[[float], Tensor]  # the photograph under a strength, 0 for none
@@ -227,15 +232,43 @@ def compare(images: dict[str, Tensor]) -> None:
     print("\nlost comparisons\n" + "\n".join(lost or ["none"]))
 
 
+def compare_scales(name: str, image: Tensor, megapixels: float) -> None:
+    """Print the detail gain of every named preset at the viewing size, for pictures of 1, 4 and 16 times that size."""
+    print(f"{name}: detail gain at {megapixels:g} megapixels, and RMS difference from the first result in grey levels")
+    scale = (megapixels * 1e6 / image[0, 0].numel()) ** 0.5
+    viewed = [round(scale * length) for length in image.shape[-2:]]
+
+    def sized(picture: Tensor, factor: int) -> Tensor:
+        size = [factor * length for length in viewed]
+        return F.interpolate(picture, size, mode="bicubic", antialias=True).clamp(0, 1)
+
+    print(row(["", *(f"{factor**2 * megapixels:g} MP" for factor in FACTORS), "apart", "RMS"]))
+    for preset in PRESETS:
+        gains, views = [], []
+        for factor in FACTORS:
+            large = sized(image, factor)
+            step = PRESETS[preset].step.changed(viewing_size=megapixels)
+            views.append(sized(apply_step(step, large), 1))
+            gains.append(Scene(sized(large, 1)).gain(views[-1]))
+        apart = 100 * (max(gains) / min(gains) - 1)
+        rms = max(255 * float((view - views[0]).square().mean().sqrt()) for view in views)
+        print(row([preset, *(f"{gain:.2f}" for gain in gains), f"{apart:.1f} %", f"{rms:.2f}"]), flush=True)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Print tables."""
     parser = argparse.ArgumentParser(description="Detail against other methods at equal gain.")
     parser.add_argument("--pictures", type=Path, help="a folder of photographs, in place of scikit-image's")
     parser.add_argument("--side", type=int, default=SIDE, help="pixels of the short side they are reduced to")
+    parser.add_argument("--scales", action="store_true", help="the same presets on one photograph in three sizes")
     parser.add_argument("--quick", action="store_true", help="two photographs at 64 pixels, to see that it runs")
     options = parser.parse_args(arguments)
     names = CHOSEN_ON[:2] if options.quick else CHOSEN_ON
-    compare(pictures(options.pictures, 64 if options.quick else options.side, names))
+    if options.scales:
+        name, image = next(iter(pictures(options.pictures, 1 << 14, (LARGE,)).items()))
+        compare_scales(name, image, 0.01 if options.quick else DETAIL["viewing_size"].default)
+    else:
+        compare(pictures(options.pictures, 64 if options.quick else options.side, names))
 
 
 if __name__ == "__main__":

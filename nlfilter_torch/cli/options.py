@@ -48,6 +48,7 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
 def parse_number(text: str, parameter: Parameter) -> float | str:
     """The value of an option that takes a positive number or a word.
 
+    >>> from nlfilter_torch.edits.parameters import EDITS
     >>> [parse_number(text, EDITS["detail"]["bandwidth"]) for text in ("51", "auto")]
     [51.0, 'auto']
     """

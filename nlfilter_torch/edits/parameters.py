@@ -100,6 +100,19 @@ LIMITS = Parameter(
     domain="choice",
     choices=("soft", "none"),
 )
+#: Likewise.
+VIEWING_SIZE = Parameter(
+    "viewing_size",
+    "number",
+    1.5,
+    "Size at which the picture is looked at, in millions of pixels, so that the sliders do the same to it at any "
+    "resolution. In larger photographs patches and lengths are counted in pixels of that size. 0: of the file.",
+    0,
+    1e6,
+    domain="not negative",
+    zero="0 is the size of the image",
+    metavar="MEGAPIXELS",
+)
 DETAIL = Edit(
     "detail",
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
@@ -174,7 +187,20 @@ DETAIL = Edit(
             metavar="TIME",
             slider=Slider("Reach of the region", 0.1, 5, 0.1),
         ),
+        Parameter(
+            "threshold",
+            "number",
+            5.0,
+            "Detail of less contrast than this is strengthened less, since it may be noise: a standard deviation in "
+            "grey levels of 255. 0: all alike.",
+            0,
+            255,
+            "levels",
+            domain="not negative",
+            zero="0 strengthens all detail alike",
+        ),
         LIMITS,
+        VIEWING_SIZE,
         *_filter(bandwidth=20.0, share=NEAR, landmarks=300, auto=True, far=True),
     ),
     hint="Paint on what is to have sliders of its own; all that looks like it follows.",
@@ -212,6 +238,7 @@ SHARPEN = Edit(
             slider=Slider("Grain overlooked", 0, 4, 0.1, live=False),
         ),
         LIMITS,
+        VIEWING_SIZE,
         *_filter(bandwidth=10.0, auto=True),
     ),
     hint="Sharper edges without more noise.",
@@ -247,6 +274,7 @@ TONE = Edit(
             slider=Slider("Clarity", 0, 5, 0.1, live=False),
         ),
         LIMITS,
+        VIEWING_SIZE,
         *_filter(bandwidth=20.0, share=NEAR, landmarks=300, auto=True, far=True),
     ),
     hint="Contrast of large shapes, and of the detail on them.",

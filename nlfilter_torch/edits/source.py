@@ -18,6 +18,7 @@ from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.filtering.scribbles import check_painted
@@ -139,6 +140,19 @@ class Source(Protocol):
             ValueError: if they do not fit the picture, or are ``needed`` and cover no pixel.
         """
 
+    def resized(self, size: tuple[int, int]) -> "Source":
+        """The picture in a smaller size (H, W)."""
+
+    def resized_weights(self, weights: Any, size: tuple[int, int], name: str) -> Any:
+        """Weights (B, K, H, W) of its pixels, in whatever form the source has these, in a smaller size (H, W).
+
+        Raises:
+            ValueError: if they do not fit the picture; ``name`` is theirs in errors.
+        """
+
+    def all(self, fitted: "Fitted") -> Tensor:
+        """The planes (B, C, H, W) that an edit makes of all pixels, for pictures that are small enough."""
+
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
@@ -237,6 +251,21 @@ class InMemory:
             shown = colours.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)[:, :, places]
         return Scribbles(places, weights[:, :, places], image, shown)
 
+    def resized(self, size: tuple[int, int]) -> "InMemory":
+        """The image in another size."""
+        return InMemory(resized(lambda start, stop: self.image[:, :, start:stop], self.size, size))
+
+    def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
+        """Weights in another size."""
+        check_same_size(weights, self.size, name, "image")
+        least = float(weights.detach().min())  # interpolation may go below it, but hides no weight that is invalid
+        return resized(lambda start, stop: weights[:, :, start:stop].to(self.image), self.size, size).clamp(min=least)
+
+    def all(self, fitted: "Fitted") -> Tensor:
+        """All pixels under an edit."""
+        planes = fitted.pixels(self)
+        return planes if fitted.finish is None else fitted.finish(self.image, planes)
+
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
         return planes(self).mean((2, 3), keepdim=True)
@@ -299,18 +328,24 @@ def luminance(pixels: Pixels) -> Tensor:
     return reduce_channels(pixels.image, "luminance")
 
 
-def polynomial(
-    operator: Operator, planes: Planes, order: int, residual: float | Tensor | None
-) -> Callable[[Any, Tensor], Tensor]:
+class Filtered(Protocol):
+    """Some planes of a picture under sliders."""
+
+    def __call__(self, pixels: Any, alpha: Tensor, weight: float | Tensor | None = ..., /) -> Tensor:
+        """Of some pixels; the weight of the residual is that of the filter unless one is given."""
+
+
+def polynomial(operator: Operator, planes: Planes, order: int, residual: float | Tensor | None) -> Filtered:
     """:func:`polynomial_filter` of some planes of a picture, of any of its pixels and for any sliders."""
     layers = operator.layers(planes, order)
     if residual is None:
-        return lambda pixels, alpha: weigh_layers(layers(pixels), alpha)
+        return lambda pixels, alpha, _=None: weigh_layers(layers(pixels), alpha)
     captured = synthesize(operator, torch.ones_like, operator.coefficients(planes))
     share = operator.each(lambda columns: columns.remainder.unsqueeze(1))
 
-    def filtered(pixels: Any, alpha: Tensor) -> Tensor:
-        change = residual_change(alpha, residual, planes(pixels) - captured(pixels), share(pixels))
+    def filtered(pixels: Any, alpha: Tensor, weight: float | Tensor | None = None) -> Tensor:
+        weight = residual if weight is None else weight
+        change = residual_change(alpha, weight, planes(pixels) - captured(pixels), share(pixels))
         return weigh_layers(layers(pixels), alpha) + change
 
     return filtered
@@ -319,10 +354,4 @@ def polynomial(
 def edited(image: Tensor, fit: Callable[..., Fitted], *arguments: Any, **options: Any) -> Tensor:
     """An image in memory under an edit, in its own dtype."""
     source = InMemory(image.to(working_dtype(image)))
-    return apply_fitted(fit(source, *arguments, **options), source).to(image.dtype)
-
-
-def apply_fitted(fitted: Fitted, source: InMemory) -> Tensor:
-    """All pixels of an image under an edit."""
-    planes = fitted.pixels(source)
-    return planes if fitted.finish is None else fitted.finish(source.image, planes)
+    return source.all(fit(source, *arguments, **options)).to(image.dtype)

@@ -7,9 +7,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import Limits, change_luminance, nearby_or_far
+from nlfilter_torch.edits.colour import Limits, nearby_or_far
 from nlfilter_torch.edits.parameters import TONE
 from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.viewing import fit_change
 
 
 @full_precision
@@ -20,6 +21,7 @@ def adjust_tone(
     clarity: float | Tensor = TONE["clarity"].idle,
     order: int = 3,
     limits: Limits = TONE.defaults["limits"],
+    viewing_size: float = TONE.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = TONE.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
     num_landmarks: int = TONE.defaults["num_landmarks"],
@@ -37,6 +39,8 @@ def adjust_tone(
         order: k, at least 1.
         limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
             clip, and holds the mean exactly.
+        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
+            bandwidths are in pixels of that; 0 is the size of the image.
         photometric_bandwidth: h_y, or ``"auto"``.
         spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
             apart they are.
@@ -64,6 +68,7 @@ def adjust_tone(
         clarity=clarity,
         order=order,
         limits=limits,
+        viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         num_landmarks=num_landmarks,
@@ -78,6 +83,7 @@ def fit_tone(
     clarity: float | Tensor = TONE["clarity"].idle,
     order: int = 3,
     limits: Limits = TONE.defaults["limits"],
+    viewing_size: float = TONE.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = TONE.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
     num_landmarks: int = TONE.defaults["num_landmarks"],
@@ -87,18 +93,23 @@ def fit_tone(
     check_order(order)
     TONE["contrast"].check_argument(contrast, source.batch)
     TONE["limits"].check_argument(limits)
+    TONE["viewing_size"].check_argument(viewing_size)
     TONE["clarity"].check_argument(clarity, source.batch)
-    options |= {
-        "photometric_bandwidth": photometric_bandwidth,
-        "spatial_bandwidth": nearby_or_far(spatial_bandwidth, TONE["spatial_bandwidth"].share, source.size),
-        "num_landmarks": num_landmarks,
-    }
-    operator, mean = source.operator(Guide(options)), source.mean(luminance)
 
     def slider(value: float | Tensor) -> Tensor:
-        return torch.as_tensor(value).to(mean).reshape(-1).expand(source.batch)
+        return torch.as_tensor(value).to(source.dtype).reshape(-1).expand(source.batch)
 
     fine = [torch.zeros_like(slider(1.0))] * (order - 1)
     sliders = torch.stack([*fine, slider(clarity) - 1, slider(contrast) - 1], dim=1)  # less 1, which gives the change
-    changed = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
-    return Fitted(lambda pixels: change_luminance(pixels.image, changed(pixels, sliders), limits))
+
+    def change(viewed: Source) -> Fitted:
+        filter_options = options | {
+            "photometric_bandwidth": photometric_bandwidth,
+            "spatial_bandwidth": nearby_or_far(spatial_bandwidth, TONE["spatial_bandwidth"].share, viewed.size),
+            "num_landmarks": num_landmarks,
+        }
+        operator, mean = viewed.operator(Guide(filter_options)), viewed.mean(luminance)
+        changed = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
+        return Fitted(lambda pixels: changed(pixels, sliders))
+
+    return fit_change(source, change, luminance, viewing_size, limits)
