@@ -8,7 +8,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import PresetName, step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
 
 Frames = Annotated[
     Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
@@ -49,6 +49,7 @@ def frames(
     import torch
 
     from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.edits.detail import options_of
     from nlfilter_torch.edits.frames import filter_frames
     from nlfilter_torch.io.photographs import Photograph, check_folder, check_output, read_photograph, write_photograph
 
@@ -75,7 +76,10 @@ def frames(
             references=samples,
             residual=step["residual"],
             channels=step["channels"],
-            **{name: value for name, value in step.arguments((0, 0)).items() if name in FILTER},
+            threshold=step["threshold"] / 255,
+            limits=step["limits"],
+            viewing_size=step["viewing_size"],
+            **options_of(step.changed(spatial_bandwidth=step["spatial_bandwidth"] or "none"), (0, 0)),
             generator=torch.Generator().manual_seed(seed),
         )
         target.mkdir(exist_ok=True)

@@ -10,7 +10,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -82,9 +82,10 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
     """The operator of a guide (1, 1, H, W), with the filter's parameters of a step."""
     from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.edits.detail import options_of
     from nlfilter_torch.operator.build import nonlocal_operator
 
-    parameters = {name: value for name, value in step.arguments((0, 0)).items() if name in FILTER}
+    parameters = options_of(step, (guide.shape[-2], guide.shape[-1]))
     return nonlocal_operator(guide, **parameters, generator=seeded(seed))
 
 

@@ -15,8 +15,9 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import Limits, nearby_or_far
-from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.parameters import DETAIL, FILTER
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
 from nlfilter_torch.filtering.masks import diffusion_mask
@@ -24,7 +25,7 @@ from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
-CALM, CALM_MARGIN = 3.0, 8  # Gaussian window in pixels in which a picture is calm or not, and how far it reaches
+CALM, CALM_MARGIN = 2.0, 6  # Gaussian window in pixels in which a picture is calm or not, and how far it reaches
 TINY = 1e-12
 
 
@@ -182,21 +183,22 @@ def fit_detail(
         operator = viewed.operator(Guide(filter_options, exact=residual is not None))
         changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
 
-        def added_and_rest(pixels: Pixels) -> Tensor:
-            def of(values: Tensor) -> Tensor:
-                added, rest = split_sliders(values)
-                return torch.cat([changed(pixels, added, 0.0), changed(pixels, rest)], dim=1)
-
+        def part(pixels: Pixels, inside: Tensor, elsewhere: Tensor | None, weight: Any) -> Tensor:
             if masks is None:
-                return of(sliders)
+                return changed(pixels, inside, weight)
             found = masks(pixels)
-            inside = sliders.expand(found.shape[1], -1) if sliders.ndim == 1 else sliders
-            if outside is not None:
-                return of(blend_sliders(found, inside, outside - 1))
-            still = torch.zeros_like(planes(pixels)).repeat(1, 2, 1, 1)
-            return blend_regions(still, found, inside, of)
+            inside = inside.expand(found.shape[1], -1) if inside.ndim == 1 else inside
+            if elsewhere is not None:
+                return changed(pixels, blend_sliders(found, inside, elsewhere), weight)
+            still = torch.zeros_like(planes(pixels))
+            return blend_regions(still, found, inside, lambda moved: changed(pixels, moved, weight))
 
-        return Fitted(added_and_rest, lambda image, found: held_back(image, found, threshold), CALM_MARGIN)
+        def added_and_rest(pixels: Pixels) -> Tensor:
+            elsewhere = (None, None) if outside is None else split_sliders(outside - 1)
+            halves = zip(split_sliders(sliders), elsewhere, (0.0, None), strict=True)
+            return torch.cat([part(pixels, *half) for half in halves], dim=1)
+
+        return Fitted(added_and_rest, lambda image, found: held_back(found, activity(image), threshold), CALM_MARGIN)
 
     return fit_change(source, change, planes, viewing_size, limits)
 
@@ -211,25 +213,34 @@ def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
 
 
-def held_back(image: Tensor, changes: Tensor, threshold: float | Tensor) -> Tensor:
+def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
     """The change (B, C, H, W) by added detail and the rest (B, 2 C, H, W), the former less where the image is calm.
 
-    The share of added detail is ``v / (v + threshold^2)``, with v the variance of luminance around the pixel.
+    The share of added detail is ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
     """
     added, rest = changes.chunk(2, dim=1)
     if not isinstance(threshold, Tensor) and threshold == 0:
         return added + rest
+    least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
+    return added * (activity / (activity + least).clamp(min=TINY)) + rest
+
+
+def activity(image: Tensor) -> Tensor:
+    """Variance (B, 1, H, W) of the luminance of an image around its pixels."""
     from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
 
-    grey = reduce_channels(image, "luminance")
-    grey = grey.mean(1, keepdim=True) if grey.shape[1] != 1 else grey
-    grey = pad_border(grey, CALM_MARGIN)
+    grey = pad_border(reduce_channels(image, "luminance").mean(1, keepdim=True), CALM_MARGIN)
     size = 2 * CALM_MARGIN + 1
     moments = gaussian_blur2d(torch.cat([grey, grey.square()], dim=1), (size, size), (CALM, CALM))
     mean, square = moments[..., CALM_MARGIN:-CALM_MARGIN, CALM_MARGIN:-CALM_MARGIN].chunk(2, dim=1)
-    variance = (square - mean.square()).clamp(min=0)
-    least = torch.as_tensor(threshold).to(variance).reshape(-1, 1, 1, 1).square()
-    return added * (variance / (variance + least).clamp(min=TINY)) + rest
+    return (square - mean.square()).clamp(min=0)
+
+
+def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
+    """Options of :func:`nonlocal_operator` for the filter of a step on an image (H, W) of the viewing size."""
+    found = {name: value for name, value in step.arguments(size).items() if name in FILTER}
+    share = DETAIL["spatial_bandwidth"].share
+    return found | {"spatial_bandwidth": nearby_or_far(found["spatial_bandwidth"], share, size)}
 
 
 def colour_masks(

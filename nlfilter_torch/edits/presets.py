@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.edits.parameters import DETAIL, FILTER
+from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.recipe import Recipe, in_file
 from nlfilter_torch.edits.steps import Step
 
@@ -70,13 +70,15 @@ class Preset:
 
         return apply_step(self.step, image, generator=generator)
 
-    def options(self) -> dict[str, Any]:
-        """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
+    def options(self, size: tuple[int, int]) -> dict[str, Any]:
+        """What :func:`nlfilter_torch.nonlocal_operator` takes for an image (H, W), in units of the picture.
 
-        >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
-        12.0
+        >>> PRESETS["smooth"].options((240, 320))["spatial_bandwidth"]
+        20.0
         """
-        return {name: value for name, value in self.step.arguments((0, 0)).items() if name in FILTER}
+        from nlfilter_torch.edits.detail import options_of
+
+        return options_of(self.step, size)
 
     @property
     def step(self) -> Step:

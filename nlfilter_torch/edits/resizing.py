@@ -37,6 +37,11 @@ def resized(read: Read, size: tuple[int, int], wanted: tuple[int, int], rows: ra
     return torch.cat(parts, dim=2)
 
 
+def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:
+    """Planes (B, C, H, W) in another size, see :func:`resized`."""
+    return resized(lambda start, stop: planes[:, :, start:stop], (planes.shape[-2], planes.shape[-1]), size)
+
+
 def cubic(distance: Tensor) -> Tensor:
     """Keys' interpolation kernel with a = -1/2."""
     t = distance.abs()

@@ -18,7 +18,10 @@ from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.components import Scribbles
-from nlfilter_torch.edits.resizing import resized
+from nlfilter_torch.edits.pixels import Fitted as Fitted
+from nlfilter_torch.edits.pixels import Pixels as Pixels
+from nlfilter_torch.edits.pixels import Planes as Planes
+from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.filtering.scribbles import check_painted
@@ -27,20 +30,6 @@ from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum
 
-
-class Pixels(Protocol):
-    """Some pixels of a picture: all of them, or some of its rows."""
-
-    @property
-    def image(self) -> Tensor:
-        """(B, C, h, W)."""
-
-    @property
-    def first(self) -> int:
-        """Number of the first one, along the rows of the picture."""
-
-
-Planes = Callable[[Any], Tensor]  # of some pixels, (B, C, h, W)
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
 
@@ -166,24 +155,6 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """What an edit does to any pixels of a picture that it was fitted to.
-
-    Attributes:
-        pixels: the edited pixels, or planes that ``finish`` makes these from.
-        finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
-        margin: how many.
-        step: ``finish`` works on every so many pixels, counted from the first of what it is given, which tiles and
-            ``margin`` are therefore multiples of.
-    """
-
-    pixels: Planes
-    finish: Callable[[Tensor, Tensor], Tensor] | None = None
-    margin: int = 0
-    step: int = 1
-
-
-@dataclass(frozen=True, eq=False)
 class InMemory:
     """An image as a source, and all of its pixels.
 
@@ -253,13 +224,15 @@ class InMemory:
 
     def resized(self, size: tuple[int, int]) -> "InMemory":
         """The image in another size."""
-        return InMemory(resized(lambda start, stop: self.image[:, :, start:stop], self.size, size))
+        if size == self.size:
+            return self
+        return InMemory(resize(self.image, size))
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Weights in another size."""
         check_same_size(weights, self.size, name, "image")
         least = float(weights.detach().min())  # interpolation may go below it, but hides no weight that is invalid
-        return resized(lambda start, stop: weights[:, :, start:stop].to(self.image), self.size, size).clamp(min=least)
+        return resize(weights.to(self.image), size).clamp(min=least)
 
     def all(self, fitted: "Fitted") -> Tensor:
         """All pixels under an edit."""
@@ -328,15 +301,13 @@ def luminance(pixels: Pixels) -> Tensor:
     return reduce_channels(pixels.image, "luminance")
 
 
-class Filtered(Protocol):
-    """Some planes of a picture under sliders."""
+def polynomial(
+    operator: Operator, planes: Planes, order: int, residual: float | Tensor | None
+) -> Callable[..., Tensor]:
+    """:func:`polynomial_filter` of some planes of a picture, of any of its pixels and for any sliders.
 
-    def __call__(self, pixels: Any, alpha: Tensor, weight: float | Tensor | None = ..., /) -> Tensor:
-        """Of some pixels; the weight of the residual is that of the filter unless one is given."""
-
-
-def polynomial(operator: Operator, planes: Planes, order: int, residual: float | Tensor | None) -> Filtered:
-    """:func:`polynomial_filter` of some planes of a picture, of any of its pixels and for any sliders."""
+    The weight of the residual may follow these, in place of the filter's.
+    """
     layers = operator.layers(planes, order)
     if residual is None:
         return lambda pixels, alpha, _=None: weigh_layers(layers(pixels), alpha)

@@ -102,11 +102,11 @@ class Step:
         )  # 3x3 in colour is as large as 5x5 in grey
         return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
 
-    def in_units(self, size: tuple[int, int], stride: int = 1) -> list[tuple[Parameter, Any]]:
+    def in_units(self, size: tuple[int, int], stride: float = 1) -> list[tuple[Parameter, Any]]:
         """Parameters and their values for an image of a size, see :meth:`Parameter.argument_of`."""
         return [(p, p.argument_of(self[p.name], size, stride)) for p in self.declared]
 
-    def arguments(self, size: tuple[int, int], stride: int = 1) -> dict[str, Any]:
+    def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
         """Arguments of the edit's function for an image of a size."""
         return {p.keyword: value for p, value in self.in_units(size, stride) if p.is_option}
 

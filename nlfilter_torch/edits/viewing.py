@@ -14,14 +14,15 @@ it is. The average of the result over a pixel of the small picture is the small 
 
 import math
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.colour import Limits, change_luminance
+from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes
 from nlfilter_torch.edits.resizing import resized
-from nlfilter_torch.edits.source import Fitted, Pixels, Source
 from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
@@ -40,8 +41,19 @@ def viewed_size(size: tuple[int, int], megapixels: float) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
+class Reducible(Protocol):
+    """What is asked of a :class:`~nlfilter_torch.edits.source.Source`."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+
+    def resized(self, size: tuple[int, int]) -> Any:
+        """The picture in a smaller size."""
+
+
 def fit_change(
-    source: Source, change: Callable[[Source], Fitted], planes: Callable[[Pixels], Tensor], size: float, limits: Limits
+    source: Reducible, change: Callable[[Any], Fitted], planes: Planes, size: float, limits: Limits
 ) -> Fitted:
     """An edit of a picture from a change of its brightness at the viewing size.
 
