@@ -16,6 +16,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import build, noise, picture
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05], dtype=torch.float64)
+PLAIN: dict = {"limits": "none", "threshold": 0.0}  # the filter as it is
 
 
 @pytest.mark.parametrize("completion", ["diagonal", "none"])
@@ -120,7 +121,7 @@ def test_one_reference_is_the_usual_filter_on_luminance() -> None:
     grey = reduce_channels(frame, "luminance")
     operator = nonlocal_operator(grey)
     expected = edit_luminance(frame, lambda planes: polynomial_filter(operator, planes, ALPHA.float()))
-    found = next(filter_frames([frame], ALPHA.float(), references=[frame]))
+    found = next(filter_frames([frame], ALPHA.float(), references=[frame], **PLAIN))
     torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
 
 
@@ -128,7 +129,8 @@ def test_all_channels_on_request() -> None:
     frame = pan(1, 1, 40, 50)[0]
     operator = nonlocal_operator(reduce_channels(frame, "luminance"), num_landmarks=60)
     wanted = polynomial_filter(operator, frame, ALPHA.float())
-    found = next(filter_frames([frame], ALPHA.float(), references=[frame], channels="all", num_landmarks=60))
+    options = {"channels": "all", "num_landmarks": 60} | PLAIN
+    found = next(filter_frames([frame], ALPHA.float(), references=[frame], **options))
     torch.testing.assert_close(found, wanted, atol=2e-4, rtol=0)
     with pytest.raises(ValueError, match="channels must be one of"):
         filter_frames([frame], ALPHA.float(), references=[frame], channels="red")
@@ -197,7 +199,8 @@ def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().out.splitlines()[0] == f"4 frames in {tmp_path / 'out'}"
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.tif", "3.png"]
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").glob("[0-9]*"))]
-    wanted = filter_frames(stored, torch.tensor([3.0, 3.0, 1.0]), references=[stored[0], stored[3]], num_landmarks=40)
+    options = {"photometric_bandwidth": 20 / 255, "num_landmarks": 40}  # the defaults of detail
+    wanted = filter_frames(stored, torch.tensor([3.0, 3.0, 1.0]), references=[stored[0], stored[3]], **options)
     for path, frame in zip(sorted((tmp_path / "out").iterdir()), wanted, strict=True):
         found = read_photograph(path)
         assert (found.pixels - frame.clamp(0, 1)).abs().max() < 0.6 / 255
@@ -213,7 +216,7 @@ def test_frames_by_every_preset(name: str, tmp_path: Path, capsys: pytest.Captur
     arguments = ["frames", str(tmp_path / "film"), str(tmp_path / "out"), "--landmarks", "40", "--references", "1"]
     assert main([*arguments, "--preset", name]) == 0
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").iterdir())]
-    options = preset.options() | {"num_landmarks": 40}
+    options = preset.options((30, 40)) | {"spatial_bandwidth": None} | {"num_landmarks": 40}
     wanted = list(filter_frames(stored, torch.tensor(preset.alpha), references=stored[:1], **options))
     for path, frame, before in zip(sorted((tmp_path / "out").iterdir()), wanted, stored, strict=True):
         found = read_photograph(path).pixels

@@ -82,7 +82,7 @@ def test_one_is_printed_as_a_file(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_gradient_reaches_the_image() -> None:
-    image = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0)).requires_grad_()
     PRESETS["glow"].apply(image).square().mean().backward()
     assert image.grad is not None
     assert image.grad.abs().max() > 0

@@ -13,7 +13,7 @@ from nlfilter_torch.cli import main
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import colour_masks
-from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.parameters import CRISP, EDITS
 from nlfilter_torch.edits.presets import PRESETS, Preset, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
@@ -89,10 +89,16 @@ def test_detail(pixels: torch.Tensor) -> None:
 
 
 def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
-    found = Recipe((DETAIL,)).apply(pixels)
-    mask = colour_masks(pixels, mask_of([IN], SIZE), negative=mask_of([OUT], SIZE), time=0.7, generator=seeded())
+    plain = DETAIL.changed(limits="none", threshold=0.0)
+    found = Recipe((plain,)).apply(pixels)
+    regions = mask_of([IN], SIZE), mask_of([OUT], SIZE)
+    mask = colour_masks(pixels, regions[0], negative=regions[1], time=0.7, num_landmarks=300, generator=seeded())
     operator = nonlocal_operator(
-        reduce_channels(pixels, "luminance"), photometric_bandwidth=30 / 255, generator=seeded()
+        reduce_channels(pixels, "luminance"),
+        photometric_bandwidth=30 / 255,
+        spatial_bandwidth=min(SIZE) / 12,
+        num_landmarks=300,
+        generator=seeded(),
     )
 
     def edit(luminance: torch.Tensor) -> torch.Tensor:
@@ -158,7 +164,7 @@ def test_the_other_edits_are_steps(pixels: torch.Tensor) -> None:
 def test_all_options_of_detail_are_in_files(pixels: torch.Tensor) -> None:
     step = Step("detail", residual=0.5, channels="all", patch_size=3)
     assert Recipe.from_json(Recipe((step,)).to_json(), "edit.json") == Recipe((step,))
-    alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
+    alpha = torch.tensor(CRISP)
     wanted = enhance(pixels, alpha, residual=0.5, channels="all", patch_size=3, generator=seeded())
     assert torch.equal(Recipe((step,)).apply(pixels), wanted)
 

@@ -17,11 +17,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.detail import MASK_BANDWIDTH
+from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared, viewed_stride
+from nlfilter_torch.edits.colour import change_luminance, nearby_or_far
+from nlfilter_torch.edits.detail import MASK_BANDWIDTH, activity, held_back, split_sliders
+from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.filtering.masks import mask_of_exponents
 from nlfilter_torch.operator.build import operator_from_features
@@ -49,10 +51,17 @@ def reduce(image: Tensor, stride: int) -> Tensor:
 
 
 def sampled_operator(
-    guide: Tensor, stride: int, detail: Step, *, bandwidth: float | Tensor, channels: GuideChannels, patch_size: int
+    guide: Tensor,
+    stride: int,
+    detail: Step,
+    *,
+    bandwidth: float | Tensor,
+    distance: float | Tensor | None,
+    channels: GuideChannels,
+    patch_size: int,
 ) -> NonlocalOperator:
     """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution."""
-    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, detail["spatial_bandwidth"], channels)
+    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, distance, channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
     return operator_from_features(
         recipe(guide, stride=stride),
@@ -128,6 +137,7 @@ class Preview:
         self._layers: Layers | None = None
         self._masks: MaskMaker | None = None
         self._mask: tuple[Key, Tensor] | None = None
+        self._active: tuple[int, Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
         self._pictures: dict[int, tuple[Key, Tensor]] = {}
 
@@ -139,15 +149,17 @@ class Preview:
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
         order = len(detail["alpha"]) - 1
-        key = (*shared(detail), order)
+        key = (*shared(detail), detail["viewing_size"], order)
         if self._layers is None or self._layers.key != key:
-            luminance = reduce_channels(self.photograph.float(), "luminance")
+            stride, shown = self._compared(detail)
+            luminance = reduce_channels(shown, "luminance")
             bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
             operator = sampled_operator(
                 luminance,
-                self.stride,
+                stride,
                 detail,
                 bandwidth=estimate_bandwidth(luminance) if bandwidth == "auto" else bandwidth,
+                distance=self._distance(detail, luminance, stride),
                 channels="luminance",
                 patch_size=detail["patch_size"],
             )
@@ -155,17 +167,47 @@ class Preview:
             self._layers = Layers(key, layers, operator.spectrum().eigenvalues[0])
         return self._layers
 
+    def _compared(self, detail: Step) -> tuple[int, Tensor]:
+        """What the filter of a step compares: every so many patches of the photograph, or those of the preview.
+
+        Patches of a photograph larger than the viewing size are those of its reduction, which the preview is close to.
+        """
+        size = (self.photograph.shape[-2], self.photograph.shape[-1])
+        larger = viewed_size(size, detail["viewing_size"]) != size
+        return (1, self.pixels) if larger else (self.stride, self.photograph.float())
+
+    def _activity(self, detail: Step) -> Tensor:
+        """The activity of what the filter of a step compares, in the size of the preview."""
+        stride, shown = self._compared(detail)
+        if self._active is None or self._active[0] != stride:
+            self._active = (stride, reduce(activity(shown), stride))
+        return self._active[1]
+
+    def _distance(self, detail: Step, guide: Tensor, stride: int) -> float | Tensor | None:
+        """The spatial bandwidth of a step in pixels of a guide."""
+        size = (guide.shape[-2], guide.shape[-1])
+        scale = viewed_stride(detail, self.size, self.stride) if stride != self.stride else 1
+        return nearby_or_far(
+            detail.arguments(size, scale)["spatial_bandwidth"], DETAIL["spatial_bandwidth"].share, size
+        )
+
     def mask(self, detail: Step) -> Tensor | None:
         """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""
         if not detail.has_region():
             return None
-        key = (detail.strokes, detail["time"], detail["landmarks"], detail["spatial_bandwidth"])
+        key = (detail.strokes, detail["time"], detail["landmarks"], detail["spatial_bandwidth"], detail["viewing_size"])
         if self._mask is None or self._mask[0] != key:
             if self._masks is None or self._masks.key != key[2:]:
                 plain = Step("detail", landmarks=detail["landmarks"], spatial_bandwidth=detail["spatial_bandwidth"])
-                guide = self.photograph.float()
+                stride, guide = self._compared(detail)
                 operator = sampled_operator(
-                    guide, self.stride, plain, bandwidth=MASK_BANDWIDTH, channels="all", patch_size=5
+                    guide,
+                    stride,
+                    plain,
+                    bandwidth=MASK_BANDWIDTH,
+                    distance=detail["spatial_bandwidth"] and self._distance(detail, guide, stride),
+                    channels="all",
+                    patch_size=5,
                 )
                 self._masks = MaskMaker(operator.spectrum(), key[2:])
             (inner,), others = scribbles_of(detail, self.size)
@@ -200,10 +242,15 @@ class Preview:
 
     def _blend(self, detail: Step) -> Tensor:
         layers, mask = self.layers(detail).layers, self.mask(detail)
-        edited = weigh_layers(layers, torch.tensor(detail["alpha"]))
+
+        def changes(alpha: tuple[float, ...]) -> Tensor:
+            return torch.cat([weigh_layers(layers, part) for part in split_sliders(torch.tensor(alpha) - 1)], dim=1)
+
+        found = changes(detail["alpha"])
         if mask is not None:
-            edited = torch.lerp(edited, weigh_layers(layers, torch.tensor(detail.sliders_inside)), mask)
-        return edit_luminance(self.pixels, lambda _: edited)
+            found = torch.lerp(found, changes(detail.sliders_inside), mask)
+        change = held_back(found, self._activity(detail), detail["threshold"] / 255)
+        return change_luminance(self.pixels, change, detail["limits"])
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""
@@ -220,4 +267,6 @@ class Preview:
 
 def is_of_layers(step: Step) -> bool:
     """Whether a step weighs layers of luminance, which are cached."""
-    return step.edit == "detail" and step["residual"] is None and step["channels"] == "luminance"
+    if step.edit != "detail" or step["residual"] is not None or step["channels"] != "luminance":
+        return False
+    return step["viewing_size"] == 0 or step["viewing_size"] * MEGAPIXEL >= PIXELS

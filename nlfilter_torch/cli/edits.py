@@ -64,7 +64,7 @@ def option_value(parameter: Parameter, value: Any) -> Any:
     """
     if parameter.kind == "sliders":
         return ",".join(f"{slider:.9g}" for slider in value)
-    return f"{value:.9g}" if parameter.words and not isinstance(value, str) else value
+    return f"{value:.9g}" if parameter.words and isinstance(value, int | float) else value
 
 
 def option(parameter: Parameter) -> Any:
@@ -146,7 +146,7 @@ def step_of(edit: Edit, given: dict[str, Any]) -> Step:
         if parameter.kind == "sliders":
             value = options.parse_sliders(value, f"--{parameter.name}")
         elif parameter.words:
-            value = options.parse_levels(value)
+            value = value if value is None else options.parse_number(value, parameter)
         values[parameter.name] = value
     return Step(edit.name, **values)
 

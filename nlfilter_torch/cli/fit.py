@@ -39,6 +39,8 @@ def fit(before: Before, after: After, preset: Result = Path("preset.json"), laye
     from nlfilter_torch.cli.inspect import build_operator
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.colour import edit_luminance
+    from nlfilter_torch.edits.resizing import resize
+    from nlfilter_torch.edits.viewing import viewed_size
     from nlfilter_torch.filtering.filters import polynomial_filter
     from nlfilter_torch.filtering.fit import fit_alpha
     from nlfilter_torch.io.photographs import check_file, open_beside, read_photograph
@@ -50,6 +52,7 @@ def fit(before: Before, after: After, preset: Result = Path("preset.json"), laye
         memory = working_bytes(step["landmarks"], step["patch_size"])
         source, target = (read_photograph(path, bytes_per_pixel=memory) for path in (before, after))
         image, edited = (reduce_channels(photograph.pixels, "luminance") for photograph in (source, target))
+        free = unclipped(target, after)
         if image.shape != edited.shape:
             height, width = image.shape[2:]
             raise ValueError(
@@ -62,15 +65,22 @@ def fit(before: Before, after: After, preset: Result = Path("preset.json"), laye
             )
 
         begin("Comparing patches")
+        size = (image.shape[-2], image.shape[-1])
+        viewed = viewed_size(size, step["viewing_size"])  # at which detail applies the preset
+        before_edit = source.pixels
+        if viewed != size:
+            image, edited, free, before_edit = (resize(planes, viewed) for planes in (image, edited, free, before_edit))
+            free = (free > 0.99).to(image)
+        rounding = 0.5 * spacing(target) if viewed == size else 0.0
         operator = build_operator(image, step)
 
         begin("Fitting")
-        alpha = fit_alpha(
-            operator, image, edited, order=layers - 1, mask=unclipped(target, after), rounding=0.5 * spacing(target)
-        )[0]
-        filtered = edit_luminance(source.pixels, lambda planes: polynomial_filter(operator, planes, alpha))
-        fitted = reduce_channels(stored(filtered, target), "luminance")
-        found = Preset(**{**dict(step.values), "alpha": tuple(round(a, 6) for a in alpha.tolist())})
+        alpha = fit_alpha(operator, image, edited, order=layers - 1, mask=free, rounding=rounding)[0]
+        filtered = edit_luminance(before_edit, lambda planes: polynomial_filter(operator, planes, alpha))
+        fitted = reduce_channels(stored(filtered, target) if viewed == size else filtered.clamp(0, 1), "luminance")
+        sliders = tuple(round(a, 6) for a in alpha.tolist())
+        # What was fitted is linear: no limits, and all detail alike.
+        found = Preset(**{**dict(step.values), "alpha": sliders, "threshold": 0.0, "limits": "none"})
         with open_beside(preset) as stream:
             stream.write(found.to_json().encode())
     typer.echo("alpha: " + ", ".join(f"{a:.3f}" for a in found.alpha))

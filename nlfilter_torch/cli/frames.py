@@ -51,6 +51,7 @@ def frames(
     from nlfilter_torch.cli.folders import pictures
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.edits.detail import options_of
     from nlfilter_torch.edits.frames import filter_frames
     from nlfilter_torch.io.photographs import Photograph, check_folder, check_output, read_photograph, write_photograph
 
@@ -77,7 +78,10 @@ def frames(
             references=samples,
             residual=step["residual"],
             channels=step["channels"],
-            **step.filter_options(),
+            threshold=step["threshold"] / 255,
+            limits=step["limits"],
+            viewing_size=step["viewing_size"],
+            **options_of(step.changed(spatial_bandwidth=step["spatial_bandwidth"] or "none"), (0, 0)),
             generator=seeded(seed),
         )
         target.mkdir(exist_ok=True)

@@ -82,9 +82,11 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
     """The operator of a guide (1, 1, H, W), with the filter's parameters of a step."""
     from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.edits.detail import options_of
     from nlfilter_torch.operator.build import nonlocal_operator
 
-    return nonlocal_operator(guide, **step.filter_options(), generator=seeded(seed))
+    parameters = options_of(step, (guide.shape[-2], guide.shape[-1]))
+    return nonlocal_operator(guide, **parameters, generator=seeded(seed))
 
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:

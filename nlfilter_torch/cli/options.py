@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nlfilter_torch.edits.declaration import BANDWIDTHS, GAINS, MAX_SLIDERS
+from nlfilter_torch.edits.declaration import GAINS, MAX_SLIDERS, UNITS, Parameter
 
 if TYPE_CHECKING:
     from nlfilter_torch.io.photographs import Depth
@@ -45,26 +45,29 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
     return tuple(numbers)
 
 
-def parse_levels(text: str) -> float | Literal["auto"]:
-    """``--bandwidth`` in grey levels.
+def parse_number(text: str, parameter: Parameter) -> float | str:
+    """The value of an option that takes a positive number or a word.
 
-    >>> parse_levels("51"), parse_levels("auto")
-    (51.0, 'auto')
+    >>> from nlfilter_torch.edits.parameters import EDITS
+    >>> [parse_number(text, EDITS["detail"]["bandwidth"]) for text in ("51", "auto")]
+    [51.0, 'auto']
     """
-    if text == "auto":
-        return "auto"
+    if text in parameter.words:
+        return text
     try:
-        levels = float(text)
+        value = float(text)
     except ValueError:
-        levels = math.nan
-    if not 0 < levels < math.inf:
-        raise ValueError(f"--bandwidth must be a positive number of grey levels, such as 20, or auto, got {text!r}")
-    if not BANDWIDTHS[0] <= levels <= BANDWIDTHS[1]:
+        value = math.nan
+    name, unit = f"--{parameter.name.replace('_', '-')}", UNITS[parameter.unit][0]
+    words = " or ".join(parameter.words)
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} must be a positive number of {unit}, such as 20, or {words}, got {text!r}")
+    if not parameter.low <= value <= parameter.high:
         raise ValueError(
-            f"--bandwidth must be from {BANDWIDTHS[0]:g} to {BANDWIDTHS[1]:.0f} grey levels, or auto, got {text!r}; "
+            f"{name} must be from {parameter.low:g} to {parameter.high:.0f} {unit}, or {words}, got {text!r}; "
             "20 suits most photographs"
         )
-    return levels
+    return value
 
 
 Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF or WebP file.")]

@@ -18,9 +18,10 @@ from nlfilter_torch.edits.parameters import FILTER
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.sharpen import fit_sharpen
-from nlfilter_torch.edits.source import Fitted, InMemory, Source, apply_fitted, edited
+from nlfilter_torch.edits.source import Fitted, InMemory, Source, edited
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.tone import fit_tone
+from nlfilter_torch.edits.viewing import viewed_size
 
 #: What each edit learns from a source, the scribbles on it and parameters.
 FITS: dict[str, Callable[..., Fitted]] = {
@@ -93,7 +94,7 @@ def fit_step(
         generator: source of randomness; None is that of the command line.
     """
     check_channels(step.edit, source.channels)
-    arguments = step.arguments(source.size, stride) | named
+    arguments = step.arguments(source.size, viewed_stride(step, source.size, stride)) | named
     if step.edit == "detail":
         scribbles = (torch.as_tensor(arguments.pop("alpha")), *scribbles)
     return FITS[step.edit](source, *scribbles, **arguments, generator=generator or seeded())
@@ -127,9 +128,23 @@ def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], T
 
     def edit(step: Step) -> Tensor:
         fitted = fit_step(step, source, *scribbles_of(step, source.size), stride=stride)
-        return apply_fitted(fitted, source).to(image.dtype)
+        return source.all(fitted).to(image.dtype)
 
     return edit
+
+
+def viewed_stride(step: Step, size: tuple[int, int], stride: int) -> float:
+    """Every how many of the pixels in which the step counts lengths a picture has one.
+
+    Args:
+        step: of an edit.
+        size: (H, W) of the picture.
+        stride: every how many pixels of the photograph it has one.
+    """
+    if stride == 1 or "viewing_size" not in step.arguments(size):
+        return stride
+    photograph = (size[0] * stride, size[1] * stride)
+    return stride * viewed_size(photograph, step["viewing_size"])[0] / photograph[0]
 
 
 def shared(step: Step) -> tuple[object, ...]:

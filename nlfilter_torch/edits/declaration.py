@@ -155,7 +155,7 @@ class Parameter:
         """Whether the edit changes nothing as far as this value goes; False for parameters without an idle value."""
         return all(v == self.idle for v in value) if isinstance(value, tuple) else bool(value == self.idle)
 
-    def argument_of(self, value: Any, size: tuple[int, int], stride: int = 1) -> Any:
+    def argument_of(self, value: Any, size: tuple[int, int], stride: float = 1) -> Any:
         """The function's argument for a value: grey levels become those of [0, 1], and lengths become pixels.
 
         Args:

@@ -14,15 +14,19 @@ from nlfilter_torch.core.checks import (
     check_weight,
 )
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.colour import Limits, nearby_or_far
+from nlfilter_torch.edits.parameters import DETAIL, FILTER
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.features import pad_border, reduce_channels
 
 MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
-SHARED = ("num_landmarks", "spatial_bandwidth", "generator")  # options that the masks share with the filter
+CALM, CALM_MARGIN = 2.0, 6  # Gaussian window in pixels in which a picture is calm or not, and how far it reaches
+TINY = 1e-12
 
 
 @full_precision
@@ -38,6 +42,12 @@ def enhance(
     time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    threshold: float | Tensor = DETAIL.defaults["threshold"],
+    limits: Limits = DETAIL.defaults["limits"],
+    viewing_size: float = DETAIL.defaults["viewing_size"],
+    photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
+    num_landmarks: int = DETAIL.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
     """Move the detail sliders of a photograph, each region's own sliders for all that looks like it.
@@ -56,8 +66,17 @@ def enhance(
         time: diffusion time of the masks; larger reaches further.
         width: squared diffusion distance at which a mask has fallen to 1/e.
         mask_bandwidth: photometric bandwidth of the masks.
-        **options: of :func:`nonlocal_operator`, for the filter; ``num_landmarks``, ``spatial_bandwidth`` and
-            ``generator`` hold for the masks as well.
+        threshold: standard deviation of luminance around a pixel at which detail is strengthened half as much as the
+            sliders say, less where it is smaller; 0 strengthens all alike.
+        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+            clip.
+        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
+            bandwidths are in pixels of that; 0 is the size of the image.
+        photometric_bandwidth: h_y of the filter, or ``"auto"``.
+        spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares spots
+            however far apart they are, so that shading is detail, too. One that is given holds for the masks as well.
+        num_landmarks: M, of the masks as well; a spatial term needs more.
+        **options: further ones of :func:`nonlocal_operator`, for the filter; ``generator`` holds for the masks as well.
 
     Returns:
         (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image, sliders and regions.
@@ -89,6 +108,12 @@ def enhance(
         time=time,
         width=width,
         mask_bandwidth=mask_bandwidth,
+        threshold=threshold,
+        limits=limits,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=num_landmarks,
         **options,
     )
 
@@ -105,44 +130,117 @@ def fit_detail(
     time: float | Tensor = DETAIL.defaults["time"],
     width: float | Tensor = 4.0,
     mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    threshold: float | Tensor = DETAIL.defaults["threshold"],
+    limits: Limits = DETAIL.defaults["limits"],
+    viewing_size: float = DETAIL.defaults["viewing_size"],
+    photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
+    num_landmarks: int = DETAIL.defaults["num_landmarks"],
     **options: Any,
 ) -> Fitted:
     """:func:`enhance` for any source."""
     check_alpha(alpha)
     DETAIL["channels"].check_argument(channels)
+    DETAIL["limits"].check_argument(limits)
+    DETAIL["viewing_size"].check_argument(viewing_size)
+    DETAIL["threshold"].check_argument(threshold, source.batch)
     check_positive(time, "time", source.batch)
     check_positive(width, "width", source.batch)
     check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
     if residual is not None:
         check_weight(residual, "residual", source.batch)
-    masks = None
-    if regions is not None:
-        shared = {name: value for name, value in options.items() if name in SHARED}
-        if isinstance(shared.get("generator"), torch.Generator):  # both filters draw from the same state
-            shared["generator"] = shared["generator"].clone_state()
-        shared |= {"photometric_bandwidth": mask_bandwidth, "guide_channels": "all"}
-        seen = Guide(shared, spectral=True)
-        masks = source.masks(seen, regions, negative, time=time, width=width)
-    elif negative is not None or outside is not None:
+    if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
-    operator = source.operator(Guide(options, exact=residual is not None))
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
-    filtered = polynomial(operator, planes, order, residual)
+    sliders = alpha - 1  # their change is 0 to the last bit where they are 1
 
-    def edit(pixels: Pixels) -> Tensor:
-        if masks is None:
-            return filtered(pixels, alpha)
-        found = masks(pixels)
-        sliders = alpha.expand(found.shape[1], -1) if alpha.ndim == 1 else alpha
-        if outside is not None:
-            return filtered(pixels, blend_sliders(found, sliders, outside))
-        return blend_regions(planes(pixels), found, sliders, lambda inside: filtered(pixels, inside))
+    def change(viewed: Source) -> Fitted:
+        def weights(of: Any, name: str) -> Any:
+            return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
 
-    if channels == "all":
-        return Fitted(edit)
-    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: edit(pixels)))
+        nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, viewed.size)
+        masks = None
+        if regions is not None:
+            compared = {
+                "photometric_bandwidth": mask_bandwidth,
+                "spatial_bandwidth": None if spatial_bandwidth is None else nearness,
+                "num_landmarks": num_landmarks,
+                "guide_channels": "all",
+            }
+            if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
+                compared["generator"] = options["generator"].clone_state()
+            seen = Guide(compared, spectral=True)
+            masks = viewed.masks(
+                seen, weights(regions, "regions"), weights(negative, "negative"), time=time, width=width
+            )
+        filter_options = options | {
+            "photometric_bandwidth": photometric_bandwidth,
+            "spatial_bandwidth": nearness,
+            "num_landmarks": num_landmarks,
+        }
+        operator = viewed.operator(Guide(filter_options, exact=residual is not None))
+        changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
+
+        def part(pixels: Pixels, inside: Tensor, elsewhere: Tensor | None, weight: Any) -> Tensor:
+            if masks is None:
+                return changed(pixels, inside, weight)
+            found = masks(pixels)
+            inside = inside.expand(found.shape[1], -1) if inside.ndim == 1 else inside
+            if elsewhere is not None:
+                return changed(pixels, blend_sliders(found, inside, elsewhere), weight)
+            still = torch.zeros_like(planes(pixels))
+            return blend_regions(still, found, inside, lambda moved: changed(pixels, moved, weight))
+
+        def added_and_rest(pixels: Pixels) -> Tensor:
+            elsewhere = (None, None) if outside is None else split_sliders(outside - 1)
+            halves = zip(split_sliders(sliders), elsewhere, (0.0, None), strict=True)
+            return torch.cat([part(pixels, *half) for half in halves], dim=1)
+
+        return Fitted(added_and_rest, lambda image, found: held_back(found, activity(image), threshold), CALM_MARGIN)
+
+    return fit_change(source, change, planes, viewing_size, limits)
+
+
+def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
+    """Sliders less 1: those that strengthen detail, with 0 for the others, and the others."""
+    dim = 1 if sliders.ndim == 4 else sliders.ndim - 1
+    places = torch.arange(sliders.shape[dim], device=sliders.device)
+    is_detail = (places < sliders.shape[dim] - 1).view(-1, *[1] * (sliders.ndim - dim - 1))
+    zero = torch.zeros_like(sliders)
+    raised = (sliders > 0) & is_detail
+    return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
+
+
+def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
+    """The change (B, C, H, W) by added detail and the rest (B, 2 C, H, W), the former less where the image is calm.
+
+    The share of added detail is ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
+    """
+    added, rest = changes.chunk(2, dim=1)
+    if not isinstance(threshold, Tensor) and threshold == 0:
+        return added + rest
+    least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
+    return added * (activity / (activity + least).clamp(min=TINY)) + rest
+
+
+def activity(image: Tensor) -> Tensor:
+    """Variance (B, 1, H, W) of the luminance of an image around its pixels."""
+    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
+
+    grey = pad_border(reduce_channels(image, "luminance").mean(1, keepdim=True), CALM_MARGIN)
+    size = 2 * CALM_MARGIN + 1
+    moments = gaussian_blur2d(torch.cat([grey, grey.square()], dim=1), (size, size), (CALM, CALM))
+    mean, square = moments[..., CALM_MARGIN:-CALM_MARGIN, CALM_MARGIN:-CALM_MARGIN].chunk(2, dim=1)
+    return (square - mean.square()).clamp(min=0)
+
+
+def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
+    """Options of :func:`nonlocal_operator` for the filter of a step on an image (H, W) of the viewing size."""
+    found = {name: value for name, value in step.arguments(size).items() if name in FILTER}
+    share = DETAIL["spatial_bandwidth"].share
+    return found | {"spatial_bandwidth": nearby_or_far(found["spatial_bandwidth"], share, size)}
 
 
 def colour_masks(

@@ -8,8 +8,11 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.colour import Limits
+from nlfilter_torch.edits.detail import activity, held_back, split_sliders
 from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.source import Fitted, InMemory, Pixels, Source, luminance
+from nlfilter_torch.edits.viewing import fit_change, viewed_size
 from nlfilter_torch.filtering.fitted import fit_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -22,6 +25,9 @@ def filter_frames(
     references: Sequence[Tensor],
     residual: float | Tensor | None = DETAIL.defaults["residual"],
     channels: str = DETAIL.defaults["channels"],
+    threshold: float = DETAIL.defaults["threshold"],
+    limits: Limits = DETAIL.defaults["limits"],
+    viewing_size: float = DETAIL.defaults["viewing_size"],
     **options: Any,
 ) -> Iterator[Tensor]:
     """Filter the frames of a film, or any set of like images, with one filter, so that the edit does not flicker.
@@ -33,6 +39,9 @@ def filter_frames(
             all of them. What looks like nothing in them stays as it is.
         residual: of :func:`polynomial_filter`.
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
+        threshold: of :func:`enhance`, and so are ``limits`` and ``viewing_size``.
+        limits: how far pixels may get brighter or darker.
+        viewing_size: in megapixels.
         **options: of :func:`nonlocal_operator`, for the luminance of the references.
 
     Returns:
@@ -66,16 +75,34 @@ def filter_frames(
     for frame in references:
         check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
+    DETAIL["limits"].check_argument(limits)
+    DETAIL["threshold"].check_argument(threshold)
+    DETAIL["viewing_size"].check_argument(viewing_size)
     # One above the other they are one image; the few patches across a seam are the price.
-    tall = torch.cat([frame.to(working_dtype(frame)) for frame in references], dim=2)
-    grey = reduce_channels(tall, "luminance")
-    filtered = tall if channels == "all" else grey
+    viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
+    reduced = [InMemory(frame.to(working_dtype(frame))).resized(viewed).image for frame in references]
+    grey = reduce_channels(torch.cat(reduced, dim=2), "luminance")
+    filtered = torch.cat(reduced, dim=2) if channels == "all" else grey
     fitted = fit_filter(nonlocal_operator(grey, **options), filtered, order=alpha.shape[-1] - 1)
+    planes = (lambda pixels: pixels.image) if channels == "all" else luminance
+
+    def change(source: Source) -> Fitted:
+        def of(pixels: Pixels) -> Tensor:
+            before, guide = planes(pixels), luminance(pixels)
+
+            def changed(sliders: Tensor, weight: float | Tensor | None) -> Tensor:
+                return fitted(before, sliders, guide, residual=weight)
+
+            added, rest = split_sliders(alpha - 1)
+            if residual is None:
+                return torch.cat([changed(added, None), changed(rest, None)], dim=1)
+            return torch.cat([changed(added, 0.0), changed(rest, residual - 1)], dim=1)
+
+        return Fitted(of, lambda image, found: held_back(found, activity(image), threshold))
 
     def edit(frame: Tensor) -> Tensor:
         check_image(frame, "frames")
-        if channels == "all":
-            return fitted(frame, alpha, reduce_channels(frame, "luminance"), residual=residual)
-        return edit_luminance(frame, lambda planes: fitted(planes, alpha, residual=residual))
+        source = InMemory(frame.to(working_dtype(frame)))
+        return source.all(fit_change(source, change, planes, viewing_size, limits)).to(frame.dtype)
 
     return map(edit, frames)

@@ -17,15 +17,22 @@ from nlfilter_torch.edits.declaration import (
 )
 
 ALIKE = "How different two spots may be and still count as alike"
-CRISP = (3.0, 3.0, 4.0, 1.05)
+CRISP = (2.2, 2.2, 2.2, 1.0)
+NEAR = 1 / 12  # of the short side: how far shading is compared, so that it is no detail
 #: Arguments of the filter of an edit.
 FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 
 
 def _filter(
-    *, bandwidth: Any = None, share: float = 0.0, patch_size: int = 5, landmarks: int = 100, auto: bool = False
+    *,
+    bandwidth: Any = None,
+    share: float = 0.0,
+    patch_size: int = 5,
+    landmarks: int = 100,
+    auto: bool = False,
+    far: bool = False,
 ) -> tuple[Parameter, ...]:
-    """Parameters of the filter of an edit, with its defaults."""
+    """Parameters of the filter of an edit, with its defaults; ``far`` if distance may also not count at all."""
     levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) touch fine texture only, large ones (40) treat "
     photometric = Parameter(
         "bandwidth",
@@ -38,7 +45,9 @@ def _filter(
         optional=bandwidth is None,
         argument="photometric_bandwidth",
     )
-    reach = "as far as the picture goes" if share == 0 else f"{share:g} of the short side"
+    reach = "as far as the picture goes" if share == 0 else f"{share:.2g} of the short side"
+    if far:
+        reach += ". `none`: distance does not count, and large areas of light and dark are details, too"
     return (
         photometric,
         Parameter(
@@ -48,6 +57,7 @@ def _filter(
             f"How far apart two spots may be and still count as alike. Left out: {reach}.",
             *DISTANCES,
             "px",
+            words=("none",) if far else (),
             optional=True,
             share=share,
         ),
@@ -81,6 +91,28 @@ def _filter(
     )
 
 
+#: Of all edits of brightness.
+LIMITS = Parameter(
+    "limits",
+    "choice",
+    "soft",
+    "How far pixels may get brighter or darker: `soft` keeps what highlights and shadows show, `none` lets them clip.",
+    domain="choice",
+    choices=("soft", "none"),
+)
+#: Likewise.
+VIEWING_SIZE = Parameter(
+    "viewing_size",
+    "number",
+    1.5,
+    "Size at which the picture is looked at, in millions of pixels, so that the sliders do the same to it at any "
+    "resolution. In larger photographs patches and lengths are counted in pixels of that size. 0: of the file.",
+    0,
+    1e6,
+    domain="not negative",
+    zero="0 is the size of the image",
+    metavar="MEGAPIXELS",
+)
 DETAIL = Edit(
     "detail",
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
@@ -89,7 +121,7 @@ DETAIL = Edit(
     the camera (EXIF). Photographs that fit no memory are worked out in tiles; best as TIFF files or arrays of zarr,
     read in parts.
 
-    Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,4,1.05`
+    Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,3,1`
 
     A look with a name: `nlfilter-torch detail in.jpg out.jpg --preset crisp`
 
@@ -155,7 +187,21 @@ DETAIL = Edit(
             metavar="TIME",
             slider=Slider("Reach of the region", 0.1, 5, 0.1),
         ),
-        *_filter(bandwidth="auto", auto=True),
+        Parameter(
+            "threshold",
+            "number",
+            5.0,
+            "Detail of less contrast than this is strengthened less, since it may be noise: a standard deviation in "
+            "grey levels of 255. 0: all alike.",
+            0,
+            255,
+            "levels",
+            domain="not negative",
+            zero="0 strengthens all detail alike",
+        ),
+        LIMITS,
+        VIEWING_SIZE,
+        *_filter(bandwidth=20.0, share=NEAR, landmarks=300, auto=True, far=True),
     ),
     hint="Paint on what is to have sliders of its own; all that looks like it follows.",
     brushes=(("in", "Edit this"), ("out", "Not this")),
@@ -191,6 +237,8 @@ SHARPEN = Edit(
             zero="0 leaves the guide as it is",
             slider=Slider("Grain overlooked", 0, 4, 0.1, live=False),
         ),
+        LIMITS,
+        VIEWING_SIZE,
         *_filter(bandwidth=10.0, auto=True),
     ),
     hint="Sharper edges without more noise.",
@@ -225,7 +273,9 @@ TONE = Edit(
             idle=1.0,
             slider=Slider("Clarity", 0, 5, 0.1, live=False),
         ),
-        *_filter(bandwidth="auto", auto=True),
+        LIMITS,
+        VIEWING_SIZE,
+        *_filter(bandwidth=20.0, share=NEAR, landmarks=300, auto=True, far=True),
     ),
     hint="Contrast of large shapes, and of the detail on them.",
 )

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.edits.parameters import DETAIL, FILTER
+from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.recipe import Recipe, in_file
 from nlfilter_torch.edits.steps import Step
 
@@ -24,22 +24,28 @@ class Preset:
     Attributes:
         alpha: sliders, fine to coarse, at least two. Paper: eq. (12).
         bandwidth: photometric bandwidth in grey levels of 255, or ``"auto"``.
-        spatial_bandwidth: in pixels, or None.
+        spatial_bandwidth: in pixels, ``"none"`` for none, or None for a twelfth of the short side.
         patch_size: odd.
         landmarks: how many.
         sampling: ``"kmeans"``, ``"uniform"`` or ``"random"``.
         residual: gain of what no landmark explains, or None for that of the finest layer.
         channels: ``"luminance"`` or ``"all"``.
+        threshold: in grey levels, contrast of detail below which it is strengthened less.
+        limits: ``"soft"`` or ``"none"``.
+        viewing_size: in megapixels.
     """
 
     alpha: tuple[float, ...]
     bandwidth: float | str = DETAIL["bandwidth"].default
-    spatial_bandwidth: float | None = DETAIL["spatial_bandwidth"].default
+    spatial_bandwidth: float | str | None = DETAIL["spatial_bandwidth"].default
     patch_size: int = DETAIL["patch_size"].default
     landmarks: int = DETAIL["landmarks"].default
     sampling: str = DETAIL["sampling"].default
     residual: float | None = DETAIL["residual"].default
     channels: str = DETAIL["channels"].default
+    threshold: float = DETAIL["threshold"].default
+    limits: str = DETAIL["limits"].default
+    viewing_size: float = DETAIL["viewing_size"].default
 
     def apply(self, image: "Tensor", *, generator: "torch.Generator | None" = None) -> "Tensor":
         """Edit a photograph as ``nlfilter-torch detail --preset`` does.
@@ -64,13 +70,15 @@ class Preset:
 
         return apply_step(self.step, image, generator=generator)
 
-    def options(self) -> dict[str, Any]:
-        """What :func:`nlfilter_torch.nonlocal_operator` takes, in units of the picture.
+    def options(self, size: tuple[int, int]) -> dict[str, Any]:
+        """What :func:`nlfilter_torch.nonlocal_operator` takes for an image (H, W), in units of the picture.
 
-        >>> PRESETS["smooth"].options()["photometric_bandwidth"] * 255
-        12.0
+        >>> PRESETS["smooth"].options((240, 320))["spatial_bandwidth"]
+        20.0
         """
-        return {name: value for name, value in self.step.arguments((0, 0)).items() if name in FILTER}
+        from nlfilter_torch.edits.detail import options_of
+
+        return options_of(self.step, size)
 
     @property
     def step(self) -> Step:
@@ -90,10 +98,13 @@ class Preset:
               "residual": null,
               "channels": "luminance",
               "time": 1.0,
+              "threshold": 5.0,
+              "limits": "soft",
+              "viewing_size": 1.5,
               "bandwidth": 20.0,
               "spatial_bandwidth": null,
               "patch_size": 5,
-              "landmarks": 100,
+              "landmarks": 300,
               "sampling": "kmeans"
             }
           ]
@@ -128,11 +139,11 @@ def _preset(recipe: Recipe, name: str) -> Preset:
 
 #: The presets that have a name. Chosen by eye on astronaut, chelsea, coffee and rocket of scikit-image.
 PRESETS: dict[str, Preset] = {
-    "crisp": Preset((3.0, 3.0, 4.0, 1.05)),
-    "clear": Preset((1.5, 1.7, 1.8, 1.0)),
+    "crisp": Preset((2.2, 2.2, 2.2, 1.0)),
+    "clear": Preset((1.5, 1.5, 1.5, 1.0)),
     "texture": Preset((3.0, 1.5, 1.0, 1.0)),
-    "dramatic": Preset((2.0, 3.0, 4.5, 0.95), 30.0),
-    "glow": Preset((0.3, 1.0, 2.5, 1.06), 30.0),
+    "dramatic": Preset((2.0, 2.5, 3.5, 1.0), 40.0),
+    "glow": Preset((0.3, 1.0, 2.5, 1.0), 30.0),
     "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 8.0),
     "calm": Preset((0.8, 0.6, 0.4, 1.0), 40.0),
     "smooth": Preset((0.0, 0.0, 0.0, 1.0), 12.0),

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.colour import Limits
 from nlfilter_torch.edits.parameters import SHARPEN
 from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import reduce_channels
 
 
@@ -20,6 +21,8 @@ def sharpen(
     *,
     amount: float | Tensor = SHARPEN.defaults["amount"],
     guide_blur: float = SHARPEN.defaults["guide_blur"],
+    limits: Limits = SHARPEN.defaults["limits"],
+    viewing_size: float = SHARPEN.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = SHARPEN.defaults["photometric_bandwidth"],
     **options: Any,
 ) -> Tensor:
@@ -34,6 +37,10 @@ def sharpen(
         amount: sliders alpha_2 and alpha_3, a number or a tensor of shape () or (B,); 1 changes nothing, 4 is visible,
             8 is strong.
         guide_blur: standard deviation in pixels of the blur of the guide, at most half the short side, 0 for none.
+        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+            clip.
+        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
+            bandwidths are in pixels of that; 0 is the size of the image.
         photometric_bandwidth: h_y of the blurred guide.
         **options: further ones of :func:`nonlocal_operator`.
 
@@ -55,6 +62,8 @@ def sharpen(
         fit_sharpen,
         amount=amount,
         guide_blur=guide_blur,
+        limits=limits,
+        viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
         **options,
     )
@@ -65,15 +74,24 @@ def fit_sharpen(
     *,
     amount: float | Tensor = SHARPEN.defaults["amount"],
     guide_blur: float = SHARPEN.defaults["guide_blur"],
+    limits: Limits = SHARPEN.defaults["limits"],
+    viewing_size: float = SHARPEN.defaults["viewing_size"],
     **options: Any,
 ) -> Fitted:
     """:func:`sharpen` for any source."""
     SHARPEN["amount"].check_argument(amount, source.batch)
     SHARPEN["guide_blur"].check_argument(guide_blur)
-    check_reach(guide_blur, "guide_blur", source.size)
+    SHARPEN["limits"].check_argument(limits)
+    SHARPEN["viewing_size"].check_argument(viewing_size)
     grey = partial(reduce_channels, guide_channels="luminance")  # one channel to blur in place of three
-    operator = source.operator(Guide(options, look=grey, blur=guide_blur))
-    filtered = polynomial(operator, luminance, 3, None)
     middle = torch.as_tensor(amount, dtype=torch.float32).reshape(-1).expand(source.batch)
-    alpha = torch.stack([torch.ones_like(middle), middle, middle, torch.ones_like(middle)], dim=1)
-    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: filtered(pixels, alpha)))
+    still = torch.zeros_like(middle)
+    sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, which gives the change
+
+    def change(viewed: Source) -> Fitted:
+        check_reach(guide_blur, "guide_blur", viewed.size)
+        operator = viewed.operator(Guide(options, look=grey, blur=guide_blur))
+        changed = polynomial(operator, luminance, 3, None)
+        return Fitted(lambda pixels: changed(pixels, sliders))
+
+    return fit_change(source, change, luminance, viewing_size, limits)

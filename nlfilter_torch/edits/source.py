@@ -18,6 +18,10 @@ from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.edits.pixels import Fitted as Fitted
+from nlfilter_torch.edits.pixels import Pixels as Pixels
+from nlfilter_torch.edits.pixels import Planes as Planes
+from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.filtering.scribbles import check_painted
@@ -26,20 +30,6 @@ from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum
 
-
-class Pixels(Protocol):
-    """Some pixels of a picture: all of them, or some of its rows."""
-
-    @property
-    def image(self) -> Tensor:
-        """(B, C, h, W)."""
-
-    @property
-    def first(self) -> int:
-        """Number of the first one, along the rows of the picture."""
-
-
-Planes = Callable[[Any], Tensor]  # of some pixels, (B, C, h, W)
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
 
@@ -139,6 +129,19 @@ class Source(Protocol):
             ValueError: if they do not fit the picture, or are ``needed`` and cover no pixel.
         """
 
+    def resized(self, size: tuple[int, int]) -> "Source":
+        """The picture in a smaller size (H, W)."""
+
+    def resized_weights(self, weights: Any, size: tuple[int, int], name: str) -> Any:
+        """Weights (B, K, H, W) of its pixels, in whatever form the source has these, in a smaller size (H, W).
+
+        Raises:
+            ValueError: if they do not fit the picture; ``name`` is theirs in errors.
+        """
+
+    def all(self, fitted: "Fitted") -> Tensor:
+        """The planes (B, C, H, W) that an edit makes of all pixels, for pictures that are small enough."""
+
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
@@ -149,24 +152,6 @@ class Source(Protocol):
             response: non-negative, from an image (B, C, H, W) to one without these.
             margin: how many pixels around a pixel it depends on.
         """
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """What an edit does to any pixels of a picture that it was fitted to.
-
-    Attributes:
-        pixels: the edited pixels, or planes that ``finish`` makes these from.
-        finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
-        margin: how many.
-        step: ``finish`` works on every so many pixels, counted from the first of what it is given, which tiles and
-            ``margin`` are therefore multiples of.
-    """
-
-    pixels: Planes
-    finish: Callable[[Tensor, Tensor], Tensor] | None = None
-    margin: int = 0
-    step: int = 1
 
 
 class InMemory:
@@ -221,6 +206,23 @@ class InMemory:
         if colours is not None:
             shown = colours.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)[:, :, places]
         return Scribbles(places, weights[:, :, places], image, shown)
+
+    def resized(self, size: tuple[int, int]) -> "InMemory":
+        """The image in another size."""
+        if size == self.size:
+            return self
+        return InMemory(resize(self.image, size))
+
+    def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
+        """Weights in another size."""
+        check_same_size(weights, self.size, name, "image")
+        least = float(weights.detach().min())  # interpolation may go below it, but hides no weight that is invalid
+        return resize(weights.to(self.image), size).clamp(min=least)
+
+    def all(self, fitted: "Fitted") -> Tensor:
+        """All pixels under an edit."""
+        planes = fitted.pixels(self)
+        return planes if fitted.finish is None else fitted.finish(self.image, planes)
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
@@ -286,16 +288,20 @@ def luminance(pixels: Pixels) -> Tensor:
 
 def polynomial(
     operator: Operator, planes: Planes, order: int, residual: float | Tensor | None
-) -> Callable[[Any, Tensor], Tensor]:
-    """:func:`polynomial_filter` of some planes of a picture, of any of its pixels and for any sliders."""
+) -> Callable[..., Tensor]:
+    """:func:`polynomial_filter` of some planes of a picture, of any of its pixels and for any sliders.
+
+    The weight of the residual may follow these, in place of the filter's.
+    """
     layers = operator.layers(planes, order)
     if residual is None:
-        return lambda pixels, alpha: weigh_layers(layers(pixels), alpha)
+        return lambda pixels, alpha, _=None: weigh_layers(layers(pixels), alpha)
     captured = synthesize(operator, torch.ones_like, operator.coefficients(planes))
     share = operator.each(lambda columns: columns.remainder.unsqueeze(1))
 
-    def filtered(pixels: Any, alpha: Tensor) -> Tensor:
-        change = residual_change(alpha, residual, planes(pixels) - captured(pixels), share(pixels))
+    def filtered(pixels: Any, alpha: Tensor, weight: float | Tensor | None = None) -> Tensor:
+        weight = residual if weight is None else weight
+        change = residual_change(alpha, weight, planes(pixels) - captured(pixels), share(pixels))
         return weigh_layers(layers(pixels), alpha) + change
 
     return filtered
@@ -304,10 +310,4 @@ def polynomial(
 def edited(image: Tensor, fit: Callable[..., Fitted], *arguments: Any, **options: Any) -> Tensor:
     """An image in memory under an edit, in its own dtype."""
     source = InMemory(image.to(working_dtype(image)))
-    return apply_fitted(fit(source, *arguments, **options), source).to(image.dtype)
-
-
-def apply_fitted(fitted: Fitted, source: InMemory) -> Tensor:
-    """All pixels of an image under an edit."""
-    planes = fitted.pixels(source)
-    return planes if fitted.finish is None else fitted.finish(source.image, planes)
+    return source.all(fit(source, *arguments, **options)).to(image.dtype)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.declaration import Edit, Parameter, is_within, shown
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
 
 if TYPE_CHECKING:
     from nlfilter_torch.edits.scribbles import Stroke
@@ -102,13 +102,9 @@ class Step:
         )  # 3x3 in colour is as large as 5x5 in grey
         return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
 
-    def arguments(self, size: tuple[int, int], stride: int = 1) -> dict[str, Any]:
+    def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
         """Arguments of the edit's function for an image of a size, see :meth:`Parameter.argument_of`."""
         return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_option}
-
-    def filter_options(self) -> dict[str, Any]:
-        """What :func:`nlfilter_torch.nonlocal_operator` takes, of parameters that do not depend on the image's size."""
-        return {name: value for name, value in self.arguments((0, 0)).items() if name in FILTER}
 
     def to_json(self, indent: str = "", *, complete: bool = False) -> str:
         """The step as a JSON object, a line for each entry, and a line for each stroke.

@@ -7,9 +7,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.colour import Limits, nearby_or_far
 from nlfilter_torch.edits.parameters import TONE
 from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.viewing import fit_change
 
 
 @full_precision
@@ -19,6 +20,11 @@ def adjust_tone(
     contrast: float | Tensor = TONE["contrast"].idle,
     clarity: float | Tensor = TONE["clarity"].idle,
     order: int = 3,
+    limits: Limits = TONE.defaults["limits"],
+    viewing_size: float = TONE.defaults["viewing_size"],
+    photometric_bandwidth: float | Tensor | str = TONE.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
+    num_landmarks: int = TONE.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
     """Raise or lower the contrast of large shapes, and of the coarsest detail on them, with the mean held.
@@ -31,7 +37,15 @@ def adjust_tone(
         contrast: alpha_{k+1}, a number or a tensor of shape () or (B,); 1 changes nothing, 1.4 is strong.
         clarity: alpha_k, likewise; bears larger values.
         order: k, at least 1.
-        **options: of :func:`nonlocal_operator`.
+        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+            clip, and holds the mean exactly.
+        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
+            bandwidths are in pixels of that; 0 is the size of the image.
+        photometric_bandwidth: h_y, or ``"auto"``.
+        spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
+            apart they are.
+        num_landmarks: M.
+        **options: further ones of :func:`nonlocal_operator`.
 
     Returns:
         (B, C, H, W) of the same mean in every channel; values may leave [0, 1]. Differentiable in image, contrast and
@@ -42,12 +56,24 @@ def adjust_tone(
 
     Example:
         >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
-        >>> strong = adjust_tone(image, contrast=1.4, num_landmarks=50)
+        >>> strong = adjust_tone(image, contrast=1.4, limits="none", num_landmarks=50)
         >>> bool((strong.mean((2, 3)) - image.mean((2, 3))).abs().max() < 1e-5), bool(strong.std() > image.std())
         (True, True)
     """
     check_photograph(image, "image")
-    return edited(image, fit_tone, contrast=contrast, clarity=clarity, order=order, **options)
+    return edited(
+        image,
+        fit_tone,
+        contrast=contrast,
+        clarity=clarity,
+        order=order,
+        limits=limits,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=num_landmarks,
+        **options,
+    )
 
 
 def fit_tone(
@@ -56,18 +82,34 @@ def fit_tone(
     contrast: float | Tensor = TONE["contrast"].idle,
     clarity: float | Tensor = TONE["clarity"].idle,
     order: int = 3,
+    limits: Limits = TONE.defaults["limits"],
+    viewing_size: float = TONE.defaults["viewing_size"],
+    photometric_bandwidth: float | Tensor | str = TONE.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
+    num_landmarks: int = TONE.defaults["num_landmarks"],
     **options: Any,
 ) -> Fitted:
     """:func:`adjust_tone` for any source."""
     check_order(order)
     TONE["contrast"].check_argument(contrast, source.batch)
+    TONE["limits"].check_argument(limits)
+    TONE["viewing_size"].check_argument(viewing_size)
     TONE["clarity"].check_argument(clarity, source.batch)
-    operator, mean = source.operator(Guide(options)), source.mean(luminance)
 
     def slider(value: float | Tensor) -> Tensor:
-        return torch.as_tensor(value).to(mean).reshape(-1).expand(source.batch)
+        return torch.as_tensor(value).to(source.dtype).reshape(-1).expand(source.batch)
 
-    fine = [torch.ones_like(slider(1.0))] * (order - 1)
-    alpha = torch.stack([*fine, slider(clarity), slider(contrast)], dim=1)
-    filtered = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
-    return Fitted(lambda pixels: edit_luminance(pixels.image, lambda _: mean + filtered(pixels, alpha)))
+    fine = [torch.zeros_like(slider(1.0))] * (order - 1)
+    sliders = torch.stack([*fine, slider(clarity) - 1, slider(contrast) - 1], dim=1)  # less 1, which gives the change
+
+    def change(viewed: Source) -> Fitted:
+        filter_options = options | {
+            "photometric_bandwidth": photometric_bandwidth,
+            "spatial_bandwidth": nearby_or_far(spatial_bandwidth, TONE["spatial_bandwidth"].share, viewed.size),
+            "num_landmarks": num_landmarks,
+        }
+        operator, mean = viewed.operator(Guide(filter_options)), viewed.mean(luminance)
+        changed = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
+        return Fitted(lambda pixels: changed(pixels, sliders))
+
+    return fit_change(source, change, luminance, viewing_size, limits)

@@ -4,12 +4,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted, Guide, Planes
 from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
@@ -125,6 +127,45 @@ class Tiled:
         return found
 
     @torch.no_grad()
+    def resized(self, size: tuple[int, int]) -> "Tiled":
+        """The picture in a smaller size, in memory: a source of its own, which is read as this one is."""
+
+        def read(start: int, stop: int) -> Tensor:
+            self.passes.report("Reducing", start, self.size[0])
+            return self.picture.tile(start, stop, 0).pixels
+
+        planes = resized(read, self.size, size)[0].permute(1, 2, 0).numpy()
+        kind = "float32" if self.dtype == torch.float32 else "float64"
+        passes = replace(self.passes, kind=kind, tile_rows=None)
+        return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
+
+    @torch.no_grad()
+    def resized_weights(self, weights: RowSource, size: tuple[int, int], name: str) -> RowSource:
+        """Weights, rows (H, W, K), in a smaller size."""
+        self._check_weights(weights, name)
+        least = [0.0]  # interpolation may go below it, but hides no weight that is invalid
+
+        def read(start: int, stop: int) -> Tensor:
+            rows = torch.from_numpy(np.array(weights[start:stop], np.float32)).permute(2, 0, 1)[None]
+            least.append(float(rows.min()))
+            return rows
+
+        return resized(read, self.size, size).clamp(min=min(least))[0].permute(1, 2, 0).contiguous().numpy()
+
+    def _check_weights(self, weights: RowSource, name: str) -> None:
+        """Raise unless they have the size of the picture."""
+        if tuple(weights.shape[:2]) != self.size or len(weights.shape) != 3:
+            raise ValueError(
+                f"{name} must have the shape {(*self.size, 'K')}, the picture's and the number of regions, got "
+                f"{tuple(weights.shape)}; resize them"
+            )
+
+    def all(self, fitted: Fitted) -> Tensor:
+        """The planes (1, C, H, W) that an edit makes of all pixels."""
+        rows = np.concatenate([values for _, values in self.rows(fitted)])
+        return torch.from_numpy(rows).permute(2, 0, 1)[None]
+
+    @torch.no_grad()
     def mean(self, planes: Planes) -> Tensor:
         """Means (1, C, 1, 1) over all pixels."""
         total: Tensor | float = 0.0
@@ -169,11 +210,8 @@ class Tiled:
             ValueError: if a region does not fit, is negative or empty.
         """
         for rows, name in ((regions, "regions"), (negative, "negative")):
-            if rows is not None and (tuple(rows.shape[:2]) != self.size or len(rows.shape) != 3):
-                raise ValueError(
-                    f"{name} must have the shape {(*self.size, 'K')}, the picture's and the number of regions, got "
-                    f"{tuple(rows.shape)}; resize them"
-                )
+            if rows is not None:
+                self._check_weights(rows, name)
         check_negative(1 if negative is None else negative.shape[2], regions.shape[2])
         operator = self.operator(guide)
         core = operator.pairs.basis(lambda eigenvalues: eigenvalues.pow(time))

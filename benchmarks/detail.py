@@ -1,0 +1,275 @@
+"""Detail against other methods at equal gain: ``python -m benchmarks.detail [--pictures FOLDER] [--quick] [--scales]``.
+
+The detail preset (sliders g, g, g, 1 and the defaults of ``enhance``) and other methods strengthen the luminance of
+the same photographs. Their strength is set by bisection so that the fine part, what a Gaussian of 2 pixels takes away,
+is 1.5 and 2 times as strong (RMS) on mid-strength texture: pixels whose surroundings have between 50 and 85 % of the
+picture's activity. Everything is measured on what a file of 8 bits would hold:
+
+halo      99th percentile of what lies beyond the local range of 11x11 pixels, in grey levels;
+noise     noise of 5 grey levels after the edit, over before, where the picture is flat (its calmer half), of two
+          realisations of noise;
+clipped   pixels of which a channel becomes 0 or 255 that was not, in percent;
+chroma    change of the mean chroma (YCbCr), in percent;
+mean      change of the mean brightness, in grey levels.
+
+With ``--scales``, one large photograph at 1.5, 6 and 24 megapixels under the same sliders: detail gain of each result
+reduced to 1.5 megapixels, and how far these are apart.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.detail_peers import clahe, detail_enhance, smoothers
+from benchmarks.photographs import pictures
+from benchmarks.unsharp import gaussian
+from nlfilter_torch import enhance
+from nlfilter_torch.edits.applying import apply_step
+from nlfilter_torch.edits.colour import change_luminance, edit_luminance
+from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.operator.features import reduce_channels
+
+CHOSEN_ON = ("astronaut", "coffee", "chelsea", "rocket")
+SIDE = 320
+GAINS = (1.5, 2.0)
+RADIUS = 2.0
+TEXTURE = (0.5, 0.85)  # quantiles of activity
+NOISE = 5 / 255
+STRONGEST = 60.0
+LARGE = "retina"
+FACTORS = (1, 2, 4)  # of the sides
+OURS = "nlfilter-torch"
+
+Strength = Callable[[float], Tensor]  # the photograph under a strength, 0 for none
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is measured of one result."""
+
+    halo: float
+    noise: float
+    clipped: float
+    chroma: float
+    mean: float
+
+    @property
+    def costs(self) -> tuple[float, float, float]:
+        """Those that are to be small."""
+        return (self.halo, self.noise, self.clipped)
+
+    def beats(self, other: "Figures") -> bool:
+        """Whether it is nowhere worse and somewhere better."""
+        pairs = list(zip(self.costs, other.costs, strict=True))
+        return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
+
+
+def luminance(image: Tensor) -> Tensor:
+    """(B, 1, H, W)."""
+    return reduce_channels(image, "luminance")
+
+
+def shown(image: Tensor) -> Tensor:
+    """As a file of 8 bits holds it."""
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+def fine(y: Tensor) -> Tensor:
+    """What a Gaussian of 2 pixels takes away."""
+    return y - gaussian(y, RADIUS)
+
+
+class Scene:
+    """A photograph, the same with noise, and where to look."""
+
+    def __init__(self, image: Tensor) -> None:
+        self.image = shown(image)
+        draws = torch.randn(2, 1, *image.shape[-2:], generator=torch.Generator().manual_seed(0))
+        self.noisy = [(self.image + NOISE * draw).clamp(0, 1) for draw in draws]
+        self.fine = fine(luminance(self.image))
+        activity = gaussian(self.fine.square(), 2 * RADIUS)
+        low, high = (activity.flatten().float().quantile(q) for q in TEXTURE)
+        self.texture = (activity >= low) & (activity <= high)
+        self.flat = activity < low
+
+    def gain(self, result: Tensor) -> float:
+        """Of detail, on mid-strength texture."""
+        after = fine(luminance(shown(result)))[self.texture]
+        return float((after.square().mean() / self.fine[self.texture].square().mean()).sqrt())
+
+    def figures(self, result: Tensor, noisy: list[Tensor]) -> Figures:
+        """Of a result, and of those of the noisy copies."""
+        before, after = self.image, shown(result)
+        y, z = luminance(before), luminance(after)
+        highest, lowest = F.max_pool2d(y, 11, 1, 5), -F.max_pool2d(-y, 11, 1, 5)
+        beyond = torch.maximum(z - highest, lowest - z).clamp(min=0)
+        noises = [(luminance(a) - luminance(b))[self.flat].std() for a, b in (noisy, self.noisy)]
+        newly = ((after <= 0) & (before > 0)) | ((after >= 1) & (before < 1))
+        chroma = [(x - luminance(x)).norm(dim=1).mean() for x in (after, before)]
+        return Figures(
+            255 * float(beyond.flatten().quantile(0.99)),
+            float(noises[0] / noises[1]),
+            100 * float(newly.any(1).float().mean()),
+            100 * float(chroma[0] / chroma[1] - 1) if chroma[1] > 0 else 0.0,
+            255 * float((z - y).mean()),
+        )
+
+
+def ours(image: Tensor) -> Strength:
+    """The detail edit for any strength from one filter: before the limits it is linear in the sliders."""
+    change = luminance(enhance(image, torch.tensor([2.0, 2.0, 2.0, 1.0]), limits="none")) - luminance(image)
+    return lambda strength: change_luminance(image, strength * change)
+
+
+def boosted(smooth: Callable[..., object]) -> Callable[[Tensor], Strength]:
+    """A method that adds a multiple of what a smoothing filter takes away."""
+
+    def of(image: Tensor) -> Strength:
+        y = luminance(image)
+        detail = y - torch.as_tensor(smooth(y[0, 0].numpy().copy()))[None, None]
+        return lambda strength: edit_luminance(image, lambda y: y + strength * detail)
+
+    return of
+
+
+def equalized(image: Tensor) -> Strength:
+    """CLAHE of luminance."""
+
+    def edit(y: Tensor, strength: float) -> Tensor:
+        return torch.from_numpy(clahe(y[0, 0].numpy(), strength))[None, None]
+
+    return lambda strength: edit_luminance(image, lambda y: edit(y, strength))
+
+
+METHODS: dict[str, Callable[[Tensor], Strength]] = {
+    OURS: ours,
+    **{name: boosted(smooth) for name, smooth in smoothers().items()},
+    "detailEnhance": lambda image: lambda strength: detail_enhance(image, strength),
+    "CLAHE": equalized,
+}
+
+
+def reach(scene: Scene, strength: Strength, gain: float) -> float | None:
+    """The strength that has the gain, or None where none has."""
+    low, high = 0.0, 1.0
+    while scene.gain(strength(high)) < gain:
+        low, high = high, 2 * high
+        if high > STRONGEST:
+            return None
+    for _ in range(12):
+        middle = (low + high) / 2
+        low, high = (middle, high) if scene.gain(strength(middle)) < gain else (low, middle)
+    return high
+
+
+def measure(scene: Scene) -> dict[float, dict[str, Figures | None]]:
+    """Figures of every method for every gain; None where it does not reach it."""
+    found: dict[float, dict[str, Figures | None]] = {gain: {} for gain in GAINS}
+    for name, method in METHODS.items():
+        clean, *noisy = (method(image) for image in (scene.image, *scene.noisy))
+        for gain in GAINS:
+            amount = reach(scene, clean, gain)
+            if amount is None:
+                found[gain][name] = None
+            else:
+                found[gain][name] = scene.figures(clean(amount), [shown(one(amount)) for one in noisy])
+    return found
+
+
+def row(cells: list[str]) -> str:
+    """Of a table."""
+    return f"{cells[0]:18}" + "".join(f"{cell:>9}" for cell in cells[1:])
+
+
+def compare(images: dict[str, Tensor]) -> None:
+    """Print a table for each picture and gain, and what it says."""
+    lost: list[str] = []
+    fronts = least = cases = 0
+    worst = [0.0, 0.0]
+    means: dict[tuple[float, str], list[Figures]] = {}
+    for name, image in images.items():
+        for gain, rows in measure(Scene(image)).items():
+            print(f"\n{name}, detail gain {gain}")
+            print(row(["", "halo", "noise", "clipped", "chroma", "mean"]))
+            for method, f in rows.items():
+                cells = ["not reached"] if f is None else [
+                    f"{f.halo:.1f}", f"{f.noise:.2f}", f"{f.clipped:.2f}", f"{f.chroma:+.1f}", f"{f.mean:+.2f}"
+                ]  # fmt: skip
+                print(row([method, *cells]), flush=True)
+                if f is not None:
+                    means.setdefault((gain, method), []).append(f)
+            own = rows[OURS]
+            cases += 1
+            if own is None:
+                lost.append(f"{name}, gain {gain}: not reached")
+                continue
+            peers = {method: f for method, f in rows.items() if f is not None and method != OURS}
+            better = [method for method, f in peers.items() if f.beats(own)]
+            fronts += not better
+            least += own.clipped <= min((f.clipped for f in peers.values()), default=100.0)
+            worst = [max(worst[0], abs(own.chroma)), max(worst[1], abs(own.mean))]
+            lost += [f"{name}, gain {gain}: {method} in halo, noise and clipped share" for method in better]
+            for i, figure in enumerate(("halo", "noise gain", "clipped share")):
+                ahead = [f"{m} {f.costs[i]:.2f}" for m, f in peers.items() if f.costs[i] < own.costs[i]]
+                if ahead:
+                    lost.append(f"{name}, gain {gain}: {figure} {own.costs[i]:.2f}: {', '.join(ahead)}")
+    for gain in GAINS:
+        print(f"\nmean of the pictures on which it is reached, detail gain {gain}")
+        print(row(["", "halo", "noise", "clipped", "reached"]))
+        for method in METHODS:
+            known = means.get((gain, method), [])
+            columns = [sum(f.costs[i] for f in known) / len(known) for i in range(3)] if known else []
+            print(row([method, *(f"{mean:.2f}" for mean in columns), f"{len(known)}/{len(images)}"]))
+    print(f"\non the Pareto front of halo, noise gain and clipped share: {fronts} of {cases}")
+    print(f"clipped share at most that of the best peer: {least} of {cases}")
+    print(f"largest change of chroma {worst[0]:.1f} %, of mean brightness {worst[1]:.2f} levels")
+    print("\nlost comparisons\n" + "\n".join(lost or ["none"]))
+
+
+def compare_scales(name: str, image: Tensor, megapixels: float) -> None:
+    """Print the detail gain of every named preset at the viewing size, for pictures of 1, 4 and 16 times that size."""
+    print(f"{name}: detail gain at {megapixels:g} megapixels, and RMS difference from the first result in grey levels")
+    scale = (megapixels * 1e6 / image[0, 0].numel()) ** 0.5
+    viewed = [round(scale * length) for length in image.shape[-2:]]
+
+    def sized(picture: Tensor, factor: int) -> Tensor:
+        size = [factor * length for length in viewed]
+        return F.interpolate(picture, size, mode="bicubic", antialias=True).clamp(0, 1)
+
+    print(row(["", *(f"{factor**2 * megapixels:g} MP" for factor in FACTORS), "apart", "RMS"]))
+    for preset in PRESETS:
+        gains, views = [], []
+        for factor in FACTORS:
+            large = sized(image, factor)
+            step = PRESETS[preset].step.changed(viewing_size=megapixels)
+            views.append(sized(apply_step(step, large), 1))
+            gains.append(Scene(sized(large, 1)).gain(views[-1]))
+        apart = 100 * (max(gains) / min(gains) - 1)
+        rms = max(255 * float((view - views[0]).square().mean().sqrt()) for view in views)
+        print(row([preset, *(f"{gain:.2f}" for gain in gains), f"{apart:.1f} %", f"{rms:.2f}"]), flush=True)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print tables."""
+    parser = argparse.ArgumentParser(description="Detail against other methods at equal gain.")
+    parser.add_argument("--pictures", type=Path, help="a folder of photographs, in place of scikit-image's")
+    parser.add_argument("--side", type=int, default=SIDE, help="pixels of the short side they are reduced to")
+    parser.add_argument("--scales", action="store_true", help="the same presets on one photograph in three sizes")
+    parser.add_argument("--quick", action="store_true", help="two photographs at 64 pixels, to see that it runs")
+    options = parser.parse_args(arguments)
+    names = CHOSEN_ON[:2] if options.quick else CHOSEN_ON
+    if options.scales:
+        name, image = next(iter(pictures(options.pictures, 1 << 14, (LARGE,)).items()))
+        compare_scales(name, image, 0.01 if options.quick else DETAIL["viewing_size"].default)
+    else:
+        compare(pictures(options.pictures, 64 if options.quick else options.side, names))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""Some pixels of a picture, and what an edit makes of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+
+class Pixels(Protocol):
+    """Some pixels of a picture: all of them, or some of its rows."""
+
+    @property
+    def image(self) -> Tensor:
+        """(B, C, h, W)."""
+
+    @property
+    def first(self) -> int:
+        """Number of the first one, along the rows of the picture."""
+
+
+Planes = Callable[[Any], Tensor]  # of some pixels, (B, C, h, W)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What an edit does to any pixels of a picture that it was fitted to.
+
+    Attributes:
+        pixels: the edited pixels, or planes that ``finish`` makes these from.
+        finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
+        margin: how many.
+        step: ``finish`` works on every so many pixels, counted from the first of what it is given, which tiles and
+            ``margin`` are therefore multiples of.
+    """
+
+    pixels: Planes
+    finish: Callable[[Tensor, Tensor], Tensor] | None = None
+    margin: int = 0
+    step: int = 1
