@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -115,8 +116,8 @@ def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., N
     """Give a command the options of detail of these names, in place of its ``**given``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        own = [p for p in inspect.signature(function, eval_str=True).parameters.values() if p.kind != p.VAR_KEYWORD]
-        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+        found = inspect.signature(function, eval_str=True).parameters.values()
+        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in found if p.kind != p.VAR_KEYWORD]
         signature = inspect.Signature([*own, *_declared(EDITS["detail"][name] for name in names)])
         setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
         return function
@@ -166,29 +167,27 @@ def edit_photograph(
     edit = EDITS[name]
     step = step_of(edit, given)
 
-    from contextlib import ExitStack
-
     from torch import Tensor
 
     from nlfilter_torch.cli import editing, scribbles
     from nlfilter_torch.cli.editing import Job
-    from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
+    from nlfilter_torch.edits.applying import apply_to, fit_step, seeded
     from nlfilter_torch.io.photographs import Photograph
-    from nlfilter_torch.io.rows import open_picture
+    from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture, Rows
 
     def work(photograph: Photograph) -> Tensor:
-        check_channels(name, photograph.pixels.shape[1])
+        free = editing.allowed_memory(memory)
         with ExitStack() as files:
-            free = editing.allowed_memory(memory)
-            drawn = scribbles.of_edit(
-                step, photograph.size, given, lambda path: files.enter_context(open_picture(path, free))
-            )
+
+            def read(path: Path) -> StoredPicture:
+                return files.enter_context(open_picture(path, free))
+
+            drawn = scribbles.of_edit(step, photograph.size, given, read)
             return apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
 
     def by_rows(job: Job) -> Rows:
-        check_channels(name, job.picture.shape[2])
         tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
         drawn = scribbles.of_edit(step, job.size, given, job.open)
         yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)

@@ -67,8 +67,8 @@ class Overlay:
     picture: Picture | None
     rectangles: list[tuple[Rectangle, slice, list[float]]]
     dtype = np.dtype(np.float32)
-    marks: ClassVar[int]  # the channel of the picture that is 0 where it says nothing
-    nothing: ClassVar[str]  # end of the sentence for a picture that says nothing
+    marked: ClassVar[int]  # the channel that is above 0 where something is marked
+    empty: ClassVar[str]  # end of the error for a picture in which nothing is marked
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         raise NotImplementedError
@@ -87,18 +87,18 @@ class Overlay:
         """All rows, as planes (1, S, H, W).
 
         Raises:
-            ValueError: if there is a picture that says nothing.
+            ValueError: if there is a picture in which nothing is marked.
         """
         rows = slice(0, self.shape[0])
-        if self.picture is not None and not self._of_picture(rows, self.picture)[..., self.marks].any():
-            raise ValueError(f"{self.picture.name} is {self.nothing}")
+        if self.picture is not None and not self._of_picture(rows, self.picture)[..., self.marked].any():
+            raise ValueError(f"{self.picture.name} is {self.empty}")
         return torch.from_numpy(self[rows]).permute(2, 0, 1)[None].contiguous()
 
 
 class Regions(Overlay):
     """Weights of regions, the first of them in the picture."""
 
-    marks, nothing = 0, "black everywhere; paint white what is to be selected"
+    marked, empty = 0, "black everywhere; paint white what is to be selected"
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
@@ -109,7 +109,7 @@ class Regions(Overlay):
 class Strokes(Overlay):
     """Colours in RGB and their mask, in four channels."""
 
-    marks, nothing = 3, "transparent everywhere; paint at least one stroke"
+    marked, empty = 3, "transparent everywhere; paint at least one stroke"
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         tile = picture.tile(rows.start, rows.stop, 0)

@@ -116,7 +116,8 @@ class RowCommunicator(Communicator):
 
     def broadcast(self, tensor: Tensor) -> Tensor:
         """A broadcast from rank 0 of the group."""
-        chosen = tensor.detach().to(_device(self.group)).clone(memory_format=torch.contiguous_format)
+        device = "cpu" if "gloo" in dist.get_backend(self.group) else "cuda"  # from which the group sends
+        chosen = tensor.detach().to(device).clone(memory_format=torch.contiguous_format)
         _exchange(lambda: dist.broadcast(chosen, src=self.global_rank(0), group=self.group), self.group)
         return chosen.to(tensor.device)
 
@@ -162,8 +163,10 @@ def all_gather_shapes(guide: Tensor, group: Any) -> Communicator:
     if group is None:
         return ALONE
     batch, channels, height, width = guide.shape
-    own = [height, batch, channels, width, torch.finfo(guide.dtype).bits]
-    shapes = [part.tolist() for part in _all_gather(torch.tensor(own, device=guide.device), group)]
+    own = torch.tensor([height, batch, channels, width, torch.finfo(guide.dtype).bits], device=guide.device)
+    parts = [torch.empty_like(own) for _ in range(dist.get_world_size(group))]
+    _exchange(lambda: dist.all_gather(parts, own, group=group), group)
+    shapes = [part.tolist() for part in parts]
     for rank, shape in enumerate(shapes):
         if shape[1:] != shapes[0][1:]:
             raise ValueError(
@@ -273,18 +276,6 @@ def _swap(sent: dict[int, Tensor], heights: dict[int, int], like: Tensor, among:
 
     _exchange(transfer, among.group)
     return received
-
-
-def _all_gather(tensor: Tensor, group: Any) -> list[Tensor]:
-    """The tensors of all ranks, of one shape."""
-    parts = [torch.empty_like(tensor) for _ in range(dist.get_world_size(group))]
-    _exchange(lambda: dist.all_gather(parts, tensor, group=group), group)
-    return parts
-
-
-def _device(group: Any) -> torch.device:
-    """The device from which the group sends tensors."""
-    return torch.device("cpu" if "gloo" in dist.get_backend(group) else "cuda")
 
 
 def _exchange(call: Callable[[], object], group: Any) -> None:

@@ -68,7 +68,7 @@ class FittedFilter:
         Raises:
             TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
         """
-        return self._planes(image, guide, origin, halo).to(image.dtype)
+        return self._planes(image, guide, origin, halo, with_residual=False).to(image.dtype)
 
     @full_precision
     def __call__(
@@ -100,7 +100,7 @@ class FittedFilter:
         origin: tuple[int, int],
         halo: tuple[int, int],
         *,
-        with_residual: bool = False,
+        with_residual: bool,
     ) -> Tensor:
         """Layers (B, k+1, C, H, W), with the residual and r as two more if asked for, in the kernel's dtype."""
         channels = self.moments.shape[3]

@@ -54,16 +54,12 @@ def read(
 
     ``check_size((width, height), double)`` is called before the pixels are decoded; ``double`` means 64-bit pixels.
     """
-    with decoding(path), tifffile.TiffFile(path) as file:
-        page = file.pages.first
-        check_page(path, page)
-        check_size((page.imagewidth, page.imagelength), page.dtype == np.float64)
-        channels = np.asarray(page.asarray())
-        if page.axes == "SYX":
+    with decoding(path), TiffRows(path) as rows:
+        check_size((rows.shape[1], rows.shape[0]), rows.dtype == np.float64)
+        channels = np.asarray(rows.page.asarray())
+        if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
-        channels = plain(page, channels.reshape(page.imagelength, page.imagewidth, -1))
-        orientation, icc, exif = metadata(file, path)
-    return channels, orientation, icc, exif
+        return plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.icc, rows.exif
 
 
 def check_page(path: Path, page: Any) -> None:

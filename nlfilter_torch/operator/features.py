@@ -3,7 +3,6 @@
 Also the photometric bandwidth that suits an image. Paper: Appendix A, eq. (20).
 """
 
-from collections.abc import Iterator
 from itertools import product
 from typing import Any, Literal
 
@@ -148,17 +147,13 @@ class _ScaledPatches(torch.autograd.Function):
         height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
         grad_padded, grad_scale = torch.zeros_like(padded), torch.zeros_like(scale)
         planes = grad.unflatten(2, (height, width))
-        for plane, (channel, y, x) in enumerate(_offsets(padded.shape[1], scale)):
+        offsets = product(*map(range, (padded.shape[1], *scale.shape[1:])))  # channel, row and column of each plane
+        for plane, (channel, y, x) in enumerate(offsets):
             window = (slice(None), channel, slice(y, y + height), slice(x, x + width))
             grad_padded[window] += planes[:, plane] * scale[:, y, x, None, None]
             moved = (planes[:, plane] * padded[window]).sum((1, 2))  # (B,)
             grad_scale[:, y, x] += moved if scale.shape[0] == moved.shape[0] else moved.sum()
         return grad_padded, grad_scale
-
-
-def _offsets(channels: int, scale: Tensor) -> Iterator[tuple[int, int, int]]:
-    """Channel, row and column of every plane of the features."""
-    return product(range(channels), range(scale.shape[1]), range(scale.shape[2]))
 
 
 def pad_border(image: Tensor, margin: int) -> Tensor:

@@ -111,7 +111,8 @@ def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tens
     slack = margin * points.square().sum(1).unsqueeze(2)  # (B, S, 1)
     centres = start
     for step in range(iterations + 1):
-        score = _closeness(extended, centres)
+        # Half the squared length of points, less half their squared distance to centres, (B, S, M).
+        score = extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)
         best = score.amax(2, keepdim=True)
         nearest = (score >= best - (slack + margin * best.abs())).byte().argmax(2)  # the first of those nearest
         if step == iterations:
@@ -121,8 +122,3 @@ def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tens
         sizes = sums[:, -1:]
         centres = torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), start)
     return nearest
-
-
-def _closeness(extended: Tensor, centres: Tensor) -> Tensor:
-    """Half the squared length of points, (B, D + 1, S) with ones, less half their squared distance to centres."""
-    return extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)  # (B, S, M)
