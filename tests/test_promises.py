@@ -201,6 +201,7 @@ def test_tiles_follow_a_limited_operator() -> None:
     )
     out = rows.copy()
     options = {"spatial_bandwidth": 3.0, "num_landmarks": 50, "landmarks": "random"}
+    options |= {"photometric_bandwidth": "auto", "limits": "none", "threshold": 0.0}
     stream_detail(rows, out, alpha, tile_rows=16, statistics="full", **options)
     expected = polynomial_filter(operator, image, alpha)[0].permute(1, 2, 0)
     torch.testing.assert_close(torch.from_numpy(out), expected, atol=1e-6, rtol=0)

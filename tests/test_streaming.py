@@ -28,6 +28,13 @@ from nlfilter_torch.tiled.tiles import Passes
 Array = NDArray[Any]
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 LEVEL = 1 / 255
+PLAIN: dict[str, Any] = {  # the filter as it is, as by nonlocal_operator
+    "limits": "none",
+    "threshold": 0.0,
+    "photometric_bandwidth": "auto",
+    "spatial_bandwidth": "none",
+    "num_landmarks": 100,
+}
 FEW = 1 << 27  # bytes, with which rows are computed one at a time
 
 
@@ -46,7 +53,7 @@ def in_memory(picture: Array, alpha: Tensor = ALPHA, residual: float | None = No
 
 def streamed(picture: Array, alpha: Tensor = ALPHA, *, kind: str | None = None, **options: Any) -> Array:
     edited = np.empty(picture.shape, kind or picture.dtype)
-    stream_detail(picture, edited, alpha, **options)
+    stream_detail(picture, edited, alpha, **(PLAIN | options))
     return edited
 
 
@@ -229,7 +236,8 @@ def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
-    stream_detail(source, edited, ALPHA, tile_rows=10, sample=2000, num_landmarks=30, memory=FEW)
+    options = PLAIN | {"num_landmarks": 30}
+    stream_detail(source, edited, ALPHA, tile_rows=10, sample=2000, memory=FEW, **options)
     assert source.read <= 3 * 90 * 14 // 10  # the pilot, the sample and the result, each with its halo
     np.testing.assert_array_equal(edited, streamed(picture, tile_rows=10, sample=2000, num_landmarks=30, memory=FEW))
 

@@ -198,6 +198,8 @@ def fit_detail(
             halves = zip(split_sliders(sliders), elsewhere, (0.0, None), strict=True)
             return torch.cat([part(pixels, *half) for half in halves], dim=1)
 
+        if not isinstance(threshold, Tensor) and threshold == 0:
+            return Fitted(lambda pixels: sum_of(added_and_rest(pixels)))
         return Fitted(added_and_rest, lambda image, found: held_back(found, activity(image), threshold), CALM_MARGIN)
 
     return fit_change(source, change, planes, viewing_size, limits)
@@ -213,14 +215,20 @@ def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
 
 
+def sum_of(changes: Tensor) -> Tensor:
+    """Added detail and the rest (B, 2 C, H, W) together."""
+    added, rest = changes.chunk(2, dim=1)
+    return added + rest
+
+
 def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
     """The change (B, C, H, W) by added detail and the rest (B, 2 C, H, W), the former less where the image is calm.
 
     The share of added detail is ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
     """
-    added, rest = changes.chunk(2, dim=1)
     if not isinstance(threshold, Tensor) and threshold == 0:
-        return added + rest
+        return sum_of(changes)
+    added, rest = changes.chunk(2, dim=1)
     least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
     return added * (activity / (activity + least).clamp(min=TINY)) + rest
 

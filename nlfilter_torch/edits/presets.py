@@ -143,7 +143,7 @@ PRESETS: dict[str, Preset] = {
     "clear": Preset((1.5, 1.5, 1.5, 1.0)),
     "texture": Preset((3.0, 1.5, 1.0, 1.0)),
     "dramatic": Preset((2.0, 2.5, 3.5, 1.0), 40.0),
-    "glow": Preset((0.3, 1.0, 2.5, 1.0), 30.0),
+    "glow": Preset((0.4, 1.0, 3.0, 1.0), 40.0),
     "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 8.0),
     "calm": Preset((0.8, 0.6, 0.4, 1.0), 40.0),
     "smooth": Preset((0.0, 0.0, 0.0, 1.0), 12.0),

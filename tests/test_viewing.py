@@ -1,0 +1,217 @@
+"""Limits of brightness, calm areas, and sliders that do the same at any resolution."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from nlfilter_torch import adjust_tone, enhance, sharpen
+from nlfilter_torch.cli import main
+from nlfilter_torch.edits.colour import change_luminance
+from nlfilter_torch.edits.detail import held_back, split_sliders
+from nlfilter_torch.edits.resizing import resize, resized
+from nlfilter_torch.edits.viewing import viewed_size
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.tiled import stream_detail
+from tests.problems import colour, luminance
+
+ALPHA = torch.tensor([2.2, 2.2, 2.2, 1.0])
+EDITS: dict[str, Any] = {
+    "detail": lambda x, **options: enhance(x, ALPHA, num_landmarks=60, **options),
+    "tone": lambda x, **options: adjust_tone(x, contrast=1.5, clarity=2.0, num_landmarks=60, **options),
+    "sharpen": lambda x, **options: sharpen(x, amount=8.0, num_landmarks=60, **options),
+}
+
+
+# --- limits
+
+
+def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(2, 3, 20, 20, generator=generator, dtype=torch.float64)
+    image[0, 0], image[1, 1] = 0.0, 1.0  # no room in one direction
+    change = torch.randn(2, 1, 20, 20, generator=generator, dtype=torch.float64)
+    found = change_luminance(image, change)
+    assert found.min() >= -1e-6
+    assert found.max() <= 1 + 1e-6
+    assert bool(((found - image) * change >= -1e-12).all())  # in the direction of the change
+    assert bool(((found - image).abs() <= change.abs() + 1e-12).all())
+    room = torch.where(change > 0, 1 - image, image).clamp(min=1e-6)
+    expected = 0.9 * room * (1 - torch.exp(-change.abs() / (0.9 * room)))
+    torch.testing.assert_close((found - image).abs(), expected, atol=1e-6, rtol=0)
+    middle = torch.full((1, 3, 4, 4), 0.5, dtype=torch.float64)
+    torch.testing.assert_close(change_luminance(middle, middle[:, :1] * 0.002), middle + 0.001, atol=2e-6, rtol=0)
+    assert torch.equal(change_luminance(image, torch.zeros_like(change)), image)
+    assert torch.equal(change_luminance(image, change, "none"), image + change)
+
+
+def test_limits_have_exact_gradients() -> None:
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(1, 3, 4, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    change = torch.randn(1, 1, 4, 5, generator=generator, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(change_luminance, (image, change))
+    still = torch.zeros(1, 1, 4, 5, dtype=torch.float64, requires_grad=True)
+    change_luminance(image.detach(), still).sum().backward()
+    assert still.grad is not None
+    torch.testing.assert_close(still.grad, torch.full_like(still, 3.0))  # sliders can leave 1 by gradients
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_soft_limits_do_not_clip_and_none_is_the_plain_sum(name: str) -> None:
+    image = colour("astronaut", 48, 64)
+    soft, hard = (EDITS[name](image, limits=limits) for limits in ("soft", "none"))
+    inside = (image > 0.02) & (image < 0.98)
+    assert soft[inside].min() > 0
+    assert soft[inside].max() < 1
+    assert hard.min() < 0
+    assert hard.max() > 1
+    chroma = [x - luminance(x) for x in (hard, image)]
+    torch.testing.assert_close(chroma[0], chroma[1], atol=1e-5, rtol=0)  # the change is the same in all channels
+    torch.testing.assert_close(change_luminance(image, luminance(hard) - luminance(image)), soft, atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match="limits must be one of 'soft', 'none', got 'hard'"):
+        EDITS[name](image, limits="hard")
+
+
+@pytest.mark.parametrize("residual", [None, 1.0])
+def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
+    image, region = colour("coffee", 40, 60), torch.zeros(1, 1, 40, 60)
+    region[..., 10:20, 10:20] = 1
+    for options in ({}, {"viewing_size": 0.001}, {"limits": "none"}, {"threshold": 0.0}):
+        found = enhance(image, torch.ones(4), residual=residual, num_landmarks=40, **options)
+        assert torch.equal(found, image)
+        found = enhance(image, torch.ones(4), region, outside=torch.ones(4), num_landmarks=40, **options)
+        assert torch.equal(found, image)
+
+
+# --- calm areas
+
+
+def test_calm_areas_are_strengthened_less_and_smoothed_alike() -> None:
+    changes = torch.tensor([0.4, 0.1]).view(1, 2, 1, 1).expand(1, 2, 1, 3)
+    variance = torch.tensor([0.0, 1e-4, 1.0]).view(1, 1, 1, 3)
+    found = held_back(changes, variance, 0.01).flatten()
+    torch.testing.assert_close(found, torch.tensor([0.1, 0.3, 0.5]), atol=1e-4, rtol=0)
+    assert torch.equal(held_back(changes, variance, 0.0), torch.full((1, 1, 1, 3), 0.5))
+    added, rest = split_sliders(torch.tensor([0.5, -0.5, 2.0, 0.3]))
+    assert added.tolist() == [0.5, 0.0, 2.0, 0.0]
+    assert (added + rest).tolist() == pytest.approx([0.5, -0.5, 2.0, 0.3])
+    noise = 0.5 + 2 / 255 * torch.randn(1, 1, 60, 60, generator=torch.Generator().manual_seed(0))
+    stds = [enhance(noise, ALPHA, threshold=t, num_landmarks=60).std() for t in (0.0, 5 / 255, 50 / 255)]
+    assert stds[0] > 1.2 * stds[1]
+    assert stds[1] > stds[2]
+    assert stds[2] < 1.05 * noise.std()
+    smooth = [enhance(noise, torch.tensor([0.0, 0.0, 1.0]), threshold=t, num_landmarks=60) for t in (0.0, 0.1)]
+    assert torch.equal(smooth[0], smooth[1])
+
+
+# --- the viewing size
+
+
+@pytest.mark.parametrize("wanted", [(10, 15), (40, 60), (17, 33), (80, 61)])
+def test_resizing_is_antialiased_bicubic_and_can_go_by_rows(wanted: tuple[int, int]) -> None:
+    image = colour("coffee", 40, 60).double()
+    found = resize(image, wanted)
+    expected = F.interpolate(image, wanted, mode="bicubic", antialias=True)
+    torch.testing.assert_close(found, expected, atol=1e-6 if wanted[0] <= 40 else 1e-4, rtol=0)
+    rows = range(3, min(wanted[0], 9))
+    part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows)
+    torch.testing.assert_close(part, found[:, :, 3:9])
+
+
+def test_the_viewing_size_of_a_picture() -> None:
+    assert viewed_size((1000, 1500), 1.5) == (1000, 1500)
+    assert viewed_size((2000, 3000), 1.5) == (1000, 1500)
+    assert viewed_size((2000, 3000), 0) == (2000, 3000)
+    assert viewed_size((1, 5_000_000), 1.5)[0] == 1
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_a_larger_picture_looks_alike_at_the_viewing_size(name: str) -> None:
+    large, megapixels = colour("coffee", 180, 270), 60 * 90 / 1e6
+    small = resize(large, (60, 90))
+    wanted = EDITS[name](small, viewing_size=megapixels)
+    assert torch.equal(wanted, EDITS[name](small, viewing_size=0))  # not larger: nothing is resized
+    viewed = resize(EDITS[name](large, viewing_size=megapixels), (60, 90))
+    per_pixel = resize(EDITS[name](large, viewing_size=0), (60, 90))
+
+    def error(found: torch.Tensor) -> float:
+        return float((found - wanted).square().mean().sqrt())
+
+    change = float((wanted - small).square().mean().sqrt())
+    assert error(viewed) < 0.4 * change
+    assert error(viewed) < 0.7 * error(per_pixel)
+
+
+def test_texture_too_fine_to_be_seen_is_changed_as_the_rest() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = (0.5 + 0.1 * torch.randn(1, 1, 120, 120, generator=generator)).clamp(0, 1)
+    options: dict[str, Any] = {"viewing_size": 0.0036, "num_landmarks": 100, "photometric_bandwidth": 0.3}
+    flat = enhance(image, torch.tensor([0.0, 0.0, 1.0]), **options)
+    assert flat.std() < 0.5 * image.std()
+    rich = enhance(image, torch.tensor([2.0, 2.0, 1.0]), limits="none", **options)
+    assert 1.5 * image.std() < rich.std() < 2.2 * image.std()
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_gradients_go_through_the_viewing_size(name: str) -> None:
+    image = colour("coffee", 40, 40).requires_grad_()
+    EDITS[name](image, viewing_size=0.0004).square().mean().backward()
+    assert image.grad is not None
+    assert bool(torch.isfinite(image.grad).all())
+    assert image.grad.abs().max() > 0
+
+
+def test_tiles_are_those_of_the_edit_in_memory() -> None:
+    image = colour("coffee", 120, 160)
+    rows = image[0].permute(1, 2, 0).numpy().astype(np.float32)
+    weights = np.zeros((120, 160, 1), np.float32)
+    weights[20:40, 30:60] = 1
+    for regions in (None, weights):
+        planes = None if regions is None else torch.from_numpy(regions).permute(2, 0, 1)[None]
+        for size in (0.005, 1.5):
+            wanted = enhance(image, ALPHA, planes, num_landmarks=40, viewing_size=size)
+            found = [np.empty_like(rows) for _ in range(2)]
+            for target, height in zip(found, (7, 50), strict=True):
+                stream_detail(
+                    rows,
+                    target,
+                    ALPHA,
+                    regions,
+                    num_landmarks=40,
+                    viewing_size=size,
+                    statistics="full",
+                    tile_rows=height,
+                )
+            assert np.abs(found[0] - wanted[0].permute(1, 2, 0).numpy()).max() < 2e-3
+            assert np.abs(found[0] - found[1]).max() < 1e-6
+
+
+def test_regions_of_another_size_are_told_at_the_viewing_size_too() -> None:
+    image = colour("coffee", 40, 60)
+    for size in (0, 0.001):
+        with pytest.raises(ValueError, match=r"region.* must have the height and width"):
+            enhance(image, ALPHA, torch.ones(1, 1, 40, 50), viewing_size=size, num_landmarks=20)
+        with pytest.raises(ValueError, match=r"region.* must be non-negative"):
+            enhance(image, ALPHA, -torch.ones(1, 1, 40, 60), viewing_size=size, num_landmarks=20)
+
+
+# --- spatial bandwidth
+
+
+def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    image = colour("coffee", 48, 72)
+    near, given, far = (enhance(image, ALPHA, num_landmarks=60, spatial_bandwidth=h) for h in (None, 4.0, "none"))
+    assert torch.equal(near, given)  # a twelfth of 48
+    assert (far - near).abs().max() > 0.02
+    with pytest.raises(ValueError, match="spatial_bandwidth must be one of 'none', got 'far'"):
+        enhance(image, ALPHA, spatial_bandwidth="far")
+    write_photograph(Photograph(image), tmp_path / "in.png")
+    arguments = ["detail", str(tmp_path / "in.png"), str(tmp_path / "out.png"), "--landmarks", "60"]
+    assert main([*arguments, "--alpha", "2.2,2.2,2.2,1", "--spatial-bandwidth", "none"]) == 0
+    stored = read_photograph(tmp_path / "in.png").pixels
+    wanted = enhance(stored, ALPHA, num_landmarks=60, spatial_bandwidth="none")
+    assert (read_photograph(tmp_path / "out.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
+    assert main([*arguments, "--spatial-bandwidth", "far"]) == 2
+    assert "--spatial-bandwidth must be a positive number of pixels, such as 20, or none" in capsys.readouterr().err
