@@ -1,7 +1,7 @@
 """The filter of a picture that is read a few rows at a time: the few sums that it consists of, and its columns."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,9 +18,18 @@ from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.sampling import Report, Sample, all_blocks, patches_at, scaled_patches, visit
+from nlfilter_torch.tiled.sampling import Draws, Pilot, Report, all_blocks, patches_at, scaled_patches, visit
 from nlfilter_torch.tiled.sources import GuidePicture, RowSource, Tile
-from nlfilter_torch.tiled.statistics import Block, Sums, sum_up
+from nlfilter_torch.tiled.statistics import (
+    CONVERGED,
+    Block,
+    Guess,
+    Sums,
+    Totals,
+    balance_by_passes,
+    limiter_by_passes,
+    sum_up,
+)
 
 
 @dataclass(eq=False)
@@ -57,24 +66,97 @@ class BlockPixels:
         return self.found
 
 
+def first_plane(pixels: Any) -> Tensor:
+    """The first channel of a picture."""
+    image: Tensor = pixels.image[:, :1]
+    return image
+
+
 @dataclass(eq=False)
 class TiledOperator:
     """The filter of a picture, by the few sums that it consists of.
 
+    They are summed up when the first of them is needed, those that it is balanced by together with those of the planes
+    that are filtered.
+
     Attributes:
         guide: what it compares.
-        kernel: landmarks, bandwidths and window.
-        balancing: what the scaling of a pixel is a function of.
+        pilot: a first look at the picture.
         report: told of the progress.
-        sample: pixels that stand for all, or None.
+        count: pixels of a sample for what a single pass cannot tell; None is none.
+        full: whether further passes over all pixels are made.
+        kernel: landmarks, bandwidths and window.
+        bounded: whether eigenvalues are to be kept from exceeding 1.
     """
 
     guide: GuidePicture
-    kernel: Kernel
-    balancing: PixelScaling
+    pilot: Pilot
     report: Report
-    sample: list[Sample] | None = None
+    count: int | None
+    full: bool
+    kernel: Kernel
+    bounded: bool
+    _balancing: PixelScaling | None = None
+    _sample: Block | None = None
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
+    _grams: Tensor | float = 0.0  # what those of the sample lack
+
+    @torch.no_grad()
+    @full_precision
+    def settle(self, planes: Planes, order: int) -> None:
+        """Balance, and sum up for the first ``order`` powers of W and some planes that depend on colours alone."""
+        total, completed, lacking = self.pilot.balancing, self.pilot.completed, None
+        if self.count is not None:
+            self._sample, lacking = self._look_again(self.count, planes, order)
+            total = balance_by_passes(
+                lambda: self.blocks("Balancing"), total, completed=completed, correction=lacking.moment
+            )
+        if self.full:
+            self._sample = lacking = None
+            total = balance_by_passes(lambda: self.blocks("Balancing"), total, completed=completed)
+        self._balancing = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
+        limiter = limiter_by_passes(lambda: self.blocks("Bounding"), self._balancing) if self.bounded else None
+        if limiter is not None:
+            self.kernel = replace(self.kernel, limiter=limiter.to(self.kernel.landmarks))
+        if self._sample is None or lacking is None:
+            return
+        if limiter is not None:
+            self._sample = replace(self._sample, factor=limiter.to(self._sample.factor) @ self._sample.factor)
+            lacking = Totals(
+                lacking.moment, limiter @ lacking.coefficients, limiter @ lacking.grams.to(limiter) @ limiter
+            )
+        self._grams = lacking.grams
+        self._sums[id(planes)] = (planes, replace(self._summed_up(planes, order), correction=lacking.coefficients))
+
+    def _look_again(self, count: int, planes: Planes, order: int) -> tuple[Block, Totals]:
+        """About ``count`` pixels, and what their sums under the pilot's guess lack to those of all pixels."""
+        pilot = self.pilot
+
+        def values(block: Block, columns: Columns) -> Tensor:
+            return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)
+
+        guess = Guess(
+            pilot.balancing, torch.empty(1, 0, pilot.balancing.shape[1], 1), values, self.guide.guide.spectral
+        )
+        columns = guess.columns(pilot.sample)
+        known = sum_up([(values(pilot.sample, columns), columns, pilot.sample.weights)], order).coefficients()
+        guess = replace(guess, coefficients=known[:, :-1])
+        draws, every = Draws(pilot, columns, count, self.guide.pixels), None
+        for block in all_blocks(self.guide, self.kernel, self.report, "Sampling"):
+            columns, found = guess.totals(block)
+            draws.add(block, columns)
+            every = found if every is None else every.plus(found)
+        assert every is not None  # for mypy; a picture has a pixel
+        sample = draws.drawn()
+        return sample, every.plus(guess.totals(sample)[1], sign=-1)
+
+    @property
+    def balancing(self) -> PixelScaling:
+        """What the scaling of a pixel is a function of."""
+        if self._balancing is None:
+            self.settle(first_plane, 1)
+        assert self._balancing is not None  # for mypy
+        return self._balancing
 
     @property
     def margin(self) -> int:
@@ -88,42 +170,47 @@ class TiledOperator:
 
     def columns(self, features: Tensor) -> Columns:
         """Columns of pixels with features (1, D, n)."""
+        balancing = self.balancing  # first: it may change the kernel
         factor, diagonal = self.kernel.factor(features)
-        return Columns(factor, *self.balancing(factor, diagonal))
+        return Columns(factor, *balancing(factor, diagonal))
 
     def blocks(self, stage: str) -> Iterator[Block]:
         """The sample, or all pixels."""
-        if self.sample is None:
+        if self._sample is None:
             yield from all_blocks(self.guide, self.kernel, self.report, stage)
             return
         self.report(stage, 0, 1)
-        for part in self.sample:
-            yield from part.blocks(self.kernel)
+        yield self._sample
 
     def pixels(self, stage: str) -> Iterator[tuple[BlockPixels, Tensor]]:
         """The same with columns, and how many pixels each stands for, (1, n)."""
+        balancing = self.balancing
         for block in self.blocks(stage):
-            columns = Columns(block.factor, *self.balancing(block.factor, block.diagonal))
+            columns = Columns(block.factor, *balancing(block.factor, block.diagonal))
             yield BlockPixels(block.image.unsqueeze(2), columns), block.weights
 
     @torch.no_grad()
     @full_precision
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums for the first ``order`` powers of W, and some planes."""
+        if self._balancing is None:
+            self.settle(planes, order)
         known = self._sums.get(id(planes))
-        if known is not None and known[1].moments.shape[1] >= order:
-            return known[1]
-        found = sum_up(((planes(pixels).flatten(2), pixels.found, weights)
-                        for pixels, weights in self.pixels("Summing up")), order)  # fmt: skip
-        self._sums[id(planes)] = (planes, found)  # the planes are kept, so that no other ones get their number
-        return found
+        if known is None or known[1].moments.shape[1] < order:
+            known = (planes, self._summed_up(planes, order))
+            self._sums[id(planes)] = known  # the planes are kept, so that no other ones get their number
+        return known[1]
+
+    def _summed_up(self, planes: Planes, order: int) -> Sums:
+        return sum_up(((planes(pixels).flatten(2), pixels.found, weights)
+                       for pixels, weights in self.pixels("Summing up")), order)  # fmt: skip
 
     @cached_property
     def pairs(self) -> RitzPairs:
         """The spectrum."""
         known = next((sums for _, sums in self._sums.values()), None)
-        sums = known or self.sums(lambda pixels: pixels.image[:, :1], 1)
-        return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
+        sums = known or self.sums(first_plane, 1)
+        return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """The planes that a function of columns gives."""
@@ -137,7 +224,7 @@ class TiledOperator:
     def at(self, places: Tensor) -> Blocks:
         """The columns of single pixels, whose features are read at once and kept."""
         features = self.features_at(places)
-        return lambda: (self.kernel.factor(part)[0] for part in features.split(sampling.CHUNK, dim=2))
+        return lambda: (self.columns(part).factor for part in features.split(sampling.CHUNK, dim=2))
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Detail layers, by the sums for powers of W."""
@@ -152,7 +239,7 @@ class TiledOperator:
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""
-        return self.sums(planes, 1).moments[:, 0].mT
+        return self.sums(planes, 1).coefficients()[:, 0].mT
 
     @torch.no_grad()
     @full_precision
@@ -172,8 +259,7 @@ class TiledOperator:
             seen = self.guide.seen(tile, size // 2)
             guide = reduce_channels(seen.pixels, recipe.guide_channels)
             patches.append(patches_at(guide, seen, chosen, size))
-        scales = (recipe.patch_weights, recipe.photometric_bandwidth, recipe.spatial_bandwidth)
-        return scaled_patches(torch.cat(patches, dim=2), places, self.guide, *scales)
+        return scaled_patches(torch.cat(patches, dim=2), places, self.guide, recipe)
 
     def region_means(self, regions: RowSource, name: str) -> Tensor:
         """The mean column of F over each region, (1, M, K) in float64."""

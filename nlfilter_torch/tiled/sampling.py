@@ -5,17 +5,15 @@ A sample of a picture's pixels for the sums that a filter consists of: rare ones
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import CACHED
 from nlfilter_torch.core.checks import check_choice, check_count, check_positive, warn
-from nlfilter_torch.core.kernels.affinity import Affinity
-from nlfilter_torch.core.kernels.sweeps import positive_root
+from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.features import (
     GuideChannels,
     bandwidth_of_gradient,
@@ -28,47 +26,14 @@ from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling
-from nlfilter_torch.operator.spectrum import CUT
-from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
-from nlfilter_torch.tiled.statistics import Block, start_balancing, sum_up
+from nlfilter_torch.tiled.statistics import Block
 
-PILOT = 1 << 17  # pixels of the first sample: their factor, 52 MB at m = 100, is balanced in memory
-CHUNK = 1 << 16  # pixels of a sample whose factor is there at once
+PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
+STARTED = 1e-3  # residual of its balancing, which is a first guess
+CHUNK = 1 << 16  # scribbled pixels whose factor is there at once
 
 Report = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Some pixels of a picture.
-
-    Attributes:
-        features: (1, D, n).
-        image: their colours, (1, C, n).
-        weights: (1, n), how many pixels each of them stands for.
-    """
-
-    features: Tensor
-    image: Tensor
-    weights: Tensor
-
-    @staticmethod
-    def together(parts: list["Sample"]) -> "Sample":
-        """Several samples as one."""
-        features, images, weights = zip(*((part.features, part.image, part.weights) for part in parts), strict=True)
-        return Sample(torch.cat(features, dim=2), torch.cat(images, dim=2), torch.cat(weights, dim=1))
-
-    def blocks(self, kernel: Kernel) -> Iterator[Block]:
-        """Factor and diagonal of the sample, a chunk at a time."""
-        for features, image, weights in zip(
-            self.features.split(CHUNK, dim=2),
-            self.image.split(CHUNK, dim=2),
-            self.weights.split(CHUNK, dim=1),
-            strict=True,
-        ):
-            yield Block(*kernel.factor(features), image, weights)
 
 
 def all_blocks(picture: GuidePicture, kernel: Kernel, report: Report, stage: str) -> Iterator[Block]:
@@ -93,7 +58,7 @@ class Pilot:
     """
 
     kernel: Kernel
-    sample: Sample
+    sample: Block
     balancing: Tensor
     seed: int
 
@@ -157,17 +122,15 @@ def take_pilot(
         photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels, dtype=torch.float64)))
     order = torch.empty_like(wanted)
     order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
-    recipe = (window, photometric_bandwidth, spatial_bandwidth)
-    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
+    recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, guide_channels)
+    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, recipe)
     points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
-    kernel = Kernel(points, inverse_cholesky(points), completion, features=GuideFeatures(*recipe, guide_channels))
-    weight = picture.pixels / len(even)
-    sample = Sample(
-        features[:, :, len(candidates) :],
-        torch.cat(values, dim=2)[:, :, order[len(candidates) :]],
-        torch.full((1, len(even)), weight, dtype=picture.dtype),
-    )
-    return Pilot(kernel, sample, start_balancing(*kernel.factor(sample.features), weight), rest.initial_seed())
+    kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
+    weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
+    columns = kernel.factor(features[:, :, len(candidates) :])
+    found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
+    image = torch.cat(values, dim=2)[:, :, order[len(candidates) :]]
+    return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
 
 
 def visit(
@@ -196,61 +159,52 @@ def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
     return padded[0].flatten(1)[:, places].flatten(0, 1)[None]
 
 
-def scaled_patches(
-    patches: Tensor,
-    pixels: Tensor,
-    picture: Picture,
-    window: Tensor,
-    photometric_bandwidth: float | Tensor,
-    spatial_bandwidth: float | Tensor | None,
-) -> Tensor:
+def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
     """Features (1, D, n), as :func:`extract_features` gives them, from patches (1, C p^2, n) and pixels' indices."""
+    window = recipe.patch_weights
     channels = patches.shape[1] // window.numel()
-    scale = (window / channels).sqrt() / torch.as_tensor(photometric_bandwidth, dtype=window.dtype)
+    scale = (window / channels).sqrt() / torch.as_tensor(recipe.photometric_bandwidth, dtype=window.dtype)
     features = patches * scale.reshape(1, 1, -1, 1).expand(1, channels, -1, 1).reshape(1, -1, 1)
-    if spatial_bandwidth is None:
+    if recipe.spatial_bandwidth is None:
         return features
     places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]]).to(features)
-    return torch.cat([features, places[None] / torch.as_tensor(spatial_bandwidth).to(features)], dim=1)
+    return torch.cat([features, places[None] / torch.as_tensor(recipe.spatial_bandwidth).to(features)], dim=1)
 
 
-SKETCHED = 16  # random projections; they tell squared lengths to a third
 EVEN = 0.1  # share of a sample that is spread evenly over the picture
 
 
-def sample_by_leverage(
-    picture: GuidePicture, pilot: Pilot, count: int, report: Report, *, spectral: bool
-) -> list[Sample]:
-    """About ``count`` pixels in several parts, rare ones more likely than common ones.
+class Draws:
+    """About ``count`` pixels of a picture, rare ones more likely than common ones, in one pass over its columns.
 
     A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
     of a photograph off by two grey levels and more. The leverage of a pixel is its own share of what W makes of it,
-    ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members. What
-    projects on eigenvectors (``spectral``) divides by small eigenvalues, and pixels that these depend on come in, too.
+    ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members.
     """
-    kernel, generator = pilot.kernel, np.random.default_rng(pilot.seed)
-    size = kernel.recipe.patch_weights.shape[0]
-    even = EVEN * count / picture.pixels
-    leverage = Leverage.of(pilot, spectral=spectral)
-    rate = _rate(leverage(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
-    recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
-    done: list[Sample] = []
-    waiting: list[Sample] = []  # of single tiles, much smaller than a chunk
-    for tile in picture.picture.tiles(size // 2 + picture.guide.margin, picture.statistics_rows):
-        report("Sampling", tile.start, picture.size[0])
-        seen = picture.seen(tile, size // 2)
-        guide = reduce_channels(seen.pixels, kernel.recipe.guide_channels)
-        features = kernel.recipe(seen.pixels, origin=seen.origin, halo=seen.halo)
-        likely = (even + rate * leverage(features)).clamp(max=1.0)
-        chosen, counts = draw(likely, generator)
-        patches, places = patches_at(guide, seen, chosen, size), chosen + tile.start * picture.size[1]
-        values = tile.inner.flatten(2)[:, :, chosen]
-        weights = (counts / likely[chosen]).to(picture.dtype)[None]
-        waiting.append(Sample(scaled_patches(patches, places, picture, *recipe), values, weights))
-        if sum(part.weights.numel() for part in waiting) >= sampling.CHUNK:
-            done.append(Sample.together(waiting))
-            waiting = []
-    return [*done, Sample.together(waiting)] if waiting else done
+
+    def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
+        """``columns`` are those of the pilot's sample."""
+        self.completed, self.generator = pilot.completed, np.random.default_rng(pilot.seed)
+        self.even, self.found = EVEN * count / pixels, list[Block]()
+        weight = float(pilot.sample.weights[0, 0])
+        self.rate = _rate(self.leverage(columns, pilot.sample.diagonal), weight, self.even, count)
+
+    def leverage(self, columns: Columns, diagonal: Tensor) -> Tensor:
+        """Of pixels: (n,) in float64."""
+        length = 1 - diagonal if self.completed else columns.factor.square().sum(1)
+        return (columns.scaling.square() * length)[0].double()
+
+    def add(self, block: Block, columns: Columns) -> None:
+        """Draw from a block, whose columns these are."""
+        likely = (self.even + self.rate * self.leverage(columns, block.diagonal)).clamp(max=1.0)
+        chosen, counts = draw(likely, self.generator)
+        weights = (counts / likely[chosen]).to(block.weights)[None]
+        factor, diagonal, image = (planes[..., chosen] for planes in (block.factor, block.diagonal, block.image))
+        self.found.append(Block(factor, diagonal, image, weights))
+
+    def drawn(self) -> Block:
+        """All that were drawn."""
+        return Block.together(self.found)
 
 
 def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -278,60 +232,6 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
     counts = torch.bincount(found, minlength=len(rates)) + certain
     chosen = counts.nonzero().squeeze(1)
     return chosen, counts[chosen]
-
-
-@dataclass(frozen=True)
-class Leverage:
-    """Leverage scores: how much single pixels matter to sums over all of them, from affinities to the landmarks alone.
-
-    Lengths of M-vectors are estimated from a few random projections of them, which are projections of the affinities.
-
-    Attributes:
-        kernel: whose affinities they are.
-        rows: (1 + J k, M), whose products with the affinities of a pixel are ``u . t``, and k random projections of u
-            for every measure of length.
-        scales: (J,): of the measures, which are added up.
-    """
-
-    kernel: Kernel
-    rows: Tensor
-    scales: Tensor
-
-    @staticmethod
-    def of(pilot: Pilot, *, spectral: bool) -> "Leverage":
-        """The leverage on W, and as much again that on projections on its eigenvectors if they are needed."""
-        kernel, generator = pilot.kernel, torch.Generator().manual_seed(pilot.seed)
-        count = kernel.landmarks.shape[2]
-        measures = [torch.eye(count, dtype=torch.float64)]
-        if spectral:
-            balancing = PixelScaling(pilot.balancing, pilot.completed)
-            blocks = pilot.sample.blocks(kernel)
-            columns = ((Columns(b.factor, *balancing(b.factor, b.diagonal)), b) for b in blocks)
-            gram = sum_up(((b.image, found, b.weights) for found, b in columns), 1).grams[0, 0]
-            values, vectors = torch.linalg.eigh(gram)
-            values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
-            measures.append(values.rsqrt()[:, None] * vectors.mT)
-        inverse = kernel.inverse_cholesky[0].double()
-        draws = torch.randn(SKETCHED, count, generator=generator, dtype=torch.float64) / SKETCHED**0.5
-        rows = torch.cat([pilot.balancing[0].mT @ inverse, *(draws @ measure @ inverse for measure in measures)])
-        leverage = Leverage(kernel, rows.to(kernel.landmarks), torch.ones(len(measures)).to(kernel.landmarks))
-        return replace(leverage, scales=1 / leverage.measure(pilot.sample.features).mean(1))
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """Of pixels with the features (1, D, n): (n,) in float64."""
-        return self.scales.double() @ self.measure(features).double()
-
-    def measure(self, features: Tensor) -> Tensor:
-        """Squared lengths (J, n) of the pixels' columns of F: ``d^2 |u|^2``, and ``F^T G^-1 F`` if that is needed."""
-        affinity = Affinity(self.kernel.landmarks, self.kernel.completion == "diagonal")
-        found = []
-        for part in features.split(CACHED, dim=2):
-            near, _ = affinity(part, features.new_empty(1, self.rows.shape[1], part.shape[2]))
-            products = self.rows @ near[0]
-            lengths = products[1:].square().unflatten(0, (-1, SKETCHED)).sum(1)  # (J, n)
-            scaling = positive_root(products[:1] / 2, (1 - lengths[:1]).clamp(min=0.0))
-            found.append(scaling.square() * lengths)
-        return torch.cat(found, dim=1)
 
 
 def _rate(leverage: Tensor, weight: float, even: float, count: int) -> float:

@@ -14,20 +14,14 @@ from nlfilter_torch.edits.source import Fitted, Guide, Planes
 from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.sampling import (
-    sample_by_leverage,
-    take_pilot,
-)
+from nlfilter_torch.tiled.sampling import take_pilot
 from nlfilter_torch.tiled.scribbles import check_room, floats_of_scribbled, read_scribbles
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
-from nlfilter_torch.tiled.statistics import CONVERGED, balance_by_passes, limiter_by_passes
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, rows_that_fit
 
 FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
-LARGE_PATCHES = 50  # numbers in a patch above which the sample has half as many of them
 
 
 class Tiled:
@@ -63,22 +57,18 @@ class Tiled:
         check_count(count, "num_landmarks")
         numbers = patch_size**2 * (self.channels if options.get("guide_channels") == "all" else 1) + 2
         self.room(numbers, count)
-        passes = self.passes if numbers < LARGE_PATCHES else replace(self.passes, sample=-(-self.passes.sample // 2))
-        picture = GuidePicture(self.picture, guide)
+        passes, picture = self.passes, GuidePicture(self.picture, guide)
         pilot = take_pilot(picture, passes.report, **options)
-        found = TiledOperator(picture, pilot.kernel, PixelScaling(pilot.balancing, pilot.completed), passes.report)
-        total, chosen = pilot.balancing, None
-        if passes.sample < picture.pixels:
-            chosen = sample_by_leverage(picture, pilot, passes.sample, passes.report, spectral=guide.spectral)
-            found.sample = chosen
-            total = balance_by_passes(lambda: found.blocks("Balancing"), total, completed=pilot.completed)
-        if chosen is None or passes.statistics == "full" or guide.exact:
-            found.sample = None
-            total = balance_by_passes(lambda: found.blocks("Balancing"), total, completed=pilot.completed)
-        found.balancing = PixelScaling(total, pilot.completed, CONVERGED[self.dtype])
-        if is_bounded(options.get("landmarks", "kmeans"), picture.pixels, total.shape[1]):
-            limiter = limiter_by_passes(lambda: found.blocks("Bounding"), found.balancing)
-            found.kernel = replace(found.kernel, limiter=limiter)
+        sampled = passes.sample < picture.pixels
+        found = TiledOperator(
+            picture,
+            pilot,
+            passes.report,
+            passes.sample if sampled else None,
+            full=not sampled or passes.statistics == "full" or guide.exact,
+            kernel=pilot.kernel,
+            bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, pilot.balancing.shape[1]),
+        )
         self.operators.append(found)
         self.floats += numbers
         return found

@@ -6,9 +6,13 @@ moment t (M numbers), since the scaling ``d_i`` of a pixel is a closed form of `
 Newton's method needs two or three passes. With t known, one pass more gives ``G_j = F diag(r^j) F^T`` and ``b_i =
 F r^i y``, and from them all coefficients of ``W^i y = F^T c_i + r W^(i-1) y``: ``c_1 = b_0``, ``c_(i+1) = sum_j G_j
 c_(i-j) + b_i``.
+
+All of these equations say that something unknown, x, equals a sum ``f(x)`` over the pixels. A single pass gives the sum
+for a guess at x, and a sample how it changes from there: ``x = f(guess) + s(x) - s(guess)``, where s estimates f. The
+error is that of the sample times that of the guess.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -16,8 +20,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.kernels.grams import sum_grams
-from nlfilter_torch.core.kernels.tall_skinny import moment
-from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.core.kernels.sweeps import positive_root
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.operator import Columns
@@ -37,20 +41,22 @@ class Block:
     image: Tensor
     weights: Tensor
 
-
-Pass = Callable[[], Iterator[Block]]
-
-
-def start_balancing(factor: Tensor, diagonal: Tensor, weight: float) -> Tensor:
-    """The moment t (1, M, 1), in float64, of an image from a sample whose pixels stand for ``weight`` pixels each."""
-    # With d = e / sqrt(w) the weighted equation is that of the sample alone, for e and a smaller diagonal.
-    scaling = balance(factor, diagonal / weight, tolerance=1e-3).scaling
-    return weight**0.5 * moment(factor, scaling.unsqueeze(1))
+    @staticmethod
+    def together(parts: list["Block"]) -> "Block":
+        """Several blocks as one."""
+        factors, diagonals, images, weights = zip(
+            *((part.factor, part.diagonal, part.image, part.weights) for part in parts), strict=True
+        )
+        return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(images, 2), torch.cat(weights, 1))
 
 
-def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor:
+Pass = Callable[[], Iterable[Block]]
+
+
+def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correction: Tensor | float = 0.0) -> Tensor:
     """The moment t (1, M, 1) of the pixels in ``blocks``, from a first guess ``total``.
 
+    ``correction``: what is added to their sum.
     ``completed``: the kernel has a unit diagonal and no negative entry, so that no scaling can be large. A guess that
     knows nothing of some pixels would give them one, and Newton's method would only halve it with every pass.
     """
@@ -67,7 +73,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
             sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
             weights = scaling * (block.weights / (1 + remainder)).sqrt()
             jacobian += sum_grams(block.factor, weights, remainder, 1)[:, 0]
-        step = torch.cholesky_solve(sums - total, torch.linalg.cholesky_ex(jacobian).L)
+        step = torch.cholesky_solve(sums + correction - total, torch.linalg.cholesky_ex(jacobian).L)
         total = total + step
         change = float(step.norm() / total.norm())
         if change <= tolerance:
@@ -104,18 +110,85 @@ class Sums:
         grams: ``F diag(r^j) F^T``, (1, J, M, M), float64.
         moments: ``F r^i y``, (1, k, M, C), float64.
         dtype: of the factor.
+        correction: what the coefficients lack if these are sums over a sample, (1, k, M, C), float64.
     """
 
     grams: Tensor
     moments: Tensor
     dtype: torch.dtype
+    correction: Tensor | None = None
 
     def coefficients(self) -> Tensor:
         """The c_i of ``W^i y = F^T c_i + r W^(i-1) y`` for i = 1 ... k, (1, k, M, C)."""
-        found = [self.moments[:, 0]]
-        for i in range(1, self.moments.shape[1]):
-            found.append(self.moments[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
+        known = self.moments if self.correction is None else self.moments + self.correction
+        found = [known[:, 0]]
+        for i in range(1, known.shape[1]):
+            found.append(known[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
         return torch.stack(found, dim=1)
+
+
+@dataclass(frozen=True)
+class Totals:
+    """Sums over pixels for a guess at the balancing and at the coefficients of powers of W.
+
+    Attributes:
+        moment: ``sum_i w_i d_i u_i``, (1, M, 1), float64.
+        coefficients: ``F W^(i-1) y`` for i = 1 ... k, (1, k, M, C), float64.
+        grams: ``F diag(r^j) F^T``, (1, 2, M, M), float64, or 0 if they are not needed.
+    """
+
+    moment: Tensor
+    coefficients: Tensor
+    grams: Tensor
+
+    def plus(self, other: "Totals", sign: int = 1) -> "Totals":
+        """The sum of both, or their difference."""
+        return Totals(
+            self.moment + sign * other.moment,
+            self.coefficients + sign * other.coefficients,
+            self.grams + sign * other.grams,
+        )
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A guess at the balancing, and at the coefficients of the powers of W before the last.
+
+    Attributes:
+        moment: t, (1, M, 1).
+        coefficients: (1, k - 1, M, C).
+        values: of a block under its columns, the planes y (1, C, n).
+        spectral: whether Gram matrices are to be summed up.
+    """
+
+    moment: Tensor
+    coefficients: Tensor
+    values: Callable[[Block, Columns], Tensor]
+    spectral: bool
+
+    def columns(self, block: Block, half: Tensor | None = None) -> Columns:
+        """The columns of a block; ``half`` is ``u . t / 2``, (1, n), if known."""
+        if half is None:
+            half = spread((self.moment / 2).mT.to(block.factor), block.factor).squeeze(1)
+        scaling = positive_root(half, block.diagonal).clamp_(max=LARGEST)  # of a pixel that the guess knows nothing of
+        return Columns(block.factor, scaling, scaling * (scaling * block.diagonal))
+
+    def totals(self, block: Block) -> tuple[Columns, Totals]:
+        """The columns of a block, and its part of the sums."""
+        factor, (order, _, count) = block.factor, self.coefficients.shape[1:]
+        rows = torch.cat([(self.moment / 2).mT, self.coefficients.transpose(2, 3).flatten(1, 2)], dim=1)
+        products = spread(rows.to(factor), factor)  # all in one read
+        columns = self.columns(block, products[:, 0])
+        powers = [self.values(block, columns)]
+        for product in products[:, 1:].unflatten(1, (order, count)).unbind(1):
+            powers.append(columns.scaling.unsqueeze(1) * product + columns.remainder.unsqueeze(1) * powers[-1])
+        mass = (block.weights * columns.scaling).unsqueeze(1)
+        sums = moment(factor, torch.cat([mass, *(mass * power for power in powers)], dim=1))  # (1, M, 1 + k C)
+        grams = torch.zeros(1, 1, factor.shape[1], factor.shape[1])
+        if self.spectral:
+            grams = sum_grams(factor, columns.scaling * block.weights.sqrt(), columns.remainder, 2)
+        coefficients = sums[:, :, 1:].unflatten(2, (len(powers), -1)).transpose(1, 2)
+        return columns, Totals(sums[:, :, :1], coefficients, grams)
 
 
 def sum_up(pixels: Iterable[tuple[Tensor, Columns, Tensor]], order: int) -> Sums:

@@ -13,7 +13,7 @@ from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 
-SAMPLE = 1 << 20  # pixels; docs/scale.md shows the effect of more or fewer
+SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
 TOGETHER, AMPLE = 1 << 14, 1 << 28  # pixels of rows computed together, which take less time each, and bytes for that
 Statistics = Literal["sample", "full"]
