@@ -19,10 +19,10 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.sampling import Draws, all_blocks, draw
+from nlfilter_torch.tiled.sampling import Draws, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import GuidePicture, Picture
-from nlfilter_torch.tiled.statistics import Guess, balance_by_passes
+from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes
 
 Array = NDArray[Any]
@@ -116,9 +116,9 @@ def test_all_channels_on_request() -> None:
 
 
 def test_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "PILOT", 1 << 14)
+    monkeypatch.setattr(sampling, "PILOT", 1 << 12)
     picture = cat(270, 350)
-    edited = streamed(picture, sample=1 << 15)
+    edited = streamed(picture, sample=1 << 13)
     difference = np.abs(edited - in_memory(picture)).max()
     assert 1e-5 < difference < LEVEL
 
@@ -180,13 +180,14 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(compl
     picture = GuidePicture(Picture(cat(90, 120)), Guide({}))
     pilot = sampling.take_pilot(picture, silent, num_landmarks=30, completion=completion)
     guess = Guess(pilot.balancing, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
-    draws, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
-    for block in all_blocks(picture, pilot.kernel, silent, "Sampling"):
+    draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
+    drawn = []
+    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2)(lambda block: block):
         columns, totals = guess.totals(block)
-        draws.add(block, columns)
+        drawn.append(draw_from(block, columns))
         moment, grams = moment + totals.moment, grams + totals.grams
-    assert len(draws.found) > 1
-    sample = draws.drawn()
+    assert len(drawn) > 1
+    sample = Block.together(drawn)
     assert 2500 < sample.weights.numel() < 3500
     assert abs(float(sample.weights.sum()) / picture.pixels - 1) < 0.1
     estimate = guess.totals(sample)[1]
@@ -323,7 +324,7 @@ def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -
     picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
     pilot = sampling.take_pilot(picture, silent, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
-        balance_by_passes(lambda: [pilot.sample], 9 * pilot.balancing, completed=True)
+        balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.balancing, completed=True)
 
 
 class Shrinking(Rows):

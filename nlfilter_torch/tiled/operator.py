@@ -1,6 +1,6 @@
 """The filter of a picture that is read a few rows at a time: the few sums that it consists of, and its columns."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -18,18 +18,22 @@ from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.sampling import Draws, Pilot, Report, all_blocks, patches_at, scaled_patches, visit
+from nlfilter_torch.tiled.sampling import Draws, Pilot, Report, over_all, patches_at, scaled_patches, visit
 from nlfilter_torch.tiled.sources import GuidePicture, RowSource, Tile
 from nlfilter_torch.tiled.statistics import (
     CONVERGED,
     Block,
     Guess,
+    Pass,
     Sums,
     Totals,
     balance_by_passes,
     limiter_by_passes,
     sum_up,
 )
+from nlfilter_torch.tiled.workers import in_order
+
+PARTS = 8  # of a sample, for several workers at once
 
 
 @dataclass(eq=False)
@@ -87,6 +91,7 @@ class TiledOperator:
         full: whether further passes over all pixels are made.
         kernel: landmarks, bandwidths and window.
         bounded: whether eigenvalues are to be kept from exceeding 1.
+        workers: tiles that are worked out at once.
     """
 
     guide: GuidePicture
@@ -96,39 +101,40 @@ class TiledOperator:
     full: bool
     kernel: Kernel
     bounded: bool
+    workers: int
     _balancing: PixelScaling | None = None
-    _sample: Block | None = None
+    _sample: list[Block] | None = None
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
     _grams: Tensor | float = 0.0  # what those of the sample lack
 
     @torch.no_grad()
     @full_precision
-    def settle(self, planes: Planes, order: int) -> None:
-        """Balance, and sum up for the first ``order`` powers of W and some planes that depend on colours alone."""
+    def settle(self, planes: Planes = first_plane, order: int = 1) -> None:
+        """Unless that is done, balance, and sum up for powers of W and some planes that depend on colours alone."""
+        if self._balancing is not None:
+            return
         total, completed, lacking = self.pilot.balancing, self.pilot.completed, None
         if self.count is not None:
             self._sample, lacking = self._look_again(self.count, planes, order)
-            total = balance_by_passes(
-                lambda: self.blocks("Balancing"), total, completed=completed, correction=lacking.moment
-            )
+            total = balance_by_passes(self.over("Balancing"), total, completed=completed, correction=lacking.moment)
         if self.full:
             self._sample = lacking = None
-            total = balance_by_passes(lambda: self.blocks("Balancing"), total, completed=completed)
+            total = balance_by_passes(self.over("Balancing"), total, completed=completed)
         self._balancing = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
-        limiter = limiter_by_passes(lambda: self.blocks("Bounding"), self._balancing) if self.bounded else None
+        limiter = limiter_by_passes(self.over("Bounding"), self._balancing, self.guide.dtype) if self.bounded else None
         if limiter is not None:
             self.kernel = replace(self.kernel, limiter=limiter.to(self.kernel.landmarks))
         if self._sample is None or lacking is None:
             return
         if limiter is not None:
-            self._sample = replace(self._sample, factor=limiter.to(self._sample.factor) @ self._sample.factor)
+            self._sample = [replace(block, factor=limiter.to(block.factor) @ block.factor) for block in self._sample]
             lacking = Totals(
                 lacking.moment, limiter @ lacking.coefficients, limiter @ lacking.grams.to(limiter) @ limiter
             )
         self._grams = lacking.grams
         self._sums[id(planes)] = (planes, replace(self._summed_up(planes, order), correction=lacking.coefficients))
 
-    def _look_again(self, count: int, planes: Planes, order: int) -> tuple[Block, Totals]:
+    def _look_again(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
         """About ``count`` pixels, and what their sums under the pilot's guess lack to those of all pixels."""
         pilot = self.pilot
 
@@ -139,22 +145,32 @@ class TiledOperator:
             pilot.balancing, torch.empty(1, 0, pilot.balancing.shape[1], 1), values, self.guide.guide.spectral
         )
         columns = guess.columns(pilot.sample)
-        known = sum_up([(values(pilot.sample, columns), columns, pilot.sample.weights)], order).coefficients()
-        guess = replace(guess, coefficients=known[:, :-1])
-        draws, every = Draws(pilot, columns, count, self.guide.pixels), None
-        for block in all_blocks(self.guide, self.kernel, self.report, "Sampling"):
-            columns, found = guess.totals(block)
-            draws.add(block, columns)
-            every = found if every is None else every.plus(found)
-        assert every is not None  # for mypy; a picture has a pixel
-        sample = draws.drawn()
-        return sample, every.plus(guess.totals(sample)[1], sign=-1)
+        known = sum_up(self._among([pilot.sample]), lambda block: (values(block, columns), columns), order)
+        guess = replace(guess, coefficients=known.coefficients()[:, :-1])
+        draw, drawn, total = Draws(pilot, columns, count, self.guide.pixels), [], None
+
+        def look(block: Block) -> tuple[Block, Totals]:
+            columns, totals = guess.totals(block)
+            return draw(block, columns), totals
+
+        for some, totals in over_all(self.guide, self.kernel, self.report, "Sampling", self.workers)(look):
+            drawn.append(some)
+            total = totals if total is None else total.plus(totals)
+        assert total is not None  # for mypy; a picture has a pixel
+        each = -(-len(drawn) // PARTS)
+        sample = [Block.together(drawn[first : first + each]) for first in range(0, len(drawn), each)]
+        for totals in self._among(sample)(lambda block: guess.totals(block)[1]):
+            total = total.plus(totals, sign=-1)
+        return sample, total
+
+    def _among(self, blocks: list[Block]) -> Pass:
+        """A pass over some blocks."""
+        return lambda function: in_order(function, blocks, self.workers)
 
     @property
     def balancing(self) -> PixelScaling:
         """What the scaling of a pixel is a function of."""
-        if self._balancing is None:
-            self.settle(first_plane, 1)
+        self.settle()
         assert self._balancing is not None  # for mypy
         return self._balancing
 
@@ -174,27 +190,23 @@ class TiledOperator:
         factor, diagonal = self.kernel.factor(features)
         return Columns(factor, *balancing(factor, diagonal))
 
-    def blocks(self, stage: str) -> Iterator[Block]:
-        """The sample, or all pixels."""
+    def over(self, stage: str) -> Pass:
+        """A pass over the sample, or over all pixels."""
         if self._sample is None:
-            yield from all_blocks(self.guide, self.kernel, self.report, stage)
-            return
+            return lambda function: over_all(self.guide, self.kernel, self.report, stage, self.workers)(function)
         self.report(stage, 0, 1)
-        yield self._sample
+        return self._among(self._sample)
 
-    def pixels(self, stage: str) -> Iterator[tuple[BlockPixels, Tensor]]:
-        """The same with columns, and how many pixels each stands for, (1, n)."""
-        balancing = self.balancing
-        for block in self.blocks(stage):
-            columns = Columns(block.factor, *balancing(block.factor, block.diagonal))
-            yield BlockPixels(block.image.unsqueeze(2), columns), block.weights
+    def pixels(self, block: Block) -> BlockPixels:
+        """Those of a block, with columns."""
+        columns = Columns(block.factor, *self.balancing(block.factor, block.diagonal))
+        return BlockPixels(block.image.unsqueeze(2), columns)
 
     @torch.no_grad()
     @full_precision
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums for the first ``order`` powers of W, and some planes."""
-        if self._balancing is None:
-            self.settle(planes, order)
+        self.settle(planes, order)
         known = self._sums.get(id(planes))
         if known is None or known[1].moments.shape[1] < order:
             known = (planes, self._summed_up(planes, order))
@@ -202,8 +214,11 @@ class TiledOperator:
         return known[1]
 
     def _summed_up(self, planes: Planes, order: int) -> Sums:
-        return sum_up(((planes(pixels).flatten(2), pixels.found, weights)
-                       for pixels, weights in self.pixels("Summing up")), order)  # fmt: skip
+        def values(block: Block) -> tuple[Tensor, Columns]:
+            pixels = self.pixels(block)
+            return planes(pixels).flatten(2), pixels.found
+
+        return sum_up(self.over("Summing up"), values, order)
 
     @cached_property
     def pairs(self) -> RitzPairs:
@@ -246,9 +261,14 @@ class TiledOperator:
     def mean(self, planes: Planes) -> Tensor:
         """Means over the pixels, or over the sample."""
         total, weight = torch.zeros(()), torch.zeros((), dtype=torch.float64)
-        for pixels, weights in self.pixels("Averaging"):
-            total = total + (planes(pixels).flatten(2) * weights.unsqueeze(1)).double().sum(2)
-            weight = weight + weights.double().sum()
+        self.settle()
+
+        def part(block: Block) -> tuple[Tensor, Tensor]:
+            values = planes(self.pixels(block)).flatten(2) * block.weights.unsqueeze(1)
+            return values.double().sum(2), block.weights.double().sum()
+
+        for values, weights in self.over("Averaging")(part):
+            total, weight = total + values, weight + weights
         return (total / weight).to(self.guide.dtype)
 
     def features_at(self, places: Tensor) -> Tensor:

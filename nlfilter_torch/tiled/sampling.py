@@ -27,7 +27,8 @@ from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, conden
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
-from nlfilter_torch.tiled.statistics import Block
+from nlfilter_torch.tiled.statistics import Block, Pass
+from nlfilter_torch.tiled.workers import alone, in_order
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
 STARTED = 1e-3  # residual of its balancing, which is a first guess
@@ -36,14 +37,21 @@ CHUNK = 1 << 16  # scribbled pixels whose factor is there at once
 Report = Callable[[str, int, int], None]
 
 
-def all_blocks(picture: GuidePicture, kernel: Kernel, report: Report, stage: str) -> Iterator[Block]:
-    """Factor and diagonal of every pixel of a picture."""
+def over_all(picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int) -> Pass:
+    """A pass over every pixel of a picture."""
     size = kernel.recipe.patch_weights.shape[0] // 2
-    for tile in picture.picture.tiles(size + picture.guide.margin, picture.statistics_rows):
+
+    def tiles() -> Iterator[Tile]:
+        for tile in picture.picture.tiles(size + picture.guide.margin, picture.statistics_rows):
+            report(stage, tile.start, picture.size[0])
+            yield tile
+
+    def block_of(tile: Tile) -> Block:
         guide = picture.seen(tile, size)
         columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
-        report(stage, tile.start, picture.size[0])
-        yield Block(*columns, tile.inner.flatten(2), torch.ones_like(columns[1]))
+        return Block(*columns, tile.inner.flatten(2), torch.ones_like(columns[1]), tile.start)
+
+    return lambda function: in_order(lambda tile: function(block_of(tile)), tiles(), workers)
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,7 @@ class Pilot:
 def take_pilot(
     picture: GuidePicture,
     report: Report,
+    workers: int = 1,
     *,
     patch_size: int = 5,
     photometric_bandwidth: float | Literal["auto"] = "auto",
@@ -108,29 +117,36 @@ def take_pilot(
     rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # the landmarks need what is in the generator
     even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
     wanted = torch.cat([candidates, even])
-    patches, values = [], []
-    slope = 0.0
-    margin = max(patch_size // 2, 1)
-    for tile, chosen in visit(picture.picture, margin + picture.guide.margin, wanted.sort().values, report, "Looking"):
+    margin, automatic = max(patch_size // 2, 1), isinstance(photometric_bandwidth, str)
+
+    def look(part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float]:
+        tile, chosen = part
         seen = picture.seen(tile, margin)
         guide = reduce_channels(seen.pixels, guide_channels)
-        patches.append(patches_at(guide, seen, chosen, patch_size))
-        values.append(tile.inner.flatten(2)[:, :, chosen])
-        if photometric_bandwidth == "auto":
-            slope += float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
+        slope = float(gradients(guide, seen.halo).double().mean((0, 1)).sum()) if automatic else 0.0
+        return patches_at(guide, seen, chosen, patch_size), tile.inner.flatten(2)[:, :, chosen], slope
+
+    parts = visit(picture.picture, margin + picture.guide.margin, wanted.sort().values, report, "Looking")
+    patches, values, slopes = zip(*in_order(look, parts, workers), strict=True)
     if isinstance(photometric_bandwidth, str):
-        photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels, dtype=torch.float64)))
+        photometric_bandwidth = float(
+            bandwidth_of_gradient(torch.tensor(sum(slopes) / picture.pixels, dtype=torch.float64))
+        )
     order = torch.empty_like(wanted)
     order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
     recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, guide_channels)
     features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, recipe)
-    points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
-    kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
-    weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
-    columns = kernel.factor(features[:, :, len(candidates) :])
-    found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
     image = torch.cat(values, dim=2)[:, :, order[len(candidates) :]]
-    return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
+    weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
+
+    def fitted() -> Pilot:
+        points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
+        kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
+        columns = kernel.factor(features[:, :, len(candidates) :])
+        found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
+        return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
+
+    return alone(fitted, workers)
 
 
 def visit(
@@ -175,7 +191,7 @@ EVEN = 0.1  # share of a sample that is spread evenly over the picture
 
 
 class Draws:
-    """About ``count`` pixels of a picture, rare ones more likely than common ones, in one pass over its columns.
+    """Draws about ``count`` pixels of a picture, rare ones more likely than common ones.
 
     A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
     of a photograph off by two grey levels and more. The leverage of a pixel is its own share of what W makes of it,
@@ -184,27 +200,22 @@ class Draws:
 
     def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
         """``columns`` are those of the pilot's sample."""
-        self.completed, self.generator = pilot.completed, np.random.default_rng(pilot.seed)
-        self.even, self.found = EVEN * count / pixels, list[Block]()
+        self.completed, self.seed, self.even = pilot.completed, pilot.seed, EVEN * count / pixels
         weight = float(pilot.sample.weights[0, 0])
-        self.rate = _rate(self.leverage(columns, pilot.sample.diagonal), weight, self.even, count)
+        self.rate = _rate(self.leverage(pilot.sample, columns), weight, self.even, count)
 
-    def leverage(self, columns: Columns, diagonal: Tensor) -> Tensor:
-        """Of pixels: (n,) in float64."""
-        length = 1 - diagonal if self.completed else columns.factor.square().sum(1)
+    def leverage(self, block: Block, columns: Columns) -> Tensor:
+        """Of the pixels of a block, whose columns these are: (n,) in float64."""
+        length = 1 - block.diagonal if self.completed else columns.factor.square().sum(1)
         return (columns.scaling.square() * length)[0].double()
 
-    def add(self, block: Block, columns: Columns) -> None:
-        """Draw from a block, whose columns these are."""
-        likely = (self.even + self.rate * self.leverage(columns, block.diagonal)).clamp(max=1.0)
-        chosen, counts = draw(likely, self.generator)
+    def __call__(self, block: Block, columns: Columns) -> Block:
+        """Those drawn from a block."""
+        likely = (self.even + self.rate * self.leverage(block, columns)).clamp(max=1.0)
+        chosen, counts = draw(likely, np.random.default_rng([self.seed, block.number]))
         weights = (counts / likely[chosen]).to(block.weights)[None]
         factor, diagonal, image = (planes[..., chosen] for planes in (block.factor, block.diagonal, block.image))
-        self.found.append(Block(factor, diagonal, image, weights))
-
-    def drawn(self) -> Block:
-        """All that were drawn."""
-        return Block.together(self.found)
+        return Block(factor, diagonal, image, weights)
 
 
 def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]:

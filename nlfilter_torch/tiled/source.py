@@ -58,7 +58,8 @@ class Tiled:
         numbers = patch_size**2 * (self.channels if options.get("guide_channels") == "all" else 1) + 2
         self.room(numbers, count)
         passes, picture = self.passes, GuidePicture(self.picture, guide)
-        pilot = take_pilot(picture, passes.report, **options)
+        workers = passes.workers(count)
+        pilot = take_pilot(picture, passes.report, workers, **options)
         sampled = passes.sample < picture.pixels
         found = TiledOperator(
             picture,
@@ -68,6 +69,7 @@ class Tiled:
             full=not sampled or passes.statistics == "full" or guide.exact,
             kernel=pilot.kernel,
             bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, pilot.balancing.shape[1]),
+            workers=workers,
         )
         self.operators.append(found)
         self.floats += numbers
@@ -221,10 +223,14 @@ class Tiled:
         """
         landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
         rows = self.passes.tile_rows or (self.room(0, landmarks) if self.operators else TILE_PIXELS // self.size[1])
-        together = self.passes.rows_together(self.size[1])
+        together, workers = self.passes.rows_together(self.size[1]), self.passes.workers(landmarks)
         rows = max(1, rows // together) * together
+        for operator in self.operators:
+            operator.settle()  # before several tiles at once need it
         if fitted.finish is None:
-            yield from self.passes.work_out(self.picture, lambda tile: self.edited(fitted, tile), self.margin, rows)
+            yield from self.passes.work_out(
+                self.picture, lambda tile: self.edited(fitted, tile), self.margin, rows, workers=workers
+            )
             return
         finish, margin = fitted.finish, fitted.margin
         plain = replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
@@ -233,6 +239,7 @@ class Tiled:
             lambda tile: self.edited(fitted, tile),
             self.margin,
             rows,
+            workers=workers,
             transparent=False,
             stage="Comparing",
         )

@@ -14,6 +14,7 @@ error is that of the sample times that of the guess.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,12 +35,13 @@ ALARM = 1e-3
 
 @dataclass(frozen=True)
 class Block:
-    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), and how many each stands for, (1, n)."""
+    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each stands for, (1, n); a number."""
 
     factor: Tensor
     diagonal: Tensor
     image: Tensor
     weights: Tensor
+    number: int = 0
 
     @staticmethod
     def together(parts: list["Block"]) -> "Block":
@@ -50,7 +52,7 @@ class Block:
         return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(images, 2), torch.cat(weights, 1))
 
 
-Pass = Callable[[], Iterable[Block]]
+Pass = Callable[[Callable[[Block], Any]], Iterable[Any]]  # what a function gives of each block, in order
 
 
 def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correction: Tensor | float = 0.0) -> Tensor:
@@ -62,17 +64,19 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
     """
     largest = LARGEST if completed else float("inf")
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
-    change = float("inf")
+    change, tolerance = float("inf"), 0.0
+
+    def terms(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
+        scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor)).clamp(max=largest)
+        remainder = scaling * (scaling * block.diagonal)
+        weights = scaling * (block.weights / (1 + remainder)).sqrt()
+        sums = moment(block.factor, (block.weights * scaling).unsqueeze(1))
+        return sums, sum_grams(block.factor, weights, remainder, 1)[:, 0], block.factor.dtype
+
     for _ in range(MAX_PASSES):
-        sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1).clone()
-        tolerance = 0.0
-        for block in blocks():
-            tolerance = CONVERGED[block.factor.dtype]
-            scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor)).clamp(max=largest)
-            remainder = scaling * (scaling * block.diagonal)
-            sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
-            weights = scaling * (block.weights / (1 + remainder)).sqrt()
-            jacobian += sum_grams(block.factor, weights, remainder, 1)[:, 0]
+        sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1)
+        for part, slope, dtype in blocks(terms):
+            sums, jacobian, tolerance = sums + part, jacobian + slope, CONVERGED[dtype]
         step = torch.cholesky_solve(sums + correction - total, torch.linalg.cholesky_ex(jacobian).L)
         total = total + step
         change = float(step.norm() / total.norm())
@@ -86,17 +90,16 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
     return total
 
 
-def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
+def limiter_by_passes(blocks: Pass, balancing: PixelScaling, dtype: torch.dtype) -> Tensor | None:
     """The ``X^(1/2)`` (1, M, M) by which the factor is multiplied, or None where no eigenvalue exceeds 1."""
-    dtype = next(iter(blocks())).factor.dtype
 
     def gram(at: Tensor, power: int) -> Tensor:
-        matrix = torch.zeros((), dtype=torch.float64)
-        for block in blocks():
+        def part(block: Block) -> Tensor:
             scaling, remainder = balancing(block.factor, block.diagonal)
             weights = block.weights * shift(at, remainder).pow(-power)
-            matrix = matrix + sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
-        return matrix
+            return sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
+
+        return torch.stack(list(blocks(part))).sum(0)
 
     allowed = slack(dtype, CONVERGED[dtype])
     return limiter(gram, balancing.moment, allowed) if exceeds(gram, balancing.moment, allowed) else None
@@ -191,21 +194,26 @@ class Guess:
         return columns, Totals(sums[:, :, :1], coefficients, grams)
 
 
-def sum_up(pixels: Iterable[tuple[Tensor, Columns, Tensor]], order: int) -> Sums:
+def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
     """One pass over pixels, for the first ``order`` powers of W.
 
     Args:
-        pixels: values y (1, C, n) to filter, columns, and how many pixels each stands for, (1, n).
+        blocks: of the pixels.
+        values: what is filtered of a block, y (1, C, n), and its columns.
         order: k, at least 1.
     """
-    grams, moments, dtype = torch.zeros(()), torch.zeros(()), torch.float64
-    for values, columns, weights in pixels:
+
+    def part(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
+        planes, columns = values(block)
         factor, scaling, remainder = columns.factor, columns.scaling, columns.remainder
-        grams = grams + sum_grams(factor, scaling * weights.sqrt(), remainder, max(order - 1, 2))
-        powers = [(scaling * weights).unsqueeze(1) * values]
+        grams = sum_grams(factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
+        powers = [(scaling * block.weights).unsqueeze(1) * planes]
         for _ in range(order - 1):
             powers.append(remainder.unsqueeze(1) * powers[-1])
         sums = moment(factor, torch.cat(powers, dim=1))  # (1, M, k C)
-        moments = moments + sums.unflatten(2, (order, -1)).transpose(1, 2)
-        dtype = factor.dtype
+        return grams, sums.unflatten(2, (order, -1)).transpose(1, 2), factor.dtype
+
+    grams, moments, dtype = torch.zeros(()), torch.zeros(()), torch.float64
+    for gram, sums, dtype in blocks(part):  # noqa: B007
+        grams, moments = grams + gram, moments + sums
     return Sums(grams, moments, dtype)

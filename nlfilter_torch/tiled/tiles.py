@@ -1,17 +1,19 @@
 """Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
+from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
@@ -68,6 +70,10 @@ class Passes:
         """Rows that are always computed together; a tile has as many, or a multiple."""
         return max(1, (TOGETHER if self.memory >= AMPLE else 1) // width)
 
+    def workers(self, num_landmarks: int) -> int:
+        """Tiles that are worked out at once, by threads of their own: as many as fit well."""
+        return max(1, min(torch.get_num_threads(), self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
+
     def work_out(
         self,
         picture: Picture,
@@ -75,18 +81,30 @@ class Passes:
         margin: int,
         rows: int,
         *,
+        workers: int = 1,
         transparent: bool = True,
         stage: str = "Filtering",
     ) -> Rows:
         """The edited rows, with their transparency if asked for, in tiles of ``rows``."""
-        for tile in picture.tiles(margin, rows):
-            self.report(stage, tile.start, picture.size[0])
-            with torch.no_grad():
-                values = stored_as(edit(tile), self.kind)
+
+        def tiles() -> Iterator[Tile]:
+            for tile in picture.tiles(margin, rows):
+                self.report(stage, tile.start, picture.size[0])
+                yield tile
+
+        def worked_out(tile: Tile) -> tuple[slice, NDArray[Any]]:
+            values = stored_as(edit(tile), self.kind)
             if transparent:
                 values = np.concatenate([values, transparency(tile, self.kind)], axis=2)
-            yield slice(tile.start, tile.start + len(values)), values
+            return slice(tile.start, tile.start + len(values)), values
+
+        yield from in_order(worked_out, tiles(), workers)
         self.report(stage, picture.size[0], picture.size[0])
+
+
+def bytes_at_hand(pixels: int, num_landmarks: int) -> int:
+    """What pixels that are computed together take: their factor, and products as large."""
+    return 16 * pixels * num_landmarks
 
 
 def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False) -> None:
