@@ -19,7 +19,7 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.sampling import Draws, draw, over_all
+from nlfilter_torch.tiled.sampling import Draws, KeptColumns, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
@@ -182,7 +182,7 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(compl
     guess = Guess(pilot.balancing, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
     draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
     drawn = []
-    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2)(lambda block: block):
+    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2, KeptColumns(2400, 5000))(lambda block: block):
         columns, totals = guess.totals(block)
         drawn.append(draw_from(block, columns))
         moment, grams = moment + totals.moment, grams + totals.grams

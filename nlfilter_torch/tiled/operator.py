@@ -18,7 +18,7 @@ from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.sampling import Draws, Pilot, Report, over_all, patches_at, scaled_patches, visit
+from nlfilter_torch.tiled.sampling import Draws, KeptColumns, Pilot, Report, over_all, patches_at, scaled_patches, visit
 from nlfilter_torch.tiled.sources import GuidePicture, RowSource, Tile
 from nlfilter_torch.tiled.statistics import (
     CONVERGED,
@@ -54,7 +54,10 @@ class TilePixels:
     def columns(self, operator: "TiledOperator") -> Columns:
         """Their columns, worked out once for each operator."""
         if id(operator) not in self._columns:
-            self._columns[id(operator)] = operator.columns(self.features(operator))
+            known = operator.kept.find(slice(self.first, self.first + self.image[0, 0].numel()))
+            self._columns[id(operator)] = (
+                operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
+            )
         return self._columns[id(operator)]
 
 
@@ -92,6 +95,7 @@ class TiledOperator:
         kernel: landmarks, bandwidths and window.
         bounded: whether eigenvalues are to be kept from exceeding 1.
         workers: tiles that are worked out at once.
+        kept: columns from earlier passes.
     """
 
     guide: GuidePicture
@@ -102,6 +106,7 @@ class TiledOperator:
     kernel: Kernel
     bounded: bool
     workers: int
+    kept: KeptColumns
     _balancing: PixelScaling | None = None
     _sample: list[Block] | None = None
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
@@ -124,6 +129,7 @@ class TiledOperator:
         limiter = limiter_by_passes(self.over("Bounding"), self._balancing, self.guide.dtype) if self.bounded else None
         if limiter is not None:
             self.kernel = replace(self.kernel, limiter=limiter.to(self.kernel.landmarks))
+            self.kept.blocks.clear()
         if self._sample is None or lacking is None:
             return
         if limiter is not None:
@@ -153,7 +159,7 @@ class TiledOperator:
             columns, totals = guess.totals(block)
             return draw(block, columns), totals
 
-        for some, totals in over_all(self.guide, self.kernel, self.report, "Sampling", self.workers)(look):
+        for some, totals in self._over_all("Sampling")(look):
             drawn.append(some)
             total = totals if total is None else total.plus(totals)
         assert total is not None  # for mypy; a picture has a pixel
@@ -162,6 +168,10 @@ class TiledOperator:
         for totals in self._among(sample)(lambda block: guess.totals(block)[1]):
             total = total.plus(totals, sign=-1)
         return sample, total
+
+    def _over_all(self, stage: str) -> Pass:
+        """A pass over every pixel."""
+        return lambda of: over_all(self.guide, self.kernel, self.report, stage, self.workers, self.kept)(of)
 
     def _among(self, blocks: list[Block]) -> Pass:
         """A pass over some blocks."""
@@ -186,21 +196,23 @@ class TiledOperator:
 
     def columns(self, features: Tensor) -> Columns:
         """Columns of pixels with features (1, D, n)."""
-        balancing = self.balancing  # first: it may change the kernel
-        factor, diagonal = self.kernel.factor(features)
-        return Columns(factor, *balancing(factor, diagonal))
+        self.settle()  # first: it may change the kernel
+        return self.scaled(*self.kernel.factor(features))
+
+    def scaled(self, factor: Tensor, diagonal: Tensor) -> Columns:
+        """Columns of pixels with this factor and diagonal."""
+        return Columns(factor, *self.balancing(factor, diagonal))
 
     def over(self, stage: str) -> Pass:
         """A pass over the sample, or over all pixels."""
         if self._sample is None:
-            return lambda function: over_all(self.guide, self.kernel, self.report, stage, self.workers)(function)
+            return self._over_all(stage)
         self.report(stage, 0, 1)
         return self._among(self._sample)
 
     def pixels(self, block: Block) -> BlockPixels:
         """Those of a block, with columns."""
-        columns = Columns(block.factor, *self.balancing(block.factor, block.diagonal))
-        return BlockPixels(block.image.unsqueeze(2), columns)
+        return BlockPixels(block.image.unsqueeze(2), self.scaled(block.factor, block.diagonal))
 
     @torch.no_grad()
     @full_precision

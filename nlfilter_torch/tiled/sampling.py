@@ -37,7 +37,36 @@ CHUNK = 1 << 16  # scribbled pixels whose factor is there at once
 Report = Callable[[str, int, int], None]
 
 
-def over_all(picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int) -> Pass:
+class KeptColumns:
+    """Columns of the first pixels of a picture, kept from one pass to the next.
+
+    Args:
+        each: pixels of a block of a pass.
+        count: how many pixels may be kept.
+    """
+
+    def __init__(self, each: int, count: int) -> None:
+        self.each, self.count = each, count
+        self.blocks: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def keep(self, first: int, columns: tuple[Tensor, Tensor]) -> None:
+        """Take the columns of the block that begins with a pixel, if there is room."""
+        if first + columns[1].shape[1] <= self.count:
+            self.blocks[first] = columns
+
+    def find(self, pixels: slice) -> tuple[Tensor, Tensor] | None:
+        """Factor and diagonal of some pixels, if all are in one block that is kept."""
+        first = pixels.start // self.each * self.each
+        known = self.blocks.get(first)
+        if known is None or pixels.stop > first + known[1].shape[1]:
+            return None
+        inside = slice(pixels.start - first, pixels.stop - first)
+        return known[0][:, :, inside], known[1][:, inside]
+
+
+def over_all(
+    picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int, kept: KeptColumns
+) -> Pass:
     """A pass over every pixel of a picture."""
     size = kernel.recipe.patch_weights.shape[0] // 2
 
@@ -47,9 +76,13 @@ def over_all(picture: GuidePicture, kernel: Kernel, report: Report, stage: str, 
             yield tile
 
     def block_of(tile: Tile) -> Block:
-        guide = picture.seen(tile, size)
-        columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
-        return Block(*columns, tile.inner.flatten(2), torch.ones_like(columns[1]), tile.start)
+        image, first = tile.inner.flatten(2), tile.start * picture.size[1]
+        columns = kept.find(slice(first, first + image.shape[2]))
+        if columns is None:
+            guide = picture.seen(tile, size)
+            columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
+            kept.keep(first, columns)
+        return Block(*columns, image, torch.ones_like(columns[1]), tile.start)
 
     return lambda function: in_order(lambda tile: function(block_of(tile)), tiles(), workers)
 

@@ -16,10 +16,10 @@ from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.sampling import take_pilot
+from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot
 from nlfilter_torch.tiled.scribbles import check_room, floats_of_scribbled, read_scribbles
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
-from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, rows_that_fit
+from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
 
 FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
 
@@ -42,6 +42,7 @@ class Tiled:
         self.operators: list[TiledOperator] = []
         self.floats = 8 * picture.colours + 40  # floats for each pixel of a tile, without features
         self.scribbled = 0  # pixels
+        self.kept = 0  # floats of columns
 
     @torch.no_grad()
     @full_precision
@@ -56,11 +57,16 @@ class Tiled:
         check_count(patch_size, "patch_size")
         check_count(count, "num_landmarks")
         numbers = patch_size**2 * (self.channels if options.get("guide_channels") == "all" else 1) + 2
+        for other in self.operators:
+            other.kept = KeptColumns(1, 0)  # makes room
+        self.kept = 0
         self.room(numbers, count)
         passes, picture = self.passes, GuidePicture(self.picture, guide)
         workers = passes.workers(count)
         pilot = take_pilot(picture, passes.report, workers, **options)
-        sampled = passes.sample < picture.pixels
+        sampled, count = passes.sample < picture.pixels, pilot.balancing.shape[1]
+        kept = pixels_kept(picture, passes, numbers, count, self.scribbled * floats_of_scribbled(numbers))
+        self.kept = kept * (count + 2)
         found = TiledOperator(
             picture,
             pilot,
@@ -68,8 +74,9 @@ class Tiled:
             passes.sample if sampled else None,
             full=not sampled or passes.statistics == "full" or guide.exact,
             kernel=pilot.kernel,
-            bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, pilot.balancing.shape[1]),
+            bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, count),
             workers=workers,
+            kept=KeptColumns(picture.statistics_rows * self.size[1], kept),
         )
         self.operators.append(found)
         self.floats += numbers
@@ -88,7 +95,7 @@ class Tiled:
             floats=self.floats + numbers,
             planes=numbers,
             num_landmarks=num_landmarks,
-            held=self.scribbled * floats_of_scribbled(numbers),
+            held=self.kept + self.scribbled * floats_of_scribbled(numbers),
         )
 
     def scribbles(

@@ -142,7 +142,7 @@ class Picture:
     @property
     def statistics_rows(self) -> int:
         """Rows in a block of a pass that computes statistics."""
-        return max(1, STATISTICS_PIXELS // self.size[1])
+        return 2 * max(1, STATISTICS_PIXELS // 2 // self.size[1])
 
 
 class GuidePicture(Picture):

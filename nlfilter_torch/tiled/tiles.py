@@ -123,6 +123,18 @@ def fill(target: RowTarget, rows: Rows) -> None:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
 
 
+def bytes_needed(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int = 0) -> int:
+    """What statistics and a row take at least; arguments as of :func:`rows_that_fit`."""
+    size = picture.dtype.itemsize
+    workers, rows = passes.workers(num_landmarks), passes.rows_together(picture.size[1])
+    at_hand = workers * bytes_at_hand(rows * picture.size[1], num_landmarks) // 4
+    # The pilot with copies of its features and its factor; later the factors of both samples, and blocks.
+    pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
+    some = (pilot + min(picture.pixels, passes.sample)) * (num_landmarks + picture.colours + 2)
+    later = some + workers * block * (num_landmarks + planes + 8)
+    return size * (held + at_hand + max(pilot * (num_landmarks + 3 * planes), later))
+
+
 def rows_that_fit(
     picture: Picture,
     passes: Passes,
@@ -145,17 +157,20 @@ def rows_that_fit(
     Raises:
         MemoryError: if there is not one, or no room for the samples.
     """
-    size, memory = (8 if picture.dtype == torch.float64 else 4), passes.memory
-    row = picture.size[1] * floats * size
-    rows = passes.rows_together(picture.size[1])
-    at_hand = rows * picture.size[1] * 4 * num_landmarks  # their factor, and products as large
-    # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
-    pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
-    later = (pilot + min(picture.pixels, passes.sample)) * planes + block * (num_landmarks + planes + 8)
-    least = size * (held + at_hand + max(pilot * (num_landmarks + 3 * planes), later))
-    if max(row, least) > memory:
+    row = picture.size[1] * floats * picture.dtype.itemsize
+    least = bytes_needed(picture, passes, planes, num_landmarks, held)
+    if max(row, least) > passes.memory:
         raise MemoryError(
-            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {memory / 1e6:.0f} MB may be "
-            "used; allow more, or use fewer landmarks"
+            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {passes.memory / 1e6:.0f} MB "
+            "may be used; allow more, or use fewer landmarks"
         )
-    return max(1, min((memory - size * (held + at_hand)) // (2 * row), TILE_PIXELS // picture.size[1]))
+    tiles = 1 + passes.workers(num_landmarks)
+    return max(1, min((passes.memory - least) // (tiles * row), TILE_PIXELS // picture.size[1]))
+
+
+def pixels_kept(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int) -> int:
+    """Pixels whose columns can be kept from one pass to the next."""
+    if passes.memory < AMPLE:
+        return 0
+    spare = passes.memory * 7 // 10 - bytes_needed(picture, passes, planes, num_landmarks, held)
+    return min(picture.pixels, max(0, spare // (picture.dtype.itemsize * (num_landmarks + 2))))
