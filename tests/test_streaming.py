@@ -19,10 +19,10 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.sampling import draw, sample_by_leverage
+from nlfilter_torch.tiled.sampling import Draws, KeptColumns, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import GuidePicture, Picture
-from nlfilter_torch.tiled.statistics import balance_by_passes
+from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes
 
 Array = NDArray[Any]
@@ -123,9 +123,9 @@ def test_all_channels_on_request() -> None:
 
 
 def test_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "PILOT", 1 << 14)
+    monkeypatch.setattr(sampling, "PILOT", 1 << 12)
     picture = cat(270, 350)
-    edited = streamed(picture, sample=1 << 15)
+    edited = streamed(picture, sample=1 << 13)
     difference = np.abs(edited - in_memory(picture)).max()
     assert 1e-5 < difference < LEVEL
 
@@ -177,16 +177,29 @@ def test_regions_that_cannot_be_used_are_named(regions: Array, alpha: Tensor, me
         streamed(cat(20, 30), alpha, regions=regions, num_landmarks=20)
 
 
+def silent(stage: str, done: int, total: int) -> None:
+    """Report nothing."""
+
+
 @pytest.mark.usefixtures("small_blocks")
-def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all() -> None:
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(completion: Any) -> None:
     picture = GuidePicture(Picture(cat(90, 120)), Guide({}))
-    pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=30)
-    for spectral in (False, True):
-        parts = sample_by_leverage(picture, pilot, 3000, lambda *_: None, spectral=spectral)
-        assert len(parts) > 1
-        weights = sampling.Sample.together(parts).weights
-        assert 2500 < weights.numel() < 3500
-        assert abs(float(weights.sum()) / picture.pixels - 1) < 0.1
+    pilot = sampling.take_pilot(picture, silent, num_landmarks=30, completion=completion)
+    guess = Guess(pilot.balancing, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
+    draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
+    drawn = []
+    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2, KeptColumns(2400, 5000))(lambda block: block):
+        columns, totals = guess.totals(block)
+        drawn.append(draw_from(block, columns))
+        moment, grams = moment + totals.moment, grams + totals.grams
+    assert len(drawn) > 1
+    sample = Block.together(drawn)
+    assert 2500 < sample.weights.numel() < 3500
+    assert abs(float(sample.weights.sum()) / picture.pixels - 1) < 0.1
+    estimate = guess.totals(sample)[1]
+    assert (estimate.moment - moment).norm() < 0.02 * torch.as_tensor(moment).norm()
+    assert (estimate.grams - grams).norm() < 0.02 * torch.as_tensor(grams).norm()
 
 
 def test_draws_follow_the_rates_and_leave_no_gap() -> None:
@@ -317,9 +330,9 @@ def test_more_landmarks_than_pixels_are_reduced() -> None:
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.tiled.statistics.MAX_PASSES", 1)
     picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
-    pilot = sampling.take_pilot(picture, lambda *_: None, num_landmarks=20)
+    pilot = sampling.take_pilot(picture, silent, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
-        balance_by_passes(lambda: pilot.sample.blocks(pilot.kernel), 9 * pilot.balancing, completed=True)
+        balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.balancing, completed=True)
 
 
 class Shrinking(Rows):

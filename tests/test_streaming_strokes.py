@@ -124,14 +124,14 @@ def test_full_passes_colourise_as_in_memory(options: dict[str, Any], dtype: Any)
 
 
 def test_a_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "PILOT", 1 << 14)
+    monkeypatch.setattr(sampling, "PILOT", 1 << 12)
     picture = cat(270, 350)
     strokes, mask, keep = paint(270, 350)
     whole = recolor(planes(picture), planes(strokes), planes(mask), keep=planes(keep), num_landmarks=50)
-    edited = recoloured(picture, strokes, mask, keep=keep, sample=1 << 16)
+    edited = recoloured(picture, strokes, mask, keep=keep, sample=1 << 12)
     assert 1e-5 < np.abs(edited - rows_of(whole)).max() < LEVEL
     whole = colorize(planes(grey(picture)), planes(strokes), planes(mask), num_landmarks=50)
-    edited = coloured(picture, strokes, mask, sample=1 << 16)
+    edited = coloured(picture, strokes, mask, sample=1 << 12)
     assert 1e-5 < np.abs(edited - rows_of(whole)).max() < LEVEL
 
 

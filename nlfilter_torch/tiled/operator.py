@@ -1,7 +1,7 @@
 """The filter of a picture that is read a few rows at a time: the few sums that it consists of, and its columns."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,9 +18,22 @@ from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.sampling import Report, Sample, all_blocks, patches_at, scaled_patches, visit
+from nlfilter_torch.tiled.sampling import Draws, KeptColumns, Pilot, Report, over_all, patches_at, scaled_patches, visit
 from nlfilter_torch.tiled.sources import GuidePicture, RowSource, Tile
-from nlfilter_torch.tiled.statistics import Block, Sums, sum_up
+from nlfilter_torch.tiled.statistics import (
+    CONVERGED,
+    Block,
+    Guess,
+    Pass,
+    Sums,
+    Totals,
+    balance_by_passes,
+    limiter_by_passes,
+    sum_up,
+)
+from nlfilter_torch.tiled.workers import in_order
+
+PARTS = 8  # of a sample, for several workers at once
 
 
 @dataclass(eq=False)
@@ -41,7 +54,10 @@ class TilePixels:
     def columns(self, operator: "TiledOperator") -> Columns:
         """Their columns, worked out once for each operator."""
         if id(operator) not in self._columns:
-            self._columns[id(operator)] = operator.columns(self.features(operator))
+            known = operator.kept.find(slice(self.first, self.first + self.image[0, 0].numel()))
+            self._columns[id(operator)] = (
+                operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
+            )
         return self._columns[id(operator)]
 
 
@@ -57,24 +73,116 @@ class BlockPixels:
         return self.found
 
 
+def first_plane(pixels: Any) -> Tensor:
+    """The first channel of a picture."""
+    image: Tensor = pixels.image[:, :1]
+    return image
+
+
 @dataclass(eq=False)
 class TiledOperator:
     """The filter of a picture, by the few sums that it consists of.
 
+    They are summed up when the first of them is needed, those that it is balanced by together with those of the planes
+    that are filtered.
+
     Attributes:
         guide: what it compares.
-        kernel: landmarks, bandwidths and window.
-        balancing: what the scaling of a pixel is a function of.
+        pilot: a first look at the picture.
         report: told of the progress.
-        sample: pixels that stand for all, or None.
+        count: pixels of a sample for what a single pass cannot tell; None is none.
+        full: whether further passes over all pixels are made.
+        kernel: landmarks, bandwidths and window.
+        bounded: whether eigenvalues are to be kept from exceeding 1.
+        workers: tiles that are worked out at once.
+        kept: columns from earlier passes.
     """
 
     guide: GuidePicture
-    kernel: Kernel
-    balancing: PixelScaling
+    pilot: Pilot
     report: Report
-    sample: list[Sample] | None = None
+    count: int | None
+    full: bool
+    kernel: Kernel
+    bounded: bool
+    workers: int
+    kept: KeptColumns
+    _balancing: PixelScaling | None = None
+    _sample: list[Block] | None = None
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
+    _grams: Tensor | float = 0.0  # what those of the sample lack
+
+    @torch.no_grad()
+    @full_precision
+    def settle(self, planes: Planes = first_plane, order: int = 1) -> None:
+        """Unless that is done, balance, and sum up for powers of W and some planes that depend on colours alone."""
+        if self._balancing is not None:
+            return
+        total, completed, lacking = self.pilot.balancing, self.pilot.completed, None
+        if self.count is not None:
+            self._sample, lacking = self._look_again(self.count, planes, order)
+            total = balance_by_passes(self.over("Balancing"), total, completed=completed, correction=lacking.moment)
+        if self.full:
+            self._sample = lacking = None
+            total = balance_by_passes(self.over("Balancing"), total, completed=completed)
+        self._balancing = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
+        limiter = limiter_by_passes(self.over("Bounding"), self._balancing, self.guide.dtype) if self.bounded else None
+        if limiter is not None:
+            self.kernel = replace(self.kernel, limiter=limiter.to(self.kernel.landmarks))
+            self.kept.blocks.clear()
+        if self._sample is None or lacking is None:
+            return
+        if limiter is not None:
+            self._sample = [replace(block, factor=limiter.to(block.factor) @ block.factor) for block in self._sample]
+            lacking = Totals(
+                lacking.moment, limiter @ lacking.coefficients, limiter @ lacking.grams.to(limiter) @ limiter
+            )
+        self._grams = lacking.grams
+        self._sums[id(planes)] = (planes, replace(self._summed_up(planes, order), correction=lacking.coefficients))
+
+    def _look_again(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
+        """About ``count`` pixels, and what their sums under the pilot's guess lack to those of all pixels."""
+        pilot = self.pilot
+
+        def values(block: Block, columns: Columns) -> Tensor:
+            return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)
+
+        guess = Guess(
+            pilot.balancing, torch.empty(1, 0, pilot.balancing.shape[1], 1), values, self.guide.guide.spectral
+        )
+        columns = guess.columns(pilot.sample)
+        known = sum_up(self._among([pilot.sample]), lambda block: (values(block, columns), columns), order)
+        guess = replace(guess, coefficients=known.coefficients()[:, :-1])
+        draw, drawn, total = Draws(pilot, columns, count, self.guide.pixels), [], None
+
+        def look(block: Block) -> tuple[Block, Totals]:
+            columns, totals = guess.totals(block)
+            return draw(block, columns), totals
+
+        for some, totals in self._over_all("Sampling")(look):
+            drawn.append(some)
+            total = totals if total is None else total.plus(totals)
+        assert total is not None  # for mypy; a picture has a pixel
+        each = -(-len(drawn) // PARTS)
+        sample = [Block.together(drawn[first : first + each]) for first in range(0, len(drawn), each)]
+        for totals in self._among(sample)(lambda block: guess.totals(block)[1]):
+            total = total.plus(totals, sign=-1)
+        return sample, total
+
+    def _over_all(self, stage: str) -> Pass:
+        """A pass over every pixel."""
+        return lambda of: over_all(self.guide, self.kernel, self.report, stage, self.workers, self.kept)(of)
+
+    def _among(self, blocks: list[Block]) -> Pass:
+        """A pass over some blocks."""
+        return lambda function: in_order(function, blocks, self.workers)
+
+    @property
+    def balancing(self) -> PixelScaling:
+        """What the scaling of a pixel is a function of."""
+        self.settle()
+        assert self._balancing is not None  # for mypy
+        return self._balancing
 
     @property
     def margin(self) -> int:
@@ -88,42 +196,48 @@ class TiledOperator:
 
     def columns(self, features: Tensor) -> Columns:
         """Columns of pixels with features (1, D, n)."""
-        factor, diagonal = self.kernel.factor(features)
+        self.settle()  # first: it may change the kernel
+        return self.scaled(*self.kernel.factor(features))
+
+    def scaled(self, factor: Tensor, diagonal: Tensor) -> Columns:
+        """Columns of pixels with this factor and diagonal."""
         return Columns(factor, *self.balancing(factor, diagonal))
 
-    def blocks(self, stage: str) -> Iterator[Block]:
-        """The sample, or all pixels."""
-        if self.sample is None:
-            yield from all_blocks(self.guide, self.kernel, self.report, stage)
-            return
+    def over(self, stage: str) -> Pass:
+        """A pass over the sample, or over all pixels."""
+        if self._sample is None:
+            return self._over_all(stage)
         self.report(stage, 0, 1)
-        for part in self.sample:
-            yield from part.blocks(self.kernel)
+        return self._among(self._sample)
 
-    def pixels(self, stage: str) -> Iterator[tuple[BlockPixels, Tensor]]:
-        """The same with columns, and how many pixels each stands for, (1, n)."""
-        for block in self.blocks(stage):
-            columns = Columns(block.factor, *self.balancing(block.factor, block.diagonal))
-            yield BlockPixels(block.image.unsqueeze(2), columns), block.weights
+    def pixels(self, block: Block) -> BlockPixels:
+        """Those of a block, with columns."""
+        return BlockPixels(block.image.unsqueeze(2), self.scaled(block.factor, block.diagonal))
 
     @torch.no_grad()
     @full_precision
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums for the first ``order`` powers of W, and some planes."""
+        self.settle(planes, order)
         known = self._sums.get(id(planes))
-        if known is not None and known[1].moments.shape[1] >= order:
-            return known[1]
-        found = sum_up(((planes(pixels).flatten(2), pixels.found, weights)
-                        for pixels, weights in self.pixels("Summing up")), order)  # fmt: skip
-        self._sums[id(planes)] = (planes, found)  # the planes are kept, so that no other ones get their number
-        return found
+        if known is None or known[1].moments.shape[1] < order:
+            known = (planes, self._summed_up(planes, order))
+            self._sums[id(planes)] = known  # the planes are kept, so that no other ones get their number
+        return known[1]
+
+    def _summed_up(self, planes: Planes, order: int) -> Sums:
+        def values(block: Block) -> tuple[Tensor, Columns]:
+            pixels = self.pixels(block)
+            return planes(pixels).flatten(2), pixels.found
+
+        return sum_up(self.over("Summing up"), values, order)
 
     @cached_property
     def pairs(self) -> RitzPairs:
         """The spectrum."""
         known = next((sums for _, sums in self._sums.values()), None)
-        sums = known or self.sums(lambda pixels: pixels.image[:, :1], 1)
-        return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
+        sums = known or self.sums(first_plane, 1)
+        return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """The planes that a function of columns gives."""
@@ -137,7 +251,7 @@ class TiledOperator:
     def at(self, places: Tensor) -> Blocks:
         """The columns of single pixels, whose features are read at once and kept."""
         features = self.features_at(places)
-        return lambda: (self.kernel.factor(part)[0] for part in features.split(sampling.CHUNK, dim=2))
+        return lambda: (self.columns(part).factor for part in features.split(sampling.CHUNK, dim=2))
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Detail layers, by the sums for powers of W."""
@@ -152,16 +266,21 @@ class TiledOperator:
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""
-        return self.sums(planes, 1).moments[:, 0].mT
+        return self.sums(planes, 1).coefficients()[:, 0].mT
 
     @torch.no_grad()
     @full_precision
     def mean(self, planes: Planes) -> Tensor:
         """Means over the pixels, or over the sample."""
         total, weight = torch.zeros(()), torch.zeros((), dtype=torch.float64)
-        for pixels, weights in self.pixels("Averaging"):
-            total = total + (planes(pixels).flatten(2) * weights.unsqueeze(1)).double().sum(2)
-            weight = weight + weights.double().sum()
+        self.settle()
+
+        def part(block: Block) -> tuple[Tensor, Tensor]:
+            values = planes(self.pixels(block)).flatten(2) * block.weights.unsqueeze(1)
+            return values.double().sum(2), block.weights.double().sum()
+
+        for values, weights in self.over("Averaging")(part):
+            total, weight = total + values, weight + weights
         return (total / weight).to(self.guide.dtype)
 
     def features_at(self, places: Tensor) -> Tensor:
@@ -172,8 +291,7 @@ class TiledOperator:
             seen = self.guide.seen(tile, size // 2)
             guide = reduce_channels(seen.pixels, recipe.guide_channels)
             patches.append(patches_at(guide, seen, chosen, size))
-        scales = (recipe.patch_weights, recipe.photometric_bandwidth, recipe.spatial_bandwidth)
-        return scaled_patches(torch.cat(patches, dim=2), places, self.guide, *scales)
+        return scaled_patches(torch.cat(patches, dim=2), places, self.guide, recipe)
 
     def region_means(self, regions: RowSource, name: str) -> Tensor:
         """The mean column of F over each region, (1, M, K) in float64."""

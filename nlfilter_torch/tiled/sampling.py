@@ -5,17 +5,15 @@ A sample of a picture's pixels for the sums that a filter consists of: rare ones
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import CACHED
 from nlfilter_torch.core.checks import check_choice, check_count, check_positive, warn
-from nlfilter_torch.core.kernels.affinity import Affinity
-from nlfilter_torch.core.kernels.sweeps import positive_root
+from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.features import (
     GuideChannels,
     bandwidth_of_gradient,
@@ -28,57 +26,65 @@ from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling
-from nlfilter_torch.operator.spectrum import CUT
-from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
-from nlfilter_torch.tiled.statistics import Block, start_balancing, sum_up
+from nlfilter_torch.tiled.statistics import Block, Pass
+from nlfilter_torch.tiled.workers import alone, in_order
 
-PILOT = 1 << 17  # pixels of the first sample: their factor, 52 MB at m = 100, is balanced in memory
-CHUNK = 1 << 16  # pixels of a sample whose factor is there at once
+PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
+STARTED = 1e-3  # residual of its balancing, which is a first guess
+CHUNK = 1 << 16  # scribbled pixels whose factor is there at once
 
 Report = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Some pixels of a picture.
+class KeptColumns:
+    """Columns of the first pixels of a picture, kept from one pass to the next.
 
-    Attributes:
-        features: (1, D, n).
-        image: their colours, (1, C, n).
-        weights: (1, n), how many pixels each of them stands for.
+    Args:
+        each: pixels of a block of a pass.
+        count: how many pixels may be kept.
     """
 
-    features: Tensor
-    image: Tensor
-    weights: Tensor
+    def __init__(self, each: int, count: int) -> None:
+        self.each, self.count = each, count
+        self.blocks: dict[int, tuple[Tensor, Tensor]] = {}
 
-    @staticmethod
-    def together(parts: list["Sample"]) -> "Sample":
-        """Several samples as one."""
-        features, images, weights = zip(*((part.features, part.image, part.weights) for part in parts), strict=True)
-        return Sample(torch.cat(features, dim=2), torch.cat(images, dim=2), torch.cat(weights, dim=1))
+    def keep(self, first: int, columns: tuple[Tensor, Tensor]) -> None:
+        """Take the columns of the block that begins with a pixel, if there is room."""
+        if first + columns[1].shape[1] <= self.count:
+            self.blocks[first] = columns
 
-    def blocks(self, kernel: Kernel) -> Iterator[Block]:
-        """Factor and diagonal of the sample, a chunk at a time."""
-        for features, image, weights in zip(
-            self.features.split(CHUNK, dim=2),
-            self.image.split(CHUNK, dim=2),
-            self.weights.split(CHUNK, dim=1),
-            strict=True,
-        ):
-            yield Block(*kernel.factor(features), image, weights)
+    def find(self, pixels: slice) -> tuple[Tensor, Tensor] | None:
+        """Factor and diagonal of some pixels, if all are in one block that is kept."""
+        first = pixels.start // self.each * self.each
+        known = self.blocks.get(first)
+        if known is None or pixels.stop > first + known[1].shape[1]:
+            return None
+        inside = slice(pixels.start - first, pixels.stop - first)
+        return known[0][:, :, inside], known[1][:, inside]
 
 
-def all_blocks(picture: GuidePicture, kernel: Kernel, report: Report, stage: str) -> Iterator[Block]:
-    """Factor and diagonal of every pixel of a picture."""
+def over_all(
+    picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int, kept: KeptColumns
+) -> Pass:
+    """A pass over every pixel of a picture."""
     size = kernel.recipe.patch_weights.shape[0] // 2
-    for tile in picture.picture.tiles(size + picture.guide.margin, picture.statistics_rows):
-        guide = picture.seen(tile, size)
-        columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
-        report(stage, tile.start, picture.size[0])
-        yield Block(*columns, tile.inner.flatten(2), torch.ones_like(columns[1]))
+
+    def tiles() -> Iterator[Tile]:
+        for tile in picture.picture.tiles(size + picture.guide.margin, picture.statistics_rows):
+            report(stage, tile.start, picture.size[0])
+            yield tile
+
+    def block_of(tile: Tile) -> Block:
+        image, first = tile.inner.flatten(2), tile.start * picture.size[1]
+        columns = kept.find(slice(first, first + image.shape[2]))
+        if columns is None:
+            guide = picture.seen(tile, size)
+            columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
+            kept.keep(first, columns)
+        return Block(*columns, image, torch.ones_like(columns[1]), tile.start)
+
+    return lambda function: in_order(lambda tile: function(block_of(tile)), tiles(), workers)
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class Pilot:
     """
 
     kernel: Kernel
-    sample: Sample
+    sample: Block
     balancing: Tensor
     seed: int
 
@@ -106,6 +112,7 @@ class Pilot:
 def take_pilot(
     picture: GuidePicture,
     report: Report,
+    workers: int = 1,
     *,
     patch_size: int = 5,
     photometric_bandwidth: float | Literal["auto"] = "auto",
@@ -143,31 +150,36 @@ def take_pilot(
     rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # the landmarks need what is in the generator
     even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
     wanted = torch.cat([candidates, even])
-    patches, values = [], []
-    slope = 0.0
-    margin = max(patch_size // 2, 1)
-    for tile, chosen in visit(picture.picture, margin + picture.guide.margin, wanted.sort().values, report, "Looking"):
+    margin, automatic = max(patch_size // 2, 1), isinstance(photometric_bandwidth, str)
+
+    def look(part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float]:
+        tile, chosen = part
         seen = picture.seen(tile, margin)
         guide = reduce_channels(seen.pixels, guide_channels)
-        patches.append(patches_at(guide, seen, chosen, patch_size))
-        values.append(tile.inner.flatten(2)[:, :, chosen])
-        if photometric_bandwidth == "auto":
-            slope += float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
+        slope = float(gradients(guide, seen.halo).double().mean((0, 1)).sum()) if automatic else 0.0
+        return patches_at(guide, seen, chosen, patch_size), tile.inner.flatten(2)[:, :, chosen], slope
+
+    parts = visit(picture.picture, margin + picture.guide.margin, wanted.sort().values, report, "Looking")
+    patches, values, slopes = zip(*in_order(look, parts, workers), strict=True)
     if isinstance(photometric_bandwidth, str):
-        photometric_bandwidth = float(bandwidth_of_gradient(torch.tensor(slope / picture.pixels, dtype=torch.float64)))
+        photometric_bandwidth = float(
+            bandwidth_of_gradient(torch.tensor(sum(slopes) / picture.pixels, dtype=torch.float64))
+        )
     order = torch.empty_like(wanted)
     order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
-    recipe = (window, photometric_bandwidth, spatial_bandwidth)
-    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, *recipe)
-    points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
-    kernel = Kernel(points, inverse_cholesky(points), completion, features=GuideFeatures(*recipe, guide_channels))
-    weight = picture.pixels / len(even)
-    sample = Sample(
-        features[:, :, len(candidates) :],
-        torch.cat(values, dim=2)[:, :, order[len(candidates) :]],
-        torch.full((1, len(even)), weight, dtype=picture.dtype),
-    )
-    return Pilot(kernel, sample, start_balancing(*kernel.factor(sample.features), weight), rest.initial_seed())
+    recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, guide_channels)
+    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, recipe)
+    image = torch.cat(values, dim=2)[:, :, order[len(candidates) :]]
+    weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
+
+    def fitted() -> Pilot:
+        points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
+        kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
+        columns = kernel.factor(features[:, :, len(candidates) :])
+        found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
+        return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
+
+    return alone(fitted, workers)
 
 
 def visit(
@@ -196,61 +208,47 @@ def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
     return padded[0].flatten(1)[:, places].flatten(0, 1)[None]
 
 
-def scaled_patches(
-    patches: Tensor,
-    pixels: Tensor,
-    picture: Picture,
-    window: Tensor,
-    photometric_bandwidth: float | Tensor,
-    spatial_bandwidth: float | Tensor | None,
-) -> Tensor:
+def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
     """Features (1, D, n), as :func:`extract_features` gives them, from patches (1, C p^2, n) and pixels' indices."""
+    window = recipe.patch_weights
     channels = patches.shape[1] // window.numel()
-    scale = (window / channels).sqrt() / torch.as_tensor(photometric_bandwidth, dtype=window.dtype)
+    scale = (window / channels).sqrt() / torch.as_tensor(recipe.photometric_bandwidth, dtype=window.dtype)
     features = patches * scale.reshape(1, 1, -1, 1).expand(1, channels, -1, 1).reshape(1, -1, 1)
-    if spatial_bandwidth is None:
+    if recipe.spatial_bandwidth is None:
         return features
     places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]]).to(features)
-    return torch.cat([features, places[None] / torch.as_tensor(spatial_bandwidth).to(features)], dim=1)
+    return torch.cat([features, places[None] / torch.as_tensor(recipe.spatial_bandwidth).to(features)], dim=1)
 
 
-SKETCHED = 16  # random projections; they tell squared lengths to a third
 EVEN = 0.1  # share of a sample that is spread evenly over the picture
 
 
-def sample_by_leverage(
-    picture: GuidePicture, pilot: Pilot, count: int, report: Report, *, spectral: bool
-) -> list[Sample]:
-    """About ``count`` pixels in several parts, rare ones more likely than common ones.
+class Draws:
+    """Draws about ``count`` pixels of a picture, rare ones more likely than common ones.
 
     A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
     of a photograph off by two grey levels and more. The leverage of a pixel is its own share of what W makes of it,
-    ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members. What
-    projects on eigenvectors (``spectral``) divides by small eigenvalues, and pixels that these depend on come in, too.
+    ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members.
     """
-    kernel, generator = pilot.kernel, np.random.default_rng(pilot.seed)
-    size = kernel.recipe.patch_weights.shape[0]
-    even = EVEN * count / picture.pixels
-    leverage = Leverage.of(pilot, spectral=spectral)
-    rate = _rate(leverage(pilot.sample.features), float(pilot.sample.weights[0, 0]), even, count)
-    recipe = (kernel.recipe.patch_weights, kernel.recipe.photometric_bandwidth, kernel.recipe.spatial_bandwidth)
-    done: list[Sample] = []
-    waiting: list[Sample] = []  # of single tiles, much smaller than a chunk
-    for tile in picture.picture.tiles(size // 2 + picture.guide.margin, picture.statistics_rows):
-        report("Sampling", tile.start, picture.size[0])
-        seen = picture.seen(tile, size // 2)
-        guide = reduce_channels(seen.pixels, kernel.recipe.guide_channels)
-        features = kernel.recipe(seen.pixels, origin=seen.origin, halo=seen.halo)
-        likely = (even + rate * leverage(features)).clamp(max=1.0)
-        chosen, counts = draw(likely, generator)
-        patches, places = patches_at(guide, seen, chosen, size), chosen + tile.start * picture.size[1]
-        values = tile.inner.flatten(2)[:, :, chosen]
-        weights = (counts / likely[chosen]).to(picture.dtype)[None]
-        waiting.append(Sample(scaled_patches(patches, places, picture, *recipe), values, weights))
-        if sum(part.weights.numel() for part in waiting) >= sampling.CHUNK:
-            done.append(Sample.together(waiting))
-            waiting = []
-    return [*done, Sample.together(waiting)] if waiting else done
+
+    def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
+        """``columns`` are those of the pilot's sample."""
+        self.completed, self.seed, self.even = pilot.completed, pilot.seed, EVEN * count / pixels
+        weight = float(pilot.sample.weights[0, 0])
+        self.rate = _rate(self.leverage(pilot.sample, columns), weight, self.even, count)
+
+    def leverage(self, block: Block, columns: Columns) -> Tensor:
+        """Of the pixels of a block, whose columns these are: (n,) in float64."""
+        length = 1 - block.diagonal if self.completed else columns.factor.square().sum(1)
+        return (columns.scaling.square() * length)[0].double()
+
+    def __call__(self, block: Block, columns: Columns) -> Block:
+        """Those drawn from a block."""
+        likely = (self.even + self.rate * self.leverage(block, columns)).clamp(max=1.0)
+        chosen, counts = draw(likely, np.random.default_rng([self.seed, block.number]))
+        weights = (counts / likely[chosen]).to(block.weights)[None]
+        factor, diagonal, image = (planes[..., chosen] for planes in (block.factor, block.diagonal, block.image))
+        return Block(factor, diagonal, image, weights)
 
 
 def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -278,60 +276,6 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
     counts = torch.bincount(found, minlength=len(rates)) + certain
     chosen = counts.nonzero().squeeze(1)
     return chosen, counts[chosen]
-
-
-@dataclass(frozen=True)
-class Leverage:
-    """Leverage scores: how much single pixels matter to sums over all of them, from affinities to the landmarks alone.
-
-    Lengths of M-vectors are estimated from a few random projections of them, which are projections of the affinities.
-
-    Attributes:
-        kernel: whose affinities they are.
-        rows: (1 + J k, M), whose products with the affinities of a pixel are ``u . t``, and k random projections of u
-            for every measure of length.
-        scales: (J,): of the measures, which are added up.
-    """
-
-    kernel: Kernel
-    rows: Tensor
-    scales: Tensor
-
-    @staticmethod
-    def of(pilot: Pilot, *, spectral: bool) -> "Leverage":
-        """The leverage on W, and as much again that on projections on its eigenvectors if they are needed."""
-        kernel, generator = pilot.kernel, torch.Generator().manual_seed(pilot.seed)
-        count = kernel.landmarks.shape[2]
-        measures = [torch.eye(count, dtype=torch.float64)]
-        if spectral:
-            balancing = PixelScaling(pilot.balancing, pilot.completed)
-            blocks = pilot.sample.blocks(kernel)
-            columns = ((Columns(b.factor, *balancing(b.factor, b.diagonal)), b) for b in blocks)
-            gram = sum_up(((b.image, found, b.weights) for found, b in columns), 1).grams[0, 0]
-            values, vectors = torch.linalg.eigh(gram)
-            values = values + CUT[kernel.landmarks.dtype] * values[-1]  # what the pilot has not seen may well be there
-            measures.append(values.rsqrt()[:, None] * vectors.mT)
-        inverse = kernel.inverse_cholesky[0].double()
-        draws = torch.randn(SKETCHED, count, generator=generator, dtype=torch.float64) / SKETCHED**0.5
-        rows = torch.cat([pilot.balancing[0].mT @ inverse, *(draws @ measure @ inverse for measure in measures)])
-        leverage = Leverage(kernel, rows.to(kernel.landmarks), torch.ones(len(measures)).to(kernel.landmarks))
-        return replace(leverage, scales=1 / leverage.measure(pilot.sample.features).mean(1))
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """Of pixels with the features (1, D, n): (n,) in float64."""
-        return self.scales.double() @ self.measure(features).double()
-
-    def measure(self, features: Tensor) -> Tensor:
-        """Squared lengths (J, n) of the pixels' columns of F: ``d^2 |u|^2``, and ``F^T G^-1 F`` if that is needed."""
-        affinity = Affinity(self.kernel.landmarks, self.kernel.completion == "diagonal")
-        found = []
-        for part in features.split(CACHED, dim=2):
-            near, _ = affinity(part, features.new_empty(1, self.rows.shape[1], part.shape[2]))
-            products = self.rows @ near[0]
-            lengths = products[1:].square().unflatten(0, (-1, SKETCHED)).sum(1)  # (J, n)
-            scaling = positive_root(products[:1] / 2, (1 - lengths[:1]).clamp(min=0.0))
-            found.append(scaling.square() * lengths)
-        return torch.cat(found, dim=1)
 
 
 def _rate(leverage: Tensor, weight: float, even: float, count: int) -> float:

@@ -16,20 +16,14 @@ from nlfilter_torch.edits.source import Fitted, Guide, Planes
 from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.sampling import (
-    sample_by_leverage,
-    take_pilot,
-)
+from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot
 from nlfilter_torch.tiled.scribbles import check_room, floats_of_scribbled, read_scribbles
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
-from nlfilter_torch.tiled.statistics import CONVERGED, balance_by_passes, limiter_by_passes
-from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, rows_that_fit
+from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
 
 FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
-LARGE_PATCHES = 50  # numbers in a patch above which the sample has half as many of them
 
 
 class Tiled:
@@ -50,6 +44,7 @@ class Tiled:
         self.operators: list[TiledOperator] = []
         self.floats = 8 * picture.colours + 40  # floats for each pixel of a tile, without features
         self.scribbled = 0  # pixels
+        self.kept = 0  # floats of columns
 
     @torch.no_grad()
     @full_precision
@@ -64,23 +59,27 @@ class Tiled:
         check_count(patch_size, "patch_size")
         check_count(count, "num_landmarks")
         numbers = patch_size**2 * (self.channels if options.get("guide_channels") == "all" else 1) + 2
+        for other in self.operators:
+            other.kept = KeptColumns(1, 0)  # makes room
+        self.kept = 0
         self.room(numbers, count)
-        passes = self.passes if numbers < LARGE_PATCHES else replace(self.passes, sample=-(-self.passes.sample // 2))
-        picture = GuidePicture(self.picture, guide)
-        pilot = take_pilot(picture, passes.report, **options)
-        found = TiledOperator(picture, pilot.kernel, PixelScaling(pilot.balancing, pilot.completed), passes.report)
-        total, chosen = pilot.balancing, None
-        if passes.sample < picture.pixels:
-            chosen = sample_by_leverage(picture, pilot, passes.sample, passes.report, spectral=guide.spectral)
-            found.sample = chosen
-            total = balance_by_passes(lambda: found.blocks("Balancing"), total, completed=pilot.completed)
-        if chosen is None or passes.statistics == "full" or guide.exact:
-            found.sample = None
-            total = balance_by_passes(lambda: found.blocks("Balancing"), total, completed=pilot.completed)
-        found.balancing = PixelScaling(total, pilot.completed, CONVERGED[self.dtype])
-        if is_bounded(options.get("landmarks", "kmeans"), picture.pixels, total.shape[1]):
-            limiter = limiter_by_passes(lambda: found.blocks("Bounding"), found.balancing)
-            found.kernel = replace(found.kernel, limiter=limiter)
+        passes, picture = self.passes, GuidePicture(self.picture, guide)
+        workers = passes.workers(count)
+        pilot = take_pilot(picture, passes.report, workers, **options)
+        sampled, count = passes.sample < picture.pixels, pilot.balancing.shape[1]
+        kept = pixels_kept(picture, passes, numbers, count, self.scribbled * floats_of_scribbled(numbers))
+        self.kept = kept * (count + 2)
+        found = TiledOperator(
+            picture,
+            pilot,
+            passes.report,
+            passes.sample if sampled else None,
+            full=not sampled or passes.statistics == "full" or guide.exact,
+            kernel=pilot.kernel,
+            bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, count),
+            workers=workers,
+            kept=KeptColumns(picture.statistics_rows * self.size[1], kept),
+        )
         self.operators.append(found)
         self.floats += numbers
         return found
@@ -98,7 +97,7 @@ class Tiled:
             floats=self.floats + numbers,
             planes=numbers,
             num_landmarks=num_landmarks,
-            held=self.scribbled * floats_of_scribbled(numbers),
+            held=self.kept + self.scribbled * floats_of_scribbled(numbers),
         )
 
     def scribbles(
@@ -269,10 +268,14 @@ class Tiled:
         """
         landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
         rows = self.passes.tile_rows or (self.room(0, landmarks) if self.operators else TILE_PIXELS // self.size[1])
-        together = self.passes.rows_together(self.size[1])
+        together, workers = self.passes.rows_together(self.size[1]), self.passes.workers(landmarks)
         rows = max(1, rows // together) * together
+        for operator in self.operators:
+            operator.settle()  # before several tiles at once need it
         if fitted.finish is None:
-            yield from self.passes.work_out(self.picture, lambda tile: self.edited(fitted, tile), self.margin, rows)
+            yield from self.passes.work_out(
+                self.picture, lambda tile: self.edited(fitted, tile), self.margin, rows, workers=workers
+            )
             return
         finish, margin = fitted.finish, fitted.margin
         plain = replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
@@ -281,6 +284,7 @@ class Tiled:
             lambda tile: self.edited(fitted, tile),
             self.margin,
             rows,
+            workers=workers,
             transparent=False,
             stage="Comparing",
         )

@@ -14,7 +14,7 @@ from nlfilter_torch.edits.source import Guide
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
-STATISTICS_PIXELS = 1 << 17  # in a block of a pass; independent of the tile size, so that sums agree bit by bit
+STATISTICS_PIXELS = 1 << 15  # in a block of a pass; independent of the tile size, so that sums agree bit by bit
 
 
 class RowSource(Protocol):
@@ -142,7 +142,7 @@ class Picture:
     @property
     def statistics_rows(self) -> int:
         """Rows in a block of a pass that computes statistics."""
-        return max(1, STATISTICS_PIXELS // self.size[1])
+        return 2 * max(1, STATISTICS_PIXELS // 2 // self.size[1])
 
 
 class GuidePicture(Picture):

@@ -6,18 +6,23 @@ moment t (M numbers), since the scaling ``d_i`` of a pixel is a closed form of `
 Newton's method needs two or three passes. With t known, one pass more gives ``G_j = F diag(r^j) F^T`` and ``b_i =
 F r^i y``, and from them all coefficients of ``W^i y = F^T c_i + r W^(i-1) y``: ``c_1 = b_0``, ``c_(i+1) = sum_j G_j
 c_(i-j) + b_i``.
+
+All of these equations say that something unknown, x, equals a sum ``f(x)`` over the pixels. A single pass gives the sum
+for a guess at x, and a sample how it changes from there: ``x = f(guess) + s(x) - s(guess)``, where s estimates f. The
+error is that of the sample times that of the guess.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.kernels.grams import sum_grams
-from nlfilter_torch.core.kernels.tall_skinny import moment
-from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.core.kernels.sweeps import positive_root
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.operator import Columns
@@ -30,44 +35,49 @@ ALARM = 1e-3
 
 @dataclass(frozen=True)
 class Block:
-    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), and how many each stands for, (1, n)."""
+    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each stands for, (1, n); a number."""
 
     factor: Tensor
     diagonal: Tensor
     image: Tensor
     weights: Tensor
+    number: int = 0
+
+    @staticmethod
+    def together(parts: list["Block"]) -> "Block":
+        """Several blocks as one."""
+        factors, diagonals, images, weights = zip(
+            *((part.factor, part.diagonal, part.image, part.weights) for part in parts), strict=True
+        )
+        return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(images, 2), torch.cat(weights, 1))
 
 
-Pass = Callable[[], Iterator[Block]]
+Pass = Callable[[Callable[[Block], Any]], Iterable[Any]]  # what a function gives of each block, in order
 
 
-def start_balancing(factor: Tensor, diagonal: Tensor, weight: float) -> Tensor:
-    """The moment t (1, M, 1), in float64, of an image from a sample whose pixels stand for ``weight`` pixels each."""
-    # With d = e / sqrt(w) the weighted equation is that of the sample alone, for e and a smaller diagonal.
-    scaling = balance(factor, diagonal / weight, tolerance=1e-3).scaling
-    return weight**0.5 * moment(factor, scaling.unsqueeze(1))
-
-
-def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor:
+def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correction: Tensor | float = 0.0) -> Tensor:
     """The moment t (1, M, 1) of the pixels in ``blocks``, from a first guess ``total``.
 
+    ``correction``: what is added to their sum.
     ``completed``: the kernel has a unit diagonal and no negative entry, so that no scaling can be large. A guess that
     knows nothing of some pixels would give them one, and Newton's method would only halve it with every pass.
     """
     largest = LARGEST if completed else float("inf")
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
-    change = float("inf")
+    change, tolerance = float("inf"), 0.0
+
+    def terms(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
+        scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor)).clamp(max=largest)
+        remainder = scaling * (scaling * block.diagonal)
+        weights = scaling * (block.weights / (1 + remainder)).sqrt()
+        sums = moment(block.factor, (block.weights * scaling).unsqueeze(1))
+        return sums, sum_grams(block.factor, weights, remainder, 1)[:, 0], block.factor.dtype
+
     for _ in range(MAX_PASSES):
-        sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1).clone()
-        tolerance = 0.0
-        for block in blocks():
-            tolerance = CONVERGED[block.factor.dtype]
-            scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor)).clamp(max=largest)
-            remainder = scaling * (scaling * block.diagonal)
-            sums += moment(block.factor, (block.weights * scaling).unsqueeze(1))
-            weights = scaling * (block.weights / (1 + remainder)).sqrt()
-            jacobian += sum_grams(block.factor, weights, remainder, 1)[:, 0]
-        step = torch.cholesky_solve(sums - total, torch.linalg.cholesky_ex(jacobian).L)
+        sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1)
+        for part, slope, dtype in blocks(terms):
+            sums, jacobian, tolerance = sums + part, jacobian + slope, CONVERGED[dtype]
+        step = torch.cholesky_solve(sums + correction - total, torch.linalg.cholesky_ex(jacobian).L)
         total = total + step
         change = float(step.norm() / total.norm())
         if change <= tolerance:
@@ -80,17 +90,16 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool) -> Tensor
     return total
 
 
-def limiter_by_passes(blocks: Pass, balancing: PixelScaling) -> Tensor | None:
+def limiter_by_passes(blocks: Pass, balancing: PixelScaling, dtype: torch.dtype) -> Tensor | None:
     """The ``X^(1/2)`` (1, M, M) by which the factor is multiplied, or None where no eigenvalue exceeds 1."""
-    dtype = next(iter(blocks())).factor.dtype
 
     def gram(at: Tensor, power: int) -> Tensor:
-        matrix = torch.zeros((), dtype=torch.float64)
-        for block in blocks():
+        def part(block: Block) -> Tensor:
             scaling, remainder = balancing(block.factor, block.diagonal)
             weights = block.weights * shift(at, remainder).pow(-power)
-            matrix = matrix + sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
-        return matrix
+            return sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
+
+        return torch.stack(list(blocks(part))).sum(0)
 
     allowed = slack(dtype, CONVERGED[dtype])
     return limiter(gram, balancing.moment, allowed) if exceeds(gram, balancing.moment, allowed) else None
@@ -104,35 +113,107 @@ class Sums:
         grams: ``F diag(r^j) F^T``, (1, J, M, M), float64.
         moments: ``F r^i y``, (1, k, M, C), float64.
         dtype: of the factor.
+        correction: what the coefficients lack if these are sums over a sample, (1, k, M, C), float64.
     """
 
     grams: Tensor
     moments: Tensor
     dtype: torch.dtype
+    correction: Tensor | None = None
 
     def coefficients(self) -> Tensor:
         """The c_i of ``W^i y = F^T c_i + r W^(i-1) y`` for i = 1 ... k, (1, k, M, C)."""
-        found = [self.moments[:, 0]]
-        for i in range(1, self.moments.shape[1]):
-            found.append(self.moments[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
+        known = self.moments if self.correction is None else self.moments + self.correction
+        found = [known[:, 0]]
+        for i in range(1, known.shape[1]):
+            found.append(known[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
         return torch.stack(found, dim=1)
 
 
-def sum_up(pixels: Iterable[tuple[Tensor, Columns, Tensor]], order: int) -> Sums:
+@dataclass(frozen=True)
+class Totals:
+    """Sums over pixels for a guess at the balancing and at the coefficients of powers of W.
+
+    Attributes:
+        moment: ``sum_i w_i d_i u_i``, (1, M, 1), float64.
+        coefficients: ``F W^(i-1) y`` for i = 1 ... k, (1, k, M, C), float64.
+        grams: ``F diag(r^j) F^T``, (1, 2, M, M), float64, or 0 if they are not needed.
+    """
+
+    moment: Tensor
+    coefficients: Tensor
+    grams: Tensor
+
+    def plus(self, other: "Totals", sign: int = 1) -> "Totals":
+        """The sum of both, or their difference."""
+        return Totals(
+            self.moment + sign * other.moment,
+            self.coefficients + sign * other.coefficients,
+            self.grams + sign * other.grams,
+        )
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A guess at the balancing, and at the coefficients of the powers of W before the last.
+
+    Attributes:
+        moment: t, (1, M, 1).
+        coefficients: (1, k - 1, M, C).
+        values: of a block under its columns, the planes y (1, C, n).
+        spectral: whether Gram matrices are to be summed up.
+    """
+
+    moment: Tensor
+    coefficients: Tensor
+    values: Callable[[Block, Columns], Tensor]
+    spectral: bool
+
+    def columns(self, block: Block, half: Tensor | None = None) -> Columns:
+        """The columns of a block; ``half`` is ``u . t / 2``, (1, n), if known."""
+        if half is None:
+            half = spread((self.moment / 2).mT.to(block.factor), block.factor).squeeze(1)
+        scaling = positive_root(half, block.diagonal).clamp_(max=LARGEST)  # of a pixel that the guess knows nothing of
+        return Columns(block.factor, scaling, scaling * (scaling * block.diagonal))
+
+    def totals(self, block: Block) -> tuple[Columns, Totals]:
+        """The columns of a block, and its part of the sums."""
+        factor, (order, _, count) = block.factor, self.coefficients.shape[1:]
+        rows = torch.cat([(self.moment / 2).mT, self.coefficients.transpose(2, 3).flatten(1, 2)], dim=1)
+        products = spread(rows.to(factor), factor)  # all in one read
+        columns = self.columns(block, products[:, 0])
+        powers = [self.values(block, columns)]
+        for product in products[:, 1:].unflatten(1, (order, count)).unbind(1):
+            powers.append(columns.scaling.unsqueeze(1) * product + columns.remainder.unsqueeze(1) * powers[-1])
+        mass = (block.weights * columns.scaling).unsqueeze(1)
+        sums = moment(factor, torch.cat([mass, *(mass * power for power in powers)], dim=1))  # (1, M, 1 + k C)
+        grams = torch.zeros(1, 1, factor.shape[1], factor.shape[1])
+        if self.spectral:
+            grams = sum_grams(factor, columns.scaling * block.weights.sqrt(), columns.remainder, 2)
+        coefficients = sums[:, :, 1:].unflatten(2, (len(powers), -1)).transpose(1, 2)
+        return columns, Totals(sums[:, :, :1], coefficients, grams)
+
+
+def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
     """One pass over pixels, for the first ``order`` powers of W.
 
     Args:
-        pixels: values y (1, C, n) to filter, columns, and how many pixels each stands for, (1, n).
+        blocks: of the pixels.
+        values: what is filtered of a block, y (1, C, n), and its columns.
         order: k, at least 1.
     """
-    grams, moments, dtype = torch.zeros(()), torch.zeros(()), torch.float64
-    for values, columns, weights in pixels:
+
+    def part(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
+        planes, columns = values(block)
         factor, scaling, remainder = columns.factor, columns.scaling, columns.remainder
-        grams = grams + sum_grams(factor, scaling * weights.sqrt(), remainder, max(order - 1, 2))
-        powers = [(scaling * weights).unsqueeze(1) * values]
+        grams = sum_grams(factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
+        powers = [(scaling * block.weights).unsqueeze(1) * planes]
         for _ in range(order - 1):
             powers.append(remainder.unsqueeze(1) * powers[-1])
         sums = moment(factor, torch.cat(powers, dim=1))  # (1, M, k C)
-        moments = moments + sums.unflatten(2, (order, -1)).transpose(1, 2)
-        dtype = factor.dtype
+        return grams, sums.unflatten(2, (order, -1)).transpose(1, 2), factor.dtype
+
+    grams, moments, dtype = torch.zeros(()), torch.zeros(()), torch.float64
+    for gram, sums, dtype in blocks(part):  # noqa: B007
+        grams, moments = grams + gram, moments + sums
     return Sums(grams, moments, dtype)

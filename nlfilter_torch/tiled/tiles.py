@@ -1,19 +1,21 @@
 """Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
+from nlfilter_torch.tiled.workers import in_order
 
-SAMPLE = 1 << 20  # pixels; docs/scale.md shows the effect of more or fewer
+SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
 TOGETHER, AMPLE = 1 << 14, 1 << 28  # pixels of rows computed together, which take less time each, and bytes for that
 Statistics = Literal["sample", "full"]
@@ -68,6 +70,10 @@ class Passes:
         """Rows that are always computed together; a tile has as many, or a multiple."""
         return max(1, (TOGETHER if self.memory >= AMPLE else 1) // width)
 
+    def workers(self, num_landmarks: int) -> int:
+        """Tiles that are worked out at once, by threads of their own: as many as fit well."""
+        return max(1, min(torch.get_num_threads(), self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
+
     def work_out(
         self,
         picture: Picture,
@@ -75,18 +81,30 @@ class Passes:
         margin: int,
         rows: int,
         *,
+        workers: int = 1,
         transparent: bool = True,
         stage: str = "Filtering",
     ) -> Rows:
         """The edited rows, with their transparency if asked for, in tiles of ``rows``."""
-        for tile in picture.tiles(margin, rows):
-            self.report(stage, tile.start, picture.size[0])
-            with torch.no_grad():
-                values = stored_as(edit(tile), self.kind)
+
+        def tiles() -> Iterator[Tile]:
+            for tile in picture.tiles(margin, rows):
+                self.report(stage, tile.start, picture.size[0])
+                yield tile
+
+        def worked_out(tile: Tile) -> tuple[slice, NDArray[Any]]:
+            values = stored_as(edit(tile), self.kind)
             if transparent:
                 values = np.concatenate([values, transparency(tile, self.kind)], axis=2)
-            yield slice(tile.start, tile.start + len(values)), values
+            return slice(tile.start, tile.start + len(values)), values
+
+        yield from in_order(worked_out, tiles(), workers)
         self.report(stage, picture.size[0], picture.size[0])
+
+
+def bytes_at_hand(pixels: int, num_landmarks: int) -> int:
+    """What pixels that are computed together take: their factor, and products as large."""
+    return 16 * pixels * num_landmarks
 
 
 def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False) -> None:
@@ -103,6 +121,18 @@ def fill(target: RowTarget, rows: Rows) -> None:
     """Assign the rows (h, W, S) to their positions."""
     for part, values in rows:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
+
+
+def bytes_needed(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int = 0) -> int:
+    """What statistics and a row take at least; arguments as of :func:`rows_that_fit`."""
+    size = picture.dtype.itemsize
+    workers, rows = passes.workers(num_landmarks), passes.rows_together(picture.size[1])
+    at_hand = workers * bytes_at_hand(rows * picture.size[1], num_landmarks) // 4
+    # The pilot with copies of its features and its factor; later the factors of both samples, and blocks.
+    pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
+    some = (pilot + min(picture.pixels, passes.sample)) * (num_landmarks + picture.colours + 2)
+    later = some + workers * block * (num_landmarks + planes + 8)
+    return size * (held + at_hand + max(pilot * (num_landmarks + 3 * planes), later))
 
 
 def rows_that_fit(
@@ -127,17 +157,20 @@ def rows_that_fit(
     Raises:
         MemoryError: if there is not one, or no room for the samples.
     """
-    size, memory = (8 if picture.dtype == torch.float64 else 4), passes.memory
-    row = picture.size[1] * floats * size
-    rows = passes.rows_together(picture.size[1])
-    at_hand = rows * picture.size[1] * 4 * num_landmarks  # their factor, and products as large
-    # Statistics: the pilot with copies of its features and its factor; later the features of both samples and a block.
-    pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
-    later = (pilot + min(picture.pixels, passes.sample)) * planes + block * (num_landmarks + planes + 8)
-    least = size * (held + at_hand + max(pilot * (num_landmarks + 3 * planes), later))
-    if max(row, least) > memory:
+    row = picture.size[1] * floats * picture.dtype.itemsize
+    least = bytes_needed(picture, passes, planes, num_landmarks, held)
+    if max(row, least) > passes.memory:
         raise MemoryError(
-            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {memory / 1e6:.0f} MB may be "
-            "used; allow more, or use fewer landmarks"
+            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {passes.memory / 1e6:.0f} MB "
+            "may be used; allow more, or use fewer landmarks"
         )
-    return max(1, min((memory - size * (held + at_hand)) // (2 * row), TILE_PIXELS // picture.size[1]))
+    tiles = 1 + passes.workers(num_landmarks)
+    return max(1, min((passes.memory - least) // (tiles * row), TILE_PIXELS // picture.size[1]))
+
+
+def pixels_kept(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int) -> int:
+    """Pixels whose columns can be kept from one pass to the next."""
+    if passes.memory < AMPLE:
+        return 0
+    spare = passes.memory * 7 // 10 - bytes_needed(picture, passes, planes, num_landmarks, held)
+    return min(picture.pixels, max(0, spare // (picture.dtype.itemsize * (num_landmarks + 2))))
