@@ -1,11 +1,16 @@
 """Photographs that ship with scikit-image, as tensors: colours and sizes that the figures ask for."""
 
+from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import skimage.data
 import torch
+import torch.nn.functional as F
 from skimage.transform import resize
+
+from nlfilter_torch.io.photographs import read_photograph
 
 LOADERS = {"motorcycle": lambda: skimage.data.stereo_motorcycle()[0]}
 
@@ -23,3 +28,28 @@ def photograph(name: str, height: int | None = None, width: int | None = None) -
         picture = resize(picture[top : top + cut[0], left : left + cut[1]], (height, width), anti_aliasing=True)
     tensor = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
     return tensor.clamp(0, 1)
+
+
+def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, torch.Tensor]:
+    """Photographs (1, 3, H, W), reduced to a short side: every PNG, JPEG and TIFF file of a folder, or scikit-image's.
+
+    Args:
+        folder: None takes scikit-image's photographs of these ``names``.
+        side: pixels of the short side; smaller photographs stay as they are.
+        names: of scikit-image.
+    """
+    if folder is None:
+        found = {name: photograph(name) for name in names}
+    else:
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif"))
+        found = {path.stem: read_photograph(path).pixels for path in paths}
+    return {name: reduced_to(picture.expand(-1, 3, -1, -1), side) for name, picture in found.items()}
+
+
+def reduced_to(picture: torch.Tensor, side: int) -> torch.Tensor:
+    """A photograph reduced to a short side; smaller ones stay as they are."""
+    scale = side / min(picture.shape[-2:])
+    if scale >= 1:
+        return picture.float()
+    size = [round(length * scale) for length in picture.shape[-2:]]
+    return F.interpolate(picture.float(), size, mode="bicubic", antialias=True).clamp(0, 1)

@@ -65,7 +65,7 @@ def test_weights_anchors_and_values_have_gradients() -> None:
     anchor[..., 0, 0] = 2.0  # differences of 1e4 have no digits left
     given = tuple(tensor.requires_grad_() for tensor in (guide, anchor, values))
     assert torch.autograd.gradcheck(solved, given)
-    assert torch.autograd.gradgradcheck(solved, given)
+    assert torch.autograd.gradgradcheck(solved, given, fast_mode=True)
 
 
 def test_values_stay_within_their_range_and_constants_are_kept() -> None:
