@@ -34,18 +34,24 @@ SIDES = tuple(_sides(offset) for offset in OFFSETS)
 PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from the pixels that have it to all
 
 
-def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tensor:
+def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor], *, variance: Tensor | None = None) -> Tensor:
     """Weights between neighbours, from their squared distance.
 
     Args:
         guide: (B, C, H, W).
         weight: of squared distances (B, h, w), summed over the channels.
+        variance: (B, 1, H, W), positive; distances are divided by the geometric mean of that of both pixels. None is 1.
 
     Returns:
         (B, 4, H, W): weights of each pixel with its neighbour at each of :data:`OFFSETS`, 0 where there is none.
     """
-    distances = ((guide[..., *here] - guide[..., *there]).square().sum(1) for here, there in SIDES)
-    return torch.stack([F.pad(weight(d), padding) for d, padding in zip(distances, PADDING, strict=True)], dim=1)
+    weights = []
+    for (here, there), padding in zip(SIDES, PADDING, strict=True):
+        distance = (guide[..., *here] - guide[..., *there]).square().sum(1)
+        if variance is not None:
+            distance = distance / (variance[:, 0, *here] * variance[:, 0, *there]).sqrt()
+        weights.append(F.pad(weight(distance), padding))
+    return torch.stack(weights, dim=1)
 
 
 @full_precision
