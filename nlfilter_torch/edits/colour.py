@@ -81,6 +81,12 @@ def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
     return luminance, image - luminance
 
 
+def with_green(chroma: Tensor) -> Tensor:
+    """Chroma (B, 3, H, W) from its red and blue, (B, 2, H, W): it has no luminance."""
+    red, blue = chroma.split(1, dim=1)
+    return torch.cat([red, (0.299 * red + 0.114 * blue) / -0.587, blue], dim=1)
+
+
 def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:
     """RGB (B, 3, H, W) of that luminance, chroma scaled down where a channel would leave [0, 1].
 

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
@@ -145,6 +146,9 @@ class Source(Protocol):
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
+    def reduced(self, planes: Planes, step: int) -> Tensor:
+        """Means (B, C, H / step, W / step), rounded up, over blocks of ``step`` pixels in both directions."""
+
     def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
         """Medians (B, C) over all pixels but ``margin`` at the borders.
 
@@ -228,6 +232,10 @@ class InMemory:
         """Means over all pixels."""
         return planes(self).mean((2, 3), keepdim=True)
 
+    def reduced(self, planes: Planes, step: int) -> Tensor:
+        """Means over blocks of all pixels."""
+        return block_means(planes(self), step)
+
     def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
         """Medians over all pixels."""
         return response(self.image).flatten(2).median(2).values
@@ -279,6 +287,11 @@ def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> 
     """``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
     total = coefficients @ operator.pairs.gain(response).mT
     return operator.each(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
+
+
+def block_means(planes: Tensor, step: int) -> Tensor:
+    """Means over blocks of ``step`` pixels in both directions, those at the lower and right borders smaller."""
+    return planes if step == 1 else F.avg_pool2d(planes, step, ceil_mode=True, count_include_pad=False)
 
 
 def luminance(pixels: Pixels) -> Tensor:

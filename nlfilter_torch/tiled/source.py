@@ -12,7 +12,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.resizing import resized
-from nlfilter_torch.edits.source import Fitted, Guide, Planes
+from nlfilter_torch.edits.source import Fitted, Guide, Planes, block_means
 from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.operator import Columns
@@ -172,6 +172,15 @@ class Tiled:
             self.passes.report("Averaging", tile.start, self.size[0])
             total = total + planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
+
+    @torch.no_grad()
+    def reduced(self, planes: Planes, step: int) -> Tensor:
+        """Means over blocks of ``step`` pixels in both directions."""
+        parts, rows = [], max(1, self.picture.statistics_rows // step) * step
+        for tile in self.picture.tiles(0, rows):
+            self.passes.report("Reducing", tile.start, self.size[0])
+            parts.append(block_means(planes(self.pixels_of(tile)), step))
+        return torch.cat(parts, dim=2)
 
     @torch.no_grad()
     def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:

@@ -1,0 +1,108 @@
+"""Values that spread from scribbles to the neighbouring pixels, and stop where the luminance changes.
+
+They are the solution of a system over the eight neighbours of each pixel, as in Levin, Lischinski and Weiss,
+"Colorization using Optimization" (2004). Unlike theirs it is symmetric; the local variance of luminance that scales the
+differences has an upper limit, since it would be large at an edge; and the influence of scribbles falls to zero far
+from them and behind edges.
+
+The system is solved on a picture that is reduced to about :data:`SOLVED` pixels, so that its cost does not grow with
+the size. Any pixel takes its values from the four nearest blocks, those of similar luminance first. So a pixel depends
+only on its own luminance and place, and tiles are exact.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.edits.source import Pixels, Source, luminance
+from nlfilter_torch.filtering.neighbours import neighbour_weights, solve_neighbours
+from nlfilter_torch.operator.features import pad_border
+
+SOLVED = 1 << 14  # pixels
+# Limits of the variance that squared differences in luminance are compared with, and weight of the least alike.
+LEAST_VARIANCE, MOST_VARIANCE, LEAST = 0.007**2, 0.042**2, 1e-5
+FIXED = 1e3  # anchor of a scribbled pixel
+REACH = 1.0  # distance at which the influence has fallen to 1/e in flat parts, relative to the root of the area
+TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-10}
+
+
+@dataclass(frozen=True, eq=False)
+class LocalValues:
+    """Values of any pixel, from those near it.
+
+    Attributes:
+        values: solutions for the scribbles' values and for ones, (B, C+1, h, w). The latter is how far the scribbles
+            determine a block, in [0, 1], and the ratio of both is a weighted mean of the scribbles' values.
+        guide: luminance of the blocks, (B, 1, h, w).
+        step: rows and columns of a block.
+        width: W of the picture.
+    """
+
+    values: Tensor
+    guide: Tensor
+    step: int
+    width: int
+
+    @staticmethod
+    def of(source: Source, scribbles: Scribbles, values: Tensor) -> "LocalValues":
+        """From values (B, C, n) of scribbled pixels."""
+        height, width = source.size
+        step = max(1, round(math.sqrt(height * width / SOLVED)))
+        guide = source.reduced(luminance, step)
+        rows, columns = guide.shape[2:]
+        places = scribbles.places
+        blocks = places // width // step * columns + places % width // step
+        weighted = torch.cat([values * scribbles.weights, scribbles.weights], dim=1)
+        sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
+        sums = sums.unflatten(2, (rows, columns)) * (FIXED / step**2)
+        # Each pixel has three neighbours in every direction.
+        anchor = sums[:, -1:] + 3 / (REACH**2 * rows * columns)
+        weights = neighbour_weights(guide, lambda squared: torch.exp(-squared) + LEAST, variance=local_variance(guide))
+        solved = solve_neighbours(weights, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
+        return LocalValues(solved, guide, step, width)
+
+    def __call__(self, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Values times influence (B, C, h, W), and influence (B, 1, h, W) in [0, 1], of some rows.
+
+        The influence is the square root of how far the scribbles determine a pixel.
+        """
+        found = self._at(pixels)
+        influence = found[:, -1:].clamp(min=1e-6).sqrt()
+        return found[:, :-1] / influence, influence
+
+    def _at(self, pixels: Pixels) -> Tensor:
+        """The solutions (B, C+1, h, W) at some rows."""
+        if self.step == 1:
+            start = pixels.first // self.width
+            return self.values[:, :, start : start + pixels.image.shape[2]]
+        own = luminance(pixels)
+        height, width = own.shape[2:]
+        rows = self._between(pixels.first // self.width, height, self.guide.shape[2], own)
+        columns = self._between(0, width, self.guide.shape[3], own)
+        total, weight = torch.zeros(()), torch.zeros(())
+        for row, row_share in rows:
+            for column, column_share in columns:
+                guide, values = (planes[:, :, row][..., column] for planes in (self.guide, self.values))
+                alike = torch.exp((own - guide).square() / -MOST_VARIANCE) + LEAST
+                share = row_share.unsqueeze(1) * column_share * alike
+                total, weight = total + share * values, weight + share
+        return total / weight
+
+    def _between(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """The blocks before and after pixels along an axis, and their shares (count,) by distance."""
+        position = (torch.arange(first, first + count, device=like.device) + 0.5) / self.step - 0.5
+        before = position.floor()
+        share = (position - before).to(like)
+        number = before.long()
+        return [(number.clamp(0, blocks - 1), 1 - share), ((number + 1).clamp(0, blocks - 1), share)]
+
+
+def local_variance(guide: Tensor) -> Tensor:
+    """Variance of 3x3 pixels around each, within limits, (B, 1, H, W)."""
+    moments = F.avg_pool2d(pad_border(torch.cat([guide, guide.square()], dim=1), 1), 3, stride=1)
+    mean, square = moments.split(1, dim=1)
+    return (square - mean.square()).clamp(LEAST_VARIANCE, MOST_VARIANCE)

@@ -1,0 +1,108 @@
+"""Values that spread from scribbles over neighbouring pixels."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch import colorize
+from nlfilter_torch.edits import local_values
+from nlfilter_torch.edits.local_values import LocalValues
+from nlfilter_torch.edits.source import InMemory, luminance
+from nlfilter_torch.tiled import stream_colorize
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import Picture
+from nlfilter_torch.tiled.tiles import Passes
+from tests.problems import box, colour
+from tests.problems import luminance as grey_of
+
+
+def halves(height: int = 24, width: int = 40) -> Tensor:
+    """Dark on the left, bright on the right, with little noise."""
+    image = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(0)) * 0.02 + 0.2
+    image[..., width // 2 :] += 0.5
+    return image
+
+
+def spread(image: Tensor, mask: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Values times influence, and influence."""
+    source = InMemory(image)
+    scribbles = source.scribbles(mask, None, "mask")
+    return LocalValues.of(source, scribbles, values.flatten(2)[:, :, scribbles.places])(source)
+
+
+def test_values_stay_on_their_side_of_a_border() -> None:
+    image, mask = halves(), box(8, 4, 4, 4, size=(24, 40)) + box(8, 30, 4, 4, size=(24, 40))
+    values = torch.full((1, 2, 24, 40), -1.0)
+    values[..., 20:] = 1.0
+    found, influence = spread(image, mask, values)
+    mean = found / influence
+    assert mean[..., :19].max() < -0.9
+    assert mean[..., 21:].min() > 0.9
+    assert influence[mask > 0].min() > 0.99
+    assert 0 < influence.min() < influence.max() <= 1 + 1e-6
+
+
+def test_influence_ends_at_a_border_and_falls_with_distance() -> None:
+    mask = box(8, 4, 4, 4, size=(24, 40))
+    found, influence = spread(halves(), mask, torch.full((1, 1, 24, 40), 0.3))
+    torch.testing.assert_close(found, 0.3 * influence, atol=2e-4, rtol=0)  # a constant stays one
+    assert influence[..., 21:].max() < 0.5 * influence[..., :19].min()
+    assert (influence[..., 10, 8:19].diff() < 0).all()
+
+
+@pytest.mark.parametrize("solved", [1 << 16, 8])
+def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
+    monkeypatch.setattr(local_values, "SOLVED", solved)
+    generator = torch.Generator().manual_seed(1)
+    image, values, weights = (torch.rand(1, c, 5, 6, generator=generator, dtype=torch.float64) for c in (1, 2, 1))
+    places = torch.tensor([3, 7, 20, 29])
+    monkeypatch.setattr(local_values, "FIXED", 2.0)  # differences of what is fixed have no digits left
+
+    def found(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        source = InMemory(0.1 * image)
+        scribbles = replace(source.scribbles(torch.ones(1, 1, 5, 6), None, "mask"), places=places, weights=weights)
+        return LocalValues.of(source, scribbles, values)(source)
+
+    given = (image, values.flatten(2)[..., :4], weights.flatten(2)[..., :4])
+    assert torch.autograd.gradcheck(found, tuple(tensor.clone().requires_grad_() for tensor in given), atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [1, 3, 7])
+def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 500)
+    picture = np.random.default_rng(0).random((83, 61, 3), np.float32)
+    tiled = Tiled(Picture(picture), Passes("float32"))
+    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    whole = InMemory(image).reduced(luminance, step)
+    assert torch.equal(tiled.reduced(luminance, step), whole)
+    part = luminance(InMemory(image))[..., -(83 % step or step) :, :step].mean()
+    torch.testing.assert_close(whole[0, 0, -1, 0], part)
+
+
+@pytest.mark.parametrize("rows", [1, 11, 90])
+def test_reduced_pictures_are_coloured_in_tiles_as_in_memory(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    monkeypatch.setattr(local_values, "SOLVED", 600)
+    image = colour("coffee", 60, 90).double()
+    mask = (box(10, 10, 5, 5, size=(60, 90)) + box(40, 60, 5, 5, size=(60, 90))).double()
+    options: dict[str, Any] = {"num_landmarks": 30}
+    whole = colorize(grey_of(image), image * mask, mask, **options)
+    edited = np.empty((60, 90, 3))
+    arrays = [tensor[0].permute(1, 2, 0).numpy() for tensor in (grey_of(image), image * mask, mask)]
+    stream_colorize(arrays[0], edited, *arrays[1:], statistics="full", tile_rows=rows, memory=1 << 27, **options)
+    assert np.abs(edited - whole[0].permute(1, 2, 0).numpy()).max() < 1e-7
+
+
+def test_a_reduced_picture_gives_nearly_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, mask = halves(48, 80), box(16, 8, 8, 8, size=(48, 80)) + box(16, 60, 8, 8, size=(48, 80))
+    values = torch.full((1, 1, 48, 80), -1.0)
+    values[..., 40:] = 1.0
+    exact, reduced = [], []
+    for found, solved in ((exact, 1 << 16), (reduced, 48 * 80 // 9)):
+        monkeypatch.setattr(local_values, "SOLVED", solved)
+        found.extend(spread(image, mask, values))
+    assert (exact[0] / exact[1] - reduced[0] / reduced[1]).abs()[..., [*range(38), *range(42, 80)]].max() < 0.1
+    assert (exact[1] - reduced[1]).abs().mean() < 0.1
