@@ -165,19 +165,9 @@ def check_positive(value: float | Tensor, name: str, batch: int | None = None) -
     check_values(value, name, "positive", batch)
 
 
-def check_not_negative(value: float | Tensor, name: str, remedy: str, batch: int | None = None) -> None:
-    """Raise unless ``value`` is at least 0 and finite; see :func:`check_values`."""
-    check_values(value, name, "not negative", batch, remedy)
-
-
 def check_weight(value: float | Tensor, name: str, batch: int | None = None) -> None:
     """Raise unless ``value`` is finite; see :func:`check_values`."""
     check_values(value, name, "finite", batch)
-
-
-def check_share(value: float | Tensor, name: str, batch: int | None = None, *, below: bool = False) -> None:
-    """Raise unless ``value`` is in [0, 1], or in [0, 1) where ``below``; see :func:`check_values`."""
-    check_values(value, name, "below 1" if below else "share", batch)
 
 
 def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:

@@ -16,11 +16,11 @@ from torch import Tensor
 from nlfilter_torch.core.checks import (
     check_image,
     check_instance,
-    check_not_negative,
     check_number,
     check_order,
     check_same_size,
     check_tensor,
+    check_values,
 )
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
@@ -126,7 +126,7 @@ def fit_alpha(
 
 def _check_not_negative(value: float, name: str) -> None:
     check_number(value, name, "pass 0.0 or more")
-    check_not_negative(value, name, "0.0 is plain least squares")
+    check_values(value, name, "not negative", remedy="0.0 is plain least squares")
 
 
 def _is_rounded(target: Tensor, among: Communicator) -> bool:

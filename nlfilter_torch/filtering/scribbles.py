@@ -20,9 +20,9 @@ from nlfilter_torch.core.checks import (
     check_instance,
     check_positive,
     check_same_size,
-    check_share,
     check_tensor,
     check_unit_range,
+    check_values,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment
@@ -86,8 +86,8 @@ def propagate_strokes(
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum")
     check_painted(stroke_mask, among=among)
-    check_share(strength, "strength", images)
-    check_share(reach, "reach", batch, below=True)
+    check_values(strength, "strength", "share", images)
+    check_values(reach, "reach", "below 1", batch)
     check_positive(smoothness, "smoothness", images)
 
     strength, reach, smoothness = (among.copy_to_group(value) for value in (strength, reach, smoothness))
