@@ -65,6 +65,8 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.tables --long-side 64
 	$(BIN)/python -m benchmarks.app --side 96
 	$(BIN)/python -m benchmarks.distributed --ranks 2 --widths 64 --landmarks 20
+	$(BIN)/python -m benchmarks.detail --quick
+	$(BIN)/python -m benchmarks.detail --quick --scales
 	$(BIN)/python -m benchmarks.streaming --quick
 	$(BIN)/python -m benchmarks.streaming_strokes --quick
 	$(BIN)/python -m benchmarks.fuzz --cases 20

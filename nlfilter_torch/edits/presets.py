@@ -137,13 +137,14 @@ def _preset(recipe: Recipe, name: str) -> Preset:
     return Preset(**{field: recipe.steps[0][field] for field in Preset.__dataclass_fields__})
 
 
-#: The presets that have a name. Chosen by eye on astronaut, chelsea, coffee and rocket of scikit-image.
+#: The presets that have a name. Chosen by eye on astronaut, chelsea and rocket of scikit-image and seven photographs of
+#: landscapes, buildings and plants.
 PRESETS: dict[str, Preset] = {
     "crisp": Preset((2.2, 2.2, 2.2, 1.0)),
     "clear": Preset((1.5, 1.5, 1.5, 1.0)),
-    "texture": Preset((3.0, 1.5, 1.0, 1.0)),
+    "texture": Preset((2.5, 1.3, 1.0, 1.0)),
     "dramatic": Preset((2.0, 2.5, 3.5, 1.0), 40.0),
-    "glow": Preset((0.4, 1.0, 3.0, 1.0), 40.0),
+    "glow": Preset((0.5, 1.0, 2.5, 1.0), 40.0),
     "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 8.0),
     "calm": Preset((0.8, 0.6, 0.4, 1.0), 40.0),
     "smooth": Preset((0.0, 0.0, 0.0, 1.0), 12.0),
@@ -154,8 +155,8 @@ PURPOSES: dict[str, str] = {
     "crisp": "all details, large and small, strongly",
     "clear": "a little more of everything",
     "texture": "the finest only: fur, hair, cloth, stone; grain too",
-    "dramatic": "deep light and shade; dark corners go black",
-    "glow": "fine detail soft, light and shade deep",
+    "dramatic": "deep light and shade; small halos at hard edges",
+    "glow": "fine detail soft, larger shapes stronger",
     "soft skin": "pores and grain away, eyes and outlines kept",
     "calm": "less contrast within things, as in haze",
     "smooth": "texture away, edges kept; the start of a drawing",
