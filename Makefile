@@ -67,6 +67,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.distributed --ranks 2 --widths 64 --landmarks 20
 	$(BIN)/python -m benchmarks.streaming --quick
 	$(BIN)/python -m benchmarks.streaming_strokes --quick
+	$(BIN)/python -m benchmarks.streaming_cpu --quick
 	$(BIN)/python -m benchmarks.fuzz --cases 20
 
 # A denoiser trained from nothing, and judged: weights, figures and a picture in out/denoiser.

@@ -72,6 +72,8 @@ class Passes:
 
     def workers(self, num_landmarks: int) -> int:
         """Tiles that are worked out at once, by threads of their own: as many as fit well."""
+        if self.memory < AMPLE:
+            return 1
         return max(1, min(torch.get_num_threads(), self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
 
     def work_out(
