@@ -69,6 +69,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.detail --quick --scales
 	$(BIN)/python -m benchmarks.streaming --quick
 	$(BIN)/python -m benchmarks.streaming_strokes --quick
+	$(BIN)/python -m benchmarks.streaming_cpu --quick
 	$(BIN)/python -m benchmarks.fuzz --cases 20
 
 # A denoiser trained from nothing, and judged: weights, figures and a picture in out/denoiser.

@@ -239,7 +239,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "from nlfilter_torch.tiled.source import Tiled\n"
         "def slow(original):\n"
         "    def edit(*arguments):\n"
-        "        time.sleep(0.05)\n"
+        "        time.sleep(0.2)\n"
         "        return original(*arguments)\n"
         "    return edit\n"
         "Tiled.edited, tiles.TILE_PIXELS = slow(Tiled.edited), 300\n"

@@ -268,7 +268,7 @@ def test_memory_gives_the_size_of_tiles() -> None:
     assert rows_within(13 * 10**7, masked=True) < rows[1]
     with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least, but 10 MB may be used; allow more"):
         rows_within(10**7)
-    with pytest.raises(MemoryError, match="source needs 4 MB of memory at least, but 0 MB may be used"):
+    with pytest.raises(MemoryError, match="source needs 7 MB of memory at least, but 0 MB may be used"):
         streamed(cat(60, 80), memory=1000)
 
 

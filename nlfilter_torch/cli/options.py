@@ -103,7 +103,7 @@ Full = Annotated[
     bool,
     typer.Option(
         "--full",
-        help="In tiles: learn from every pixel, not from a million of them. Takes two or three times as long.",
+        help="In tiles: learn from every pixel to the last digit. Takes two or three times as long.",
     ),
 ]
 StrokesFile = Annotated[

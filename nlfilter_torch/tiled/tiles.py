@@ -72,6 +72,8 @@ class Passes:
 
     def workers(self, num_landmarks: int) -> int:
         """Tiles that are worked out at once, by threads of their own: as many as fit well."""
+        if self.memory < AMPLE:
+            return 1
         return max(1, min(torch.get_num_threads(), self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
 
     def work_out(
@@ -164,8 +166,9 @@ def rows_that_fit(
             f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {passes.memory / 1e6:.0f} MB "
             "may be used; allow more, or use fewer landmarks"
         )
-    tiles = 1 + passes.workers(num_landmarks)
-    return max(1, min((passes.memory - least) // (tiles * row), TILE_PIXELS // picture.size[1]))
+    tiles, together = 1 + passes.workers(num_landmarks), passes.rows_together(picture.size[1]) * picture.size[1]
+    taken = picture.dtype.itemsize * held + (tiles - 1) * bytes_at_hand(together, num_landmarks)
+    return max(1, min((passes.memory - taken) // (tiles * row), TILE_PIXELS // picture.size[1]))
 
 
 def pixels_kept(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int) -> int:
