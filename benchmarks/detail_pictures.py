@@ -25,11 +25,10 @@ from rich.table import Table
 from skimage.filters import unsharp_mask
 from torch import Tensor
 
-from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.plotting import save_figure, show_images
 
-ALPHA = (3.0, 3.0, 4.0, 1.05)
 RADIUS = 2.0
 # The part of each photograph that is shown, at its own scale, by its upper left corner; the figures are of the whole.
 CROPS = {"coffee": (130, 180), "chelsea": (15, 90), "astronaut": (20, 90)}
@@ -95,30 +94,28 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where the pictures go")
     folder = parser.parse_args().folder
     folder.mkdir(exist_ok=True)
-    table = Table(title=f"Sharpening with alpha = {ALPHA}, m = 100, auto bandwidth")
+    table = Table(title="The preset crisp")
     for column in ("photograph", "method", "detail gain", "noise gain", "halo", "clipped %"):
         table.add_column(column, justify="left" if column in ("photograph", "method") else "right")
     for name, (top, left) in CROPS.items():
         image = torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1)[None].float() / 255
         luminance = rgb_to_grayscale(image)
-        operator = nonlocal_operator(luminance)
-        nonlocal_edit = polynomial_filter(operator, luminance, torch.tensor(ALPHA))
-        gain = detail_gain(luminance, nonlocal_edit.clamp(0, 1))
+        crisp = PRESETS["crisp"].apply(image)
+        gain = detail_gain(luminance, rgb_to_grayscale(crisp.clamp(0, 1)))
         amount = matching_amount(luminance, gain)
-        results = {f"unsharp mask, amount {amount:.2f}": unsharp(amount)(luminance), "nlfilter-torch": nonlocal_edit}
+        masked = edit_luminance(image, unsharp(amount))
+        results = {f"unsharp mask, amount {amount:.2f}": masked, "nlfilter-torch": crisp}
         for method, result in results.items():
-            shown = result.clamp(0, 1)
+            shown = rgb_to_grayscale(result.clamp(0, 1))
             figures = (
                 detail_gain(luminance, shown),
                 noise_gain(luminance, shown),
                 halo(luminance, shown),
-                clipped(result),
+                clipped(rgb_to_grayscale(result)),
             )
             table.add_row(name, method, *(f"{figure:.2f}" for figure in figures))
         window = (..., slice(top, top + SIDE), slice(left, left + SIDE))
-        panels = {"before": image} | {
-            method: edit_luminance(image, lambda _, crisp=result: crisp) for method, result in results.items()
-        }
+        panels = {"before": image} | results
         figure = show_images({title: panel[window] for title, panel in panels.items()}, side=SIDE)
         save_figure(figure, folder / f"detail-{name}.png")
     Console(width=110).print(table)
