@@ -75,8 +75,9 @@ def colorize(
     """Colour a grey image from strokes; its luminance stays as it is.
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first far, then
-    what is left of it near the strokes; ``"kmeans"`` is the paper's way: the image is cut into as many pieces as there
-    are colours, by :func:`segment_mask`.
+    what is left of it near the strokes, and mixes it with chroma that spreads from neighbour to neighbour up to edges,
+    half and half where strokes determine the latter. ``"kmeans"`` is the paper's way: the image is cut into as many
+    pieces as there are colours, by :func:`segment_mask`.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].

@@ -59,7 +59,7 @@ class LocalValues:
         weighted = torch.cat([values * scribbles.weights, scribbles.weights], dim=1)
         sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
         sums = sums.unflatten(2, (rows, columns)) * (FIXED / step**2)
-        # Each pixel has three neighbours in every direction.
+        # In flat parts the system is a u = 3 u'', as there are three neighbours in every direction.
         anchor = sums[:, -1:] + 3 / (REACH**2 * rows * columns)
         weights = neighbour_weights(guide, lambda squared: torch.exp(-squared) + LEAST, variance=local_variance(guide))
         solved = solve_neighbours(weights, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])

@@ -186,8 +186,8 @@ def stream_colorize(
 ) -> None:
     """Colourise a picture of any size, as :func:`~nlfilter_torch.colorize` does in memory.
 
-    Given the sums over all pixels and over the scribbled ones, the colour of a pixel depends only on its own patch and
-    position, so there are no seams, and the size of the tiles does not matter.
+    Given the sums over all pixels and over the scribbled ones, and a reduced picture, the colour of a pixel depends
+    only on its own patch and position, so there are no seams, and the size of the tiles does not matter.
 
     Args:
         source: rows (H, W) or (H, W, S), as of :func:`stream_detail`; of colours the luminance is taken.
