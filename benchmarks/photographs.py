@@ -1,10 +1,12 @@
 """Photographs that ship with scikit-image, as tensors: colours and sizes that the figures ask for."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import skimage.data
 import torch
+from PIL import Image
 from skimage.transform import resize
 
 LOADERS = {"motorcycle": lambda: skimage.data.stereo_motorcycle()[0]}
@@ -23,3 +25,17 @@ def photograph(name: str, height: int | None = None, width: int | None = None) -
         picture = resize(picture[top : top + cut[0], left : left + cut[1]], (height, width), anti_aliasing=True)
     tensor = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
     return tensor.clamp(0, 1)
+
+
+def pictures(folder: Path, size: int) -> dict[str, torch.Tensor]:
+    """All pictures (1, 3, H, W) of a folder by name, their longer side reduced to ``size``."""
+    found = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp"):
+            with Image.open(path) as opened:
+                opened.thumbnail((size, size), Image.Resampling.LANCZOS)
+                picture = np.asarray(opened.convert("RGB"), np.float32) / 255
+            found[path.stem] = torch.from_numpy(picture).permute(2, 0, 1)[None]
+    if not found:
+        raise SystemExit(f"{folder} must hold pictures (PNG, JPEG, TIFF or WebP), but holds none; name another folder")
+    return found

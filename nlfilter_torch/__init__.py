@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.edits.denoise import estimate_noise as estimate_noise
     from nlfilter_torch.edits.detail import enhance as enhance
     from nlfilter_torch.edits.frames import filter_frames as filter_frames
+    from nlfilter_torch.edits.mask import region_mask as region_mask
     from nlfilter_torch.edits.recolor import recolor as recolor
     from nlfilter_torch.edits.sharpen import sharpen as sharpen
     from nlfilter_torch.edits.tone import adjust_tone as adjust_tone
@@ -84,6 +85,7 @@ _DEFINED_IN = {
     "polynomial_response": "filtering.filters",
     "propagate_strokes": "filtering.scribbles",
     "recolor": "edits.recolor",
+    "region_mask": "edits.mask",
     "segment_mask": "filtering.masks",
     "sharpen": "edits.sharpen",
     "spectral_filter": "filtering.filters",

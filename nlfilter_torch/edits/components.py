@@ -4,7 +4,7 @@ Under ``g = W + s W^2 + s^2 W^3 + ...``, s the reach, two pixels correlate by ``
 component is compared by the mean of the pixels it covers, so that a few odd pixels under the brush do not count.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -81,6 +81,22 @@ class Components:
     def between(self) -> Tensor:
         """Correlations of the components with each other, (J, J), within [-1, 1]."""
         return self.means @ self.means.mT
+
+
+def scribbled_blocks(
+    known: Sequence[tuple[Callable[[], Iterable[Tensor]], Tensor, Tensor]],
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Columns (B, M, n), weights (B, 1, n) and values (B, C, n) of pixels, block by block, as a regression takes them.
+
+    Args:
+        known: some pixels and others: their columns, block by block; weights and values of all of them.
+    """
+    for columns, weights, values in known:
+        first = 0
+        for block in columns():
+            part = slice(first, first + block.shape[2])
+            yield block, weights[:, :, part], values[:, :, part]
+            first = part.stop
 
 
 def find_components(

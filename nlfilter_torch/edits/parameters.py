@@ -374,6 +374,43 @@ DEFOCUS = Edit(
     needs=True,
 )
 
+MASK = Edit(
+    "mask",
+    """Select a thing: a soft mask of it from a scribble on it, or from a rough mask.
+
+    Mark some of it and, where the mask takes in too much, some of what is around. Masks are grey pictures of the
+    photograph's size, white inside: 8 bits in PNG files, 16 in TIFF files, floats in PFM files, which darktable and ART
+    read as raster masks.
+
+    Example: `nlfilter-torch mask in.jpg mask.png --region 190,60,60,60 --background 10,10,40,40`
+
+    A rough mask to a soft one: `nlfilter-torch mask in.jpg mask.tif --mask rough.png`
+    """,
+    (
+        Parameter(
+            "reach",
+            "number",
+            0.6,
+            "How far a region spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+            0,
+            0.999,
+            domain="below 1",
+            metavar="0...1",
+        ),
+        Parameter(
+            "tolerance",
+            "number",
+            8.0,
+            "How different two colours may be and still count as alike, in units of CIE Lab.",
+            1,
+            100,
+            "lab",
+            argument="photometric_bandwidth",
+        ),
+        *(p for p in _filter(share=0.8)[1:] if p.name != "patch_size"),
+    ),
+)
+
 ABSTRACT = Edit(
     "abstract",
     """Turn a photograph into a painting: flat areas with clear outlines.

@@ -4,25 +4,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance
+from nlfilter_torch.edits.colour import colour_guide, group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.components import Components, Scribbles, correlations, find_components
 from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.source import Fitted, Guide, Source, edited
 from nlfilter_torch.filtering.scribbles import walk_basis
 
-LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
 FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
 DOUBT = 0.05  # variance of what a component tells, in units of a pixel's own: two colours on one thing are no error
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
-
-CONVERTED = 8192  # pixels that one thread converts at once
-VECTOR = 64  # a multiple of the floats that a processor works on at once
 
 
 @full_precision
@@ -174,19 +169,3 @@ def divide(components: Components) -> Tensor:
     doubtful = components.between.double() + DOUBT * torch.eye(len(components.means)).to(components.means)
     solved = torch.cholesky_solve(components.owners.double(), torch.linalg.cholesky_ex(doubtful).L)
     return solved.mT.to(components.means) @ components.means
-
-
-def colour_guide(image: Tensor) -> Tensor:
-    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour.
-
-    To the last bit the same for a pixel wherever it stands, so that landmarks are the same for a picture read by rows.
-    """
-    from kornia.color import rgb_to_lab  # kornia takes half a second to import
-
-    # Powers round differently in the odd pixels that are left over at the end of a tensor, or of a thread's part of it.
-    parts = []
-    for part in image.clamp(0.0, 1.0).flatten(2).split(CONVERTED, dim=2):
-        full = F.pad(part, (0, -part.shape[2] % VECTOR)).unsqueeze(2).contiguous()
-        parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
-    lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
-    return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
