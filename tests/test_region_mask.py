@@ -46,7 +46,7 @@ def test_the_regression_is_the_best_estimate_from_scribbles_and_the_frame() -> N
     source = InMemory(image)
     options = {"photometric_bandwidth": 0.2, "num_landmarks": 60, "patch_size": 1, "guide_channels": "all"}
     operator = nonlocal_operator(masks.region_guide(image), **options)
-    marked = masks._against(source.regions(front, "a"), 0, source.regions(back, "b")[0])
+    marked = masks._against(source.regions(front, "a"), 0, source.regions(back, "b"))
     held = InMemoryOperator(operator, source)
     places = masks.frame_places((20, 24))
     unlike = noise(1, 1, len(places), seed=4)
@@ -78,7 +78,7 @@ def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.Monkey
     weights = near * (np.exp(-matting.STEEPNESS * squares) + matting.LEAST)
     laplacian = np.diag(weights.sum(1)) - weights
     for k in range(2):
-        c = trust[0, k].flatten().numpy() * (matting.REFERENCE / height) ** 2
+        c = trust[0, k].flatten().numpy()
         expected = np.linalg.solve(laplacian + np.diag(c), c * rough[0, k].flatten().numpy())
         np.testing.assert_allclose(found[0, k].flatten(), expected, atol=1e-6)
 

@@ -5,6 +5,8 @@ compares colours, their surroundings and texture; a local solve then lays the bo
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -29,8 +31,8 @@ PLANES = 9  # of the guide
 SMOOTHNESS = 0.25  # of the regression
 FRAME = 64  # points along the upper or left border of a picture, about
 CONTRAST = 4.0  # with which a likelihood becomes a rough mask
-TRUST, CERTAIN = 0.02, 10.0  # confidence in the rough mask, and in scribbles
-COMPARED, LIKE = 512, 2.0  # scribbled pixels, about, that the frame is compared with; factor of the bandwidth for it
+TRUST, CERTAIN = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
+COMPARED = 512  # scribbled pixels, about, that the frame is compared with
 TINY = 1e-6
 
 
@@ -93,7 +95,7 @@ def region_mask(
         reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
             alike.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
-        spatial_bandwidth: in pixels; None is 0.8 of the short side, ``math.inf`` no limit: all that is alike anywhere.
+        spatial_bandwidth: in pixels; None is 0.6 of the short side, ``math.inf`` no limit: all that is alike anywhere.
         num_landmarks: M of the operator.
         **options: further ones of :func:`nonlocal_operator`, such as ``generator``.
 
@@ -127,19 +129,10 @@ def region_mask(
     )
 
 
-def fit_mask(
-    source: Source,
-    scribbles: Any,
-    background: Any = None,
-    *,
-    reach: float | Tensor = MASK.defaults["reach"],
-    spatial_bandwidth: float | Tensor | None = None,
-    **options: Any,
-) -> Fitted:
+def fit_mask(source: Source, scribbles: Any, background: Any = None, **options: Any) -> Fitted:
     """:func:`region_mask` for any source."""
     if source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
-    MASK["reach"].check_argument(reach, source.batch)
     inside = source.regions(scribbles, "scribbles")
     others = [] if background is None else source.regions(background, "background")
     if len(others) not in (0, 1, len(inside)):
@@ -147,40 +140,88 @@ def fit_mask(
             f"background must have 1 channel or one for each of the {len(inside)} regions, got {len(others)}; "
             "add or drop some"
         )
-    both = [_against(inside, k, others[k if len(others) > 1 else 0] if others else None) for k in range(len(inside))]
+    found = fit_regions(source, inside, others, **options)
+    if others and bool((found.around.detach() <= 0).any()):
+        raise ValueError(
+            "background must hold a painted pixel outside the scribbles of each region in every image, got none; "
+            "paint beside them, or leave it out"
+        )
+    return Fitted(found.planes, found.masks, found.margin, found.step)
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Masks of K regions, for an edit that needs them.
+
+    Attributes:
+        planes: of any pixels, what their masks are made from, (B, 3 K, h, W).
+        masks: from an image and these planes to the masks (B, K, h, W).
+        margin: how many pixels around a pixel its mask depends on.
+        levels: as of :func:`pyramid_levels`.
+        around: largest weight of what is scribbled as background of each region, (B, K).
+    """
+
+    planes: Planes
+    masks: Callable[[Tensor, Tensor], Tensor]
+    margin: int
+    levels: int
+    around: Tensor
+
+    @property
+    def step(self) -> int:
+        """See :attr:`Fitted.step`."""
+        return 1 << self.levels
+
+
+def fit_regions(
+    source: Source,
+    inside: list[Scribbles],
+    background: list[Scribbles],
+    *,
+    reach: float | Tensor = MASK.defaults["reach"],
+    spatial_bandwidth: float | Tensor | None = None,
+    **options: Any,
+) -> Regions:
+    """The masks of regions from the scribbles on each, and on the background of all of them or of each; or none.
+
+    Further arguments are those of :func:`region_mask`.
+    """
+    MASK["reach"].check_argument(reach, source.batch)
+    count, several = len(inside), len(background) > 1
+    both = [_against(inside, k, background[k : k + 1] if several else background) for k in range(count)]
 
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
-    options = defaults | {"patch_size": 1, "guide_channels": "all"} | options
+    options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
     options["num_landmarks"] = min(options["num_landmarks"], source.size[0] * source.size[1])
     if spatial_bandwidth is None or isinstance(spatial_bandwidth, Tensor) or spatial_bandwidth < math.inf:
         options["spatial_bandwidth"] = nearby(spatial_bandwidth, MASK["spatial_bandwidth"].share, source.size)
-    operator = source.operator(
-        Guide(options, look=region_guide, reach=MARGIN, planes=PLANES, spectral=True, sampled=True)
-    )
+    operator = source.operator(Guide(options, region_guide, MARGIN, PLANES, spectral=True, sampled=True))
     places = frame_places(source.size)
     frame, colours = operator.at(places), source.colours(places)
     rough = []
     for marked in both:
         alike = likeness(marked.image, marked.weights[:, 0], colours, options["photometric_bandwidth"])
         rough.append(_regression(source, operator, marked, frame, 1 - alike, reach))
-    count, short = len(both), min(source.size)
 
     def planes(pixels: Any) -> Tensor:
         marks = [marked.planes(pixels) for marked in both]
         parts = [*(of(pixels) for of in rough), *(m[:, :1] for m in marks), *(m[:, 1:] for m in marks)]
         return torch.cat(parts, dim=1)
 
-    def finish(image: Tensor, found: Tensor) -> Tensor:
+    short = min(source.size)
+    levels = pyramid_levels(short)
+
+    def masks(image: Tensor, found: Tensor) -> Tensor:
         likely, front, back = found.split(count, dim=1)
         return fit_borders(image, likely, front, back, short)
 
-    levels = pyramid_levels(short)
-    return Fitted(planes, finish, pyramid_margin(levels), 1 << levels)
+    around = torch.stack([marked.weights[:, 1].amax(1) for marked in both], dim=1)
+    return Regions(planes, masks, pyramid_margin(levels), levels, around)
 
 
-def _against(inside: list[Scribbles], number: int, background: Scribbles | None) -> Scribbles:
+def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:
     """The scribbles of a region and, as the second of two, those of all that is not in it."""
-    rest = [other for k, other in enumerate(inside) if k != number] + ([] if background is None else [background])
+    rest = [other for k, other in enumerate(inside) if k != number] + background
     own = inside[number]
     if not rest:
         return own.weighted(torch.cat([own.weights, torch.zeros_like(own.weights)], dim=1))
@@ -188,13 +229,7 @@ def _against(inside: list[Scribbles], number: int, background: Scribbles | None)
     for other in rest[1:]:
         joined = around.joined(other)
         around = joined.weighted(joined.weights.amax(1, keepdim=True))
-    found = own.joined(around)
-    if background is not None and bool((found.weights[:, 1].detach().amax(1) <= 0).any()):
-        raise ValueError(
-            "background must hold a painted pixel outside the scribbles of the region in every image, got none; "
-            "paint beside them, or leave it out"
-        )
-    return found
+    return own.joined(around)
 
 
 def frame_places(size: tuple[int, int]) -> Tensor:
@@ -221,7 +256,7 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
     """
     every = max(1, scribbled.shape[2] // COMPARED)
     some, counted = (t[..., ::every] for t in (scribbled, weights.detach() > 0))
-    scale = (LIKE * torch.as_tensor(bandwidth)).to(others).reshape(-1, 1, 1)
+    scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
     left, right = (lab_of(t.unsqueeze(2)).squeeze(2) for t in (others, some))
     squares = (left.unsqueeze(3) - right.unsqueeze(2)).square().mean(1) / scale.square()  # (B, k, n)
     alike = torch.exp(-squares) * counted.unsqueeze(1)
@@ -269,4 +304,5 @@ def fit_borders(image: Tensor, likely: Tensor, front: Tensor, back: Tensor, shor
     rough = (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)  # 0 and 1 stay as they are
     painted = front + back
     target = (rough * TRUST + front * CERTAIN) / (TRUST + painted * CERTAIN)
-    return solve_mask(image, target, TRUST + painted * CERTAIN, short)
+    solved = solve_mask(image, target, TRUST + painted * CERTAIN, short)
+    return solved * (1 - painted) + front

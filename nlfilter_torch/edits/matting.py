@@ -18,6 +18,9 @@ COARSEST = 48  # pixels of the short side on the coarsest level, at least
 LEVELS = 4  # at most, beside the picture itself
 STEEPNESS = 300.0  # of the weights, per mean squared difference of the channels
 LEAST = 1e-4  # weight of neighbours that differ as much as they can
+REFINED, CONTRAST = 2, 0.03  # rounds; difference of colours from which on they tell how much of each a pixel holds
+SIDES = 4  # coarsest pixels that the colours on either side of a border are averaged over, to each direction
+TINY = 1e-4  # weight of pixels that hardly belong to a side
 SHIFTS = ((0, 1), (1, -1), (1, 0), (1, 1))  # to half of the neighbours; the other half lies opposite
 REFERENCE = 112  # short side for which confidences are meant
 
@@ -39,13 +42,19 @@ def steps_on(level: int, levels: int) -> int:
     return STEPS[-1] if level == levels else STEPS[min(level, len(STEPS) - 1)]
 
 
+def sides_margin(levels: int) -> int:
+    """How many pixels around a pixel :func:`colours_beside` depends on."""
+    return (2 + SIDES) << levels
+
+
 def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor, short: int) -> Tensor:
     """The soft mask (B, K, H, W).
 
     Args:
         image: (B, C, H, W), C = 1 or 3.
         rough: t, (B, K, H, W).
-        confidence: c, (B, K, H, W), for a picture whose short side is :data:`REFERENCE`.
+        confidence: c, (B, K, H, W), for a picture whose short side is at most
+            :data:`REFERENCE`.
         short: pixels of the short side of the whole picture.
     """
     height, width = image.shape[-2:]
@@ -55,7 +64,7 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor, short: int) -> 
     pad = (0, -width % step, 0, -height % step)
     planes = torch.cat([image, confidence * rough, confidence], dim=1)
     planes = F.pad(planes, pad, "replicate")
-    scale = (REFERENCE / short) ** 2
+    scale = min(1.0, REFERENCE / short) ** 2
     pyramid = [planes]
     for _ in range(levels):
         pyramid.append(F.avg_pool2d(pyramid[-1], 2))
@@ -106,3 +115,47 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: list[Tensor], 
             to_there.addcmul_(weight, here)
         found = following * inverse
     return found
+
+
+def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Tensor]:
+    """The mean colours nearby of what is inside a mask and of what is outside, both (B, C, H, W).
+
+    Args:
+        image: (B, C, H, W).
+        mask: (B, 1, H, W).
+        levels: as of :func:`pyramid_levels`.
+    """
+    (height, width), step = image.shape[-2:], 1 << levels
+    weights = torch.cat([mask, 1 - mask], dim=1).pow(4) + TINY  # (B, 2, H, W)
+    planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
+    planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
+    coarse = F.avg_pool2d(planes, step)
+    size = 2 * SIDES + 1
+    # Along one axis after the other; nothing is outside the picture.
+    sums = F.avg_pool2d(coarse, (size, 1), 1, (SIDES, 0))
+    sums = F.avg_pool2d(sums, (1, size), 1, (0, SIDES))
+    both = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
+    if levels:
+        both = F.interpolate(both.flatten(1, 2), scale_factor=step, mode="bilinear", align_corners=False)
+    both = both.reshape(len(image), 2, image.shape[1], *both.shape[-2:])[..., :height, :width]
+    return both[:, 0], both[:, 1]
+
+
+def refine_mask(image: Tensor, mask: Tensor, levels: int) -> Tensor:
+    """A mask (B, 1, H, W) whose border pixels hold as much of the inside as their own colours say.
+
+    For things of one colour on grounds of another; of textures it would make patterns.
+
+    Args:
+        image: (B, C, H, W).
+        mask: (B, 1, H, W).
+        levels: as of :func:`colours_beside`.
+    """
+    for _ in range(REFINED):
+        inside, outside = colours_beside(image, mask, levels)
+        across = inside - outside
+        contrast = across.square().mean(1, keepdim=True)
+        share = ((image - outside) * across).mean(1, keepdim=True) / (contrast + TINY * CONTRAST)
+        trust = contrast / (contrast + CONTRAST**2) * (1 - (2 * mask - 1).pow(8))  # 0 and 1 are certain
+        mask = torch.lerp(mask, share.clamp(0.0, 1.0), trust)
+    return mask

@@ -260,10 +260,10 @@ DENOISE = Edit(
 
 RECOLOR = Edit(
     "recolor",
-    """Give things another colour: paint a little of it on one, and all that look alike take it.
+    """Give a thing another colour: paint a little of it on it, and the rest of it takes it, and its likes nearby.
 
-    Brightness stays as it is to the last bit, and so does whatever looks like none of the strokes. Photographs that fit
-    no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
+    Brightness stays as it is to the last bit, and so does whatever is beyond the borders of the thing. Photographs that
+    fit no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
 
     A red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
 
@@ -273,7 +273,7 @@ RECOLOR = Edit(
         Parameter(
             "reach",
             "number",
-            0.8,
+            0.6,
             "How far the colour spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
             0,
             0.999,
@@ -284,7 +284,7 @@ RECOLOR = Edit(
         Parameter(
             "tolerance",
             "number",
-            12.0,
+            8.0,
             "How different two colours may be and still count as alike, in units of CIE Lab.",
             1,
             100,
@@ -293,7 +293,7 @@ RECOLOR = Edit(
             former=(("bandwidth", 1.0),),
             slider=Slider("Tolerance", 3, 40, 1, live=False),
         ),
-        *_filter(patch_size=3)[1:],
+        *_filter(share=0.6, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
@@ -341,9 +341,9 @@ COLORIZE = Edit(
 
 DEFOCUS = Edit(
     "defocus",
-    """Blur a photograph as a wide aperture would, but for what you mark and all that looks like it nearby.
+    """Blur a photograph as a wide aperture would, but for the thing that you mark.
 
-    Mark some spots of each part that is to stay sharp; the rest of it is found.
+    Mark a spot of it, or of each of its parts; the rest of it is found.
 
     Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
     """,
@@ -367,9 +367,20 @@ DEFOCUS = Edit(
             domain="choice",
             choices=("disc", "gaussian"),
         ),
-        *_filter(bandwidth=25.0, share=0.2, patch_size=3),
+        Parameter(
+            "tolerance",
+            "number",
+            8.0,
+            "How different two colours may be and still count as alike, in units of CIE Lab.",
+            1,
+            100,
+            "lab",
+            argument="photometric_bandwidth",
+            former=(("bandwidth", 100 / 255),),
+        ),
+        *_filter(share=0.38, patch_size=1)[1:],
     ),
-    hint="Paint some of what is to stay sharp; what is unlike it or far away is blurred.",
+    hint="Paint some of what is to stay sharp; the rest of it is found, and what is around is blurred.",
     brushes=(("in", "Keep sharp"),),
     needs=True,
 )
@@ -407,7 +418,7 @@ MASK = Edit(
             "lab",
             argument="photometric_bandwidth",
         ),
-        *(p for p in _filter(share=0.8)[1:] if p.name != "patch_size"),
+        *(p for p in _filter(share=0.6)[1:] if p.name != "patch_size"),
     ),
 )
 
