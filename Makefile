@@ -71,6 +71,8 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.streaming_strokes --quick
 	$(BIN)/python -m benchmarks.streaming_cpu --quick
 	$(BIN)/python -m benchmarks.fuzz --cases 20
+	$(BIN)/python -m benchmarks.masks --quick
+	$(BIN)/python -m benchmarks.recolor --quick
 
 # A denoiser trained from nothing, and judged: weights, figures and a picture in out/denoiser.
 train: $(VENV)/.installed-test

@@ -43,6 +43,8 @@ def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, 
     else:
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif"))
         found = {path.stem: read_photograph(path).pixels for path in paths}
+    if not found:
+        raise SystemExit(f"{folder} must hold pictures (PNG, JPEG or TIFF), but holds none; name another folder")
     return {name: reduced_to(picture.expand(-1, 3, -1, -1), side) for name, picture in found.items()}
 
 

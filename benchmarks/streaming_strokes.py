@@ -22,8 +22,8 @@ from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
 from nlfilter_torch.edits.colorize import fit_colorize
-from nlfilter_torch.edits.colour import split_luminance
-from nlfilter_torch.edits.recolor import colour_guide, fit_recolor
+from nlfilter_torch.edits.colour import colour_guide, split_luminance
+from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_colorize, stream_recolor
 from nlfilter_torch.tiled.source import Tiled

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.edits.denoise import estimate_noise as estimate_noise
     from nlfilter_torch.edits.detail import enhance as enhance
     from nlfilter_torch.edits.frames import filter_frames as filter_frames
+    from nlfilter_torch.edits.mask import region_mask as region_mask
     from nlfilter_torch.edits.recolor import recolor as recolor
     from nlfilter_torch.edits.sharpen import sharpen as sharpen
     from nlfilter_torch.edits.tone import adjust_tone as adjust_tone
@@ -57,6 +58,7 @@ _DEFINES: dict[str, tuple[str, ...]] = {
     "edits.denoise": ("denoise", "estimate_noise"),
     "edits.detail": ("enhance",),
     "edits.frames": ("filter_frames",),
+    "edits.mask": ("region_mask",),
     "edits.recolor": ("recolor",),
     "edits.sharpen": ("sharpen",),
     "edits.tone": ("adjust_tone",),

@@ -5,9 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import defocus
-from nlfilter_torch.edits.defocus import fit_defocus, focus_map, largest_within
-from nlfilter_torch.edits.source import InMemory
-from tests.problems import box, cat, colour, noise
+from tests.problems import box, colour
 
 
 def gradient_energy(image: torch.Tensor, mask: torch.Tensor) -> float:
@@ -64,24 +62,3 @@ def test_odd_pixels_of_the_subject_do_not_bring_the_background_into_focus() -> N
 def test_flat_images_stay_flat() -> None:
     flat = torch.full((1, 3, 24, 30), 0.3)
     torch.testing.assert_close(defocus(flat, box(4, 4, size=(24, 30))), flat, atol=1e-5, rtol=0)
-
-
-def test_largest_within_reach() -> None:
-    planes = noise(2, 1, 17, 23)
-    for reach in (0, 1, 4):
-        wanted = F.max_pool2d(planes, 2 * reach + 1, stride=1, padding=reach)
-        assert torch.equal(largest_within(planes, reach), wanted)
-
-
-def test_a_coarse_smoothing_of_the_focus_is_nearly_the_fine_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on photographs of many megapixels, where every third, tenth or thirtieth pixel takes part in it."""
-    image = cat(1)  # 300x450
-    region = torch.zeros(1, 1, 300, 450)
-    region[..., 130:160, 200:240] = 1
-    source = InMemory(image)
-    likeness, painted = fit_defocus(source, region, num_landmarks=50).pixels(source).split(1, dim=1)
-    fine = focus_map(image, likeness, painted, 300)
-    monkeypatch.setattr("nlfilter_torch.edits.defocus.GUIDED", 4)
-    coarse = focus_map(image, likeness, painted, 300)
-    assert 0 < (coarse - fine).abs().mean() < 0.01
-    assert 0.05 < fine.mean() < 0.95

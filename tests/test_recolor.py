@@ -1,22 +1,10 @@
-"""Recolouring: which pixels take a colour and which keep theirs, and the groups, components and means behind it."""
+"""Recolouring: which pixels take a colour and which keep theirs, and the groups and means behind it."""
 
-import pytest
 import torch
 import torch.nn.functional as F
-from skimage.measure import label
 
-from nlfilter_torch import nonlocal_operator, recolor
-from nlfilter_torch.edits.colour import group_colours, region_means, split_luminance
-from nlfilter_torch.edits.components import (
-    MAX_COMPONENTS,
-    Scribbles,
-    correlations,
-    find_components,
-    label_components,
-    unit_vectors,
-)
-from nlfilter_torch.edits.recolor import colour_guide
-from nlfilter_torch.filtering.scribbles import walk_basis
+from nlfilter_torch import recolor
+from nlfilter_torch.edits.colour import colour_guide, group_colours, region_means, split_luminance
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
 
 
@@ -132,49 +120,3 @@ def test_means_of_regions_are_exact_on_large_images() -> None:
     image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)
     wanted = (image.double() * mask.double()).sum((2, 3)) / mask.double().sum()
     torch.testing.assert_close(region_means(image, mask)[:, 0].double(), wanted, rtol=0, atol=1e-7)
-
-
-def test_components_beyond_the_last_that_is_kept_apart_count_as_one() -> None:
-    image = colour("astronaut")
-    operator = nonlocal_operator(image, num_landmarks=40, photometric_bandwidth=0.2, guide_channels="all")
-    dots = torch.zeros(1, 2, 64, 64)
-    dots[:, 0, 1::4, 1::4], dots[:, 1, 3::16, 3::16] = 0.5, 1.0  # 256 and 16
-    places = dots.sum((0, 1)).flatten().nonzero().squeeze(1)
-    scribbles = Scribbles(places, dots.flatten(2)[:, :, places], image.flatten(2)[:, :, places])
-    basis, factor = walk_basis(operator.spectrum(), 0.5).float(), operator.factor
-    blocks = factor[:, :, places].split(50, dim=2)
-    (found,) = find_components(scribbles, lambda: blocks, basis, (64, 64))
-    assert found.owners.sum(0).tolist() == [MAX_COMPONENTS, 16]
-    torch.testing.assert_close(found.between.diagonal(), torch.ones(MAX_COMPONENTS + 16), atol=1e-4, rtol=0)
-    each = correlations(basis[0], found.means, factor[0])
-    assert each.abs().max() <= 1 + 1e-3
-    single = dots[0, 1].flatten() > 0  # a dot correlates with itself fully
-    torch.testing.assert_close(each[MAX_COMPONENTS:, single].diagonal(), torch.ones(16), atol=1e-3, rtol=0)
-
-
-def test_components_are_those_of_scikit_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.edits.components.MAX_COMPONENTS", 10**9)
-    for number, size in enumerate([(1, 1), (1, 9), (9, 1), (7, 8), (40, 31)]):
-        for density in (0.1, 0.3, 0.5, 0.8, 1.0):
-            planes = torch.rand(3, *size, generator=torch.Generator().manual_seed(number)) < density
-            planes[0, 0, 0] = True
-            regions, places = planes.flatten(1).nonzero().unbind(1)
-            labels, owners = label_components(places, regions, size)
-            parts = [label(plane.numpy(), connectivity=2) for plane in planes]
-            counts = torch.tensor([part.max() for part in parts])
-            offsets = counts.cumsum(0) - counts - 1
-            wanted = torch.cat([torch.from_numpy(p[p > 0]) + o for p, o in zip(parts, offsets, strict=True)])
-            assert torch.equal(labels, wanted)
-            assert torch.equal(owners, torch.arange(3).repeat_interleave(counts))
-
-
-def test_products_along_directions_are_those_of_unit_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Block by block, gradients too."""
-    monkeypatch.setattr("nlfilter_torch.edits.components.CACHED", 1)  # blocks of 256 pixels
-    basis, factor, directions = (noise(*shape).requires_grad_() for shape in ((5, 5), (5, 700), (3, 5)))
-    found = correlations(basis, directions, factor)
-    wanted = directions @ unit_vectors(basis, factor)
-    torch.testing.assert_close(found, wanted, atol=1e-12, rtol=0)
-    slopes = [torch.autograd.grad((y * noise(3, 700)).sum(), [basis, factor, directions]) for y in (found, wanted)]
-    for a, b in zip(*slopes, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-9, rtol=0)

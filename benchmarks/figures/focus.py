@@ -7,10 +7,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
-from nlfilter_torch import defocus
-from nlfilter_torch.edits.defocus import blur_by, fit_defocus, focus_map
+from nlfilter_torch import defocus, region_mask
+from nlfilter_torch.edits.defocus import blur_behind, focus_of
 from nlfilter_torch.edits.parameters import DEFOCUS
-from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.plotting import show_images
 
 PORTRAIT: tuple[Box, ...] = (
@@ -39,7 +38,7 @@ NEAR, FAR = 5.0, 14.0  # in pixels of disparity from the tank's: the subject, an
 def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     """In focus is what the yellow spots touch, and what is like them and near; the depth of the second scene is known.
 
-    Blur grows as the map falls. (h) is blurred by the depth that a stereo camera measured. Gradient energy is that of
+    (h) is blurred by the depth that a stereo camera measured. Gradient energy is that of
     the result over that of the photograph.
     """
     portrait, scale = scene("astronaut", size)
@@ -56,9 +55,8 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     disparity = _disparity(image)
     distance = (disparity - disparity[region > 0].median()).abs()
     lens = defocus(image, region)
-    true = blur_by(
-        image, ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1), DEFOCUS["radius"].pixels(None, image.shape[-2:]), "disc"
-    )
+    blur = ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1)
+    true = blur_behind(image, 1 - blur, DEFOCUS["radius"].pixels(None, image.shape[-2:]), "disc")
     panels |= {
         "(e) photograph and spots": marked(image, region),
         "(f) focus map": default_map(image, region),
@@ -79,9 +77,8 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 def default_map(image: Tensor, region: Tensor) -> Tensor:
     """The map that the defaults of defocus make."""
-    source = InMemory(image)
-    likeness, painted = fit_defocus(source, region).pixels(source).split(1, dim=1)
-    return focus_map(image, likeness, painted, min(source.size))
+    share = DEFOCUS["spatial_bandwidth"].share * min(image.shape[-2:])
+    return focus_of(region_mask(image, region, spatial_bandwidth=share))
 
 
 def _disparity(image: Tensor) -> Tensor:

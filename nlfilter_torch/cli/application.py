@@ -19,6 +19,7 @@ from nlfilter_torch.cli.fit import fit
 from nlfilter_torch.cli.frames import frames
 from nlfilter_torch.cli.inspect import inspect
 from nlfilter_torch.cli.interrupts import INTERRUPTED, tell
+from nlfilter_torch.cli.mask import mask
 from nlfilter_torch.cli.presets import presets
 from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 from nlfilter_torch.edits.parameters import EDITS
@@ -57,6 +58,7 @@ app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", 
 app.command(name="app", cls=Verb)(app_verb)
 for _edit in EDITS.values():
     app.command(name=_edit.name, cls=Verb)(command(_edit))
+app.command(name="mask", cls=Verb)(mask)
 for _verb in (apply, fit, presets, batch, frames, inspect, demo):
     app.command(cls=Verb)(_verb)
 

@@ -54,6 +54,7 @@ SCRIBBLES: dict[str, dict[str, Any]] = {
     "recolor": {"strokes": options.StrokesFile, "region": options.ColourRegions, "keep": options.Keeps},
     "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions},
     "defocus": {"region": options.Regions, "mask": options.MaskFile},
+    "mask": {"region": options.Regions, "background": options.Backgrounds, "mask": options.MaskFile},
 }
 
 

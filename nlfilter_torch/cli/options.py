@@ -142,6 +142,14 @@ Regions = Annotated[
         "times.",
     ),
 ]
+Backgrounds = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--background",
+        metavar="X,Y,W,H",
+        help="A rectangle of what is around, where the mask takes in too much. May be given several times.",
+    ),
+]
 SliderRegions = Annotated[
     list[str] | None,
     typer.Option(

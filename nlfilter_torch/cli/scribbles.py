@@ -121,11 +121,11 @@ def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tup
     """Scribbles and masks from the options of an edit, in the form of :func:`scribbles_of`, as rows."""
     mask, regions = given.get("mask"), given.get("region")
     if step.edit in ("recolor", "colorize"):
-        keep = _selection(size, None, given.get("keep"), "--keep", read)
+        keep = selection(size, None, given.get("keep"), "--keep", read)
         strokes = _strokes(size, given.get("strokes"), regions, read)
         return (strokes, None), {} if keep is None else {"keep": keep}
     if step.edit == "defocus":
-        focus = _selection(size, mask, regions, "--region", read)
+        focus = selection(size, mask, regions, "--region", read)
         if focus is None:
             raise ValueError(
                 "give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60"
@@ -165,7 +165,7 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
     return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles)
 
 
-def _selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
+def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
     """A single region from a mask file and the rectangles of an option, or None if neither is given."""
     rectangles = []
     for text in texts or []:

@@ -4,12 +4,16 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.features import reduce_channels
 
 ROOM = 0.9  # share of the room towards white or black that a channel may take, so that rounding does not clip it
+LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
+CONVERTED = 8192  # pixels that one thread converts at once
+VECTOR = 64  # a multiple of the floats that a processor works on at once
 Limits = Literal["soft", "none"]
 
 
@@ -162,3 +166,19 @@ def nearby(given: float | Tensor | None, share: float, size: Sequence[int]) -> f
     A share, so that a preview and the photograph agree.
     """
     return share * min(size) if given is None else given
+
+
+def colour_guide(image: Tensor) -> Tensor:
+    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour.
+
+    To the last bit the same for a pixel wherever it stands, so that landmarks are the same for a picture read by rows.
+    """
+    from kornia.color import rgb_to_lab  # kornia takes half a second to import
+
+    # Powers round differently in the odd pixels that are left over at the end of a tensor, or of a thread's part of it.
+    parts = []
+    for part in image.clamp(0.0, 1.0).flatten(2).split(CONVERTED, dim=2):
+        full = F.pad(part, (0, -part.shape[2] % VECTOR)).unsqueeze(2).contiguous()
+        parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
+    lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
+    return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)

@@ -4,24 +4,19 @@ import math
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby
-from nlfilter_torch.edits.components import Components, correlations, find_components
+from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
-from nlfilter_torch.edits.source import Fitted, Guide, Source, edited
-from nlfilter_torch.filtering.scribbles import walk_basis
+from nlfilter_torch.edits.source import Fitted, Source, edited
 
 Aperture = Literal["disc", "gaussian"]
 
-REACH = 0.7  # of the correlations with the spots of the focus region
-CLOSING, SMOOTHING = 0.015, 0.04  # sizes, as shares of the short side, of the gaps in a focus map that are filled
-GUIDED = 12  # radius of the smoothing, in pixels, from twice of which on it takes every other one and fewer
-BLURRED, SHARP = 0.15, 0.45  # likeness below BLURRED gets the whole blur, above SHARP none
-STEPS = (0.1, 0.25, 0.5, 1.0)  # blurs that others are mixed from, as shares of the radius
+BLURRED, SHARP = 0.1, 0.4  # a mask below BLURRED is all background, above SHARP all subject: a doubt is kept sharp
+LEAST = 1e-5  # weight of the subject in the blur of what is behind it
 
 
 @full_precision
@@ -36,22 +31,21 @@ def defocus(
     patch_size: int = DEFOCUS.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
-    """Blur what is unlike, or far from, a region that stays in focus.
+    """Blur what is behind a subject that stays in focus.
 
-    Paper: Sec. V-C, eq. (18), Fig. 17. The sharp part does not bleed into the blurred one: each pixel is mixed from
-    pixels that are blurred as much as itself.
+    Paper: Sec. V-C, Fig. 17, with :func:`region_mask` in place of its mask. The subject does not bleed into the blur,
+    which is that of the background alone.
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp; connected components
-            may differ in colour, and each stands for what most of it covers.
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp.
         radius: of the strongest blur, in pixels, at most half the short side; None is 2.5 % of it.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
             variance.
-        photometric_bandwidth: h_y of eq. (18), in units of the image.
-        spatial_bandwidth: h_x of eq. (18), in pixels; None is 0.2 of the short side.
+        photometric_bandwidth: as of :func:`region_mask`, in hundredths of Lab.
+        spatial_bandwidth: likewise, in pixels; None is 0.38 of the short side.
         patch_size: of the patches that are compared.
-        **options: further ones of :func:`nonlocal_operator`, such as ``num_landmarks`` or ``generator``.
+        **options: further ones of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
 
     Returns:
         (B, C, H, W), equal to ``image`` to rounding where it is in focus, within its range. Differentiable in image and
@@ -103,96 +97,34 @@ def fit_defocus(
     check_reach(reach, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
     options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
-    options |= {
-        "spatial_bandwidth": nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size),
-        "guide_channels": "all",
-    }
-    operator = source.operator(Guide(options, spectral=True))
-    basis = walk_basis(operator.pairs, REACH).to(source.dtype)
-    found = find_components(scribbles, operator.at(scribbles.places), basis, source.size)
-    likeness = operator.each(
-        lambda columns: torch.stack([_best(*of) for of in zip(basis, found, columns.factor, strict=True)]).unsqueeze(1)
-    )
-    short = min(source.size)
+    spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
+    found = fit_regions(source, [scribbles], [], spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, planes: Tensor) -> Tensor:
-        return blur_by(image, 1 - focus_map(image, planes[:, :1], planes[:, 1:], short), reach, aperture)
+        return blur_behind(image, focus_of(found.masks(image, planes)), reach, aperture)
 
-    margin, step = focus_margin(short) + _kernel_radius(reach, aperture), _every(math.ceil(SMOOTHING * short))
-    return Fitted(
-        lambda pixels: torch.cat([likeness(pixels), scribbles.planes(pixels)], dim=1),
-        finish,
-        -(-margin // step) * step,
-        step,
-    )
+    beyond = -(-_kernel_radius(reach, aperture) // found.step) * found.step
+    return Fitted(found.planes, finish, found.margin + beyond, found.step)
 
 
-def focus_margin(short: int) -> int:
-    """How many pixels around a pixel its focus depends on, in a picture whose short side has so many."""
-    closing, smoothing = math.ceil(CLOSING * short), math.ceil(SMOOTHING * short)
-    return 2 * closing - 1 + (2 * (smoothing + _every(smoothing)) if smoothing < short else 0)
+def focus_of(mask: Tensor) -> Tensor:
+    """How much of a pixel is in focus, from the mask (B, 1, H, W) of the subject."""
+    return ((mask - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
 
 
-def _every(radius: int) -> int:
-    """Every how many pixels a smoothing of that radius takes one."""
-    return max(1, radius // GUIDED)
-
-
-def focus_map(image: Tensor, likeness: Tensor, focus_region: Tensor, short: int) -> Tensor:
-    """How much every pixel belongs to what is in focus, (B, 1, H, W) in [0, 1]; the paper's mask, for many components.
-
-    A pixel is in focus if it correlates with any component of the region. Gaps are closed, and borders follow the
-    image's.
+def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture) -> Tensor:
+    """An image whose background is blurred, from pixels of the background alone, and mixed with itself by a soft mask.
 
     Args:
         image: (B, C, H, W).
-        likeness: largest correlation with a component of the region, (B, 1, H, W).
-        focus_region: weights of the region, (B, 1, H, W).
-        short: pixels of the short side of the whole picture.
+        focus: how much of a pixel is in focus, (B, 1, H, W).
+        radius: of the blur.
+        aperture: see :func:`defocus`.
     """
-    from kornia.filters import guided_blur  # kornia takes half a second to import
-
-    share = ((likeness - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
-    focus = torch.maximum(share * share * (3 - 2 * share), focus_region)
-    radius = math.ceil(CLOSING * short)
-    # One pixel less back than forth: a patch across a border is like neither side, and would cost the subject its rim.
-    closed = -largest_within(-largest_within(focus, radius), radius - 1)
-    radius = math.ceil(SMOOTHING * short)
-    if radius < short:  # reflection needs as many pixels
-        every = _every(radius)
-        window = 2 * (radius // every) * every + 1
-        height, width = image.shape[-2:]
-        # A multiple of the step keeps the pixels that take part evenly spaced, in tiles the same as in the whole.
-        guide, rough = (F.pad(p, (0, -width % every, 0, -height % every), "replicate") for p in (image, closed))
-        smooth = guided_blur(guide, rough, window, eps=1e-4, subsample=every, separable=True)
-        closed = smooth[..., :height, :width]
-    return torch.maximum(closed.clamp(0.0, 1.0), focus_region)
-
-
-def largest_within(planes: Tensor, reach: int) -> Tensor:
-    """The largest value (B, 1, H, W) within ``reach`` pixels along both axes."""
-    rows = F.max_pool2d(planes, (1, 2 * reach + 1), stride=1, padding=(0, reach))
-    return F.max_pool2d(rows, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
-
-
-def _best(basis: Tensor, components: Components, factor: Tensor) -> Tensor:
-    """Largest correlation (n,) of the columns (M, n) with a component, a few components at a time."""
-    return torch.stack([correlations(basis, few, factor).amax(0) for few in components.means.split(8)]).amax(0)
-
-
-def blur_by(image: Tensor, amount: Tensor, radius: float, aperture: Aperture) -> Tensor:
-    """Blur every pixel by ``amount`` (B, 1, H, W) in [0, 1] of the radius, from pixels that are blurred themselves."""
-    result, below = image, 0.0
-    for step in STEPS:
-        # Sharper pixels take less part, so that the subject leaves no glow on what is behind it; the small share that
-        # is left to them matters only where there is nothing else.
-        weight = (amount / step).clamp(0.1, 1.0).square()
-        kernel = _kernel(step * radius, aperture).to(image)
-        sums = _convolve(torch.cat([image * weight, weight], dim=1), kernel)
-        blurred = sums[:, :-1] / sums[:, -1:]
-        result = torch.lerp(result, blurred, ((amount - below) / (step - below)).clamp(0.0, 1.0))
-        below = step
-    return result
+    behind = (1 - focus).square() + LEAST  # the least matters only where there is nothing else
+    sums = _convolve(torch.cat([image * behind, behind], dim=1), _kernel(radius, aperture).to(image))
+    blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
+    return torch.where(focus == 1, image, blurred)
 
 
 def _kernel_radius(radius: float, aperture: Aperture) -> int:

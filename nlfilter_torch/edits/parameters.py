@@ -310,10 +310,10 @@ DENOISE = Edit(
 
 RECOLOR = Edit(
     "recolor",
-    """Give things another colour: paint a little of it on one, and all that look alike take it.
+    """Give a thing another colour: paint a little of it on it, and the rest of it takes it, and its likes nearby.
 
-    Brightness stays as it is to the last bit, and so does whatever looks like none of the strokes. Photographs that fit
-    no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
+    Brightness stays as it is to the last bit, and so does whatever is beyond the borders of the thing. Photographs that
+    fit no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
 
     A red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
 
@@ -323,7 +323,7 @@ RECOLOR = Edit(
         Parameter(
             "reach",
             "number",
-            0.8,
+            0.6,
             "How far the colour spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
             0,
             0.999,
@@ -334,7 +334,7 @@ RECOLOR = Edit(
         Parameter(
             "tolerance",
             "number",
-            12.0,
+            8.0,
             "How different two colours may be and still count as alike, in units of CIE Lab.",
             1,
             100,
@@ -343,7 +343,7 @@ RECOLOR = Edit(
             former=(("bandwidth", 1.0),),
             slider=Slider("Tolerance", 3, 40, 1, live=False),
         ),
-        *_filter(patch_size=3)[1:],
+        *_filter(share=0.6, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
@@ -391,9 +391,9 @@ COLORIZE = Edit(
 
 DEFOCUS = Edit(
     "defocus",
-    """Blur a photograph as a wide aperture would, but for what you mark and all that looks like it nearby.
+    """Blur a photograph as a wide aperture would, but for the thing that you mark.
 
-    Mark some spots of each part that is to stay sharp; the rest of it is found.
+    Mark a spot of it, or of each of its parts; the rest of it is found.
 
     Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
     """,
@@ -417,11 +417,59 @@ DEFOCUS = Edit(
             domain="choice",
             choices=("disc", "gaussian"),
         ),
-        *_filter(bandwidth=25.0, share=0.2, patch_size=3),
+        Parameter(
+            "tolerance",
+            "number",
+            8.0,
+            "How different two colours may be and still count as alike, in units of CIE Lab.",
+            1,
+            100,
+            "lab",
+            argument="photometric_bandwidth",
+            former=(("bandwidth", 100 / 255),),
+        ),
+        *_filter(share=0.38, patch_size=1)[1:],
     ),
-    hint="Paint some of what is to stay sharp; what is unlike it or far away is blurred.",
+    hint="Paint some of what is to stay sharp; the rest of it is found, and what is around is blurred.",
     brushes=(("in", "Keep sharp"),),
     needs=True,
+)
+
+MASK = Edit(
+    "mask",
+    """Select a thing: a soft mask of it from a scribble on it, or from a rough mask.
+
+    Mark some of it and, where the mask takes in too much, some of what is around. Masks are grey pictures of the
+    photograph's size, white inside: 8 bits in PNG files, 16 in TIFF files, floats in PFM files, which darktable and ART
+    read as raster masks.
+
+    Example: `nlfilter-torch mask in.jpg mask.png --region 190,60,60,60 --background 10,10,40,40`
+
+    A rough mask to a soft one: `nlfilter-torch mask in.jpg mask.tif --mask rough.png`
+    """,
+    (
+        Parameter(
+            "reach",
+            "number",
+            0.6,
+            "How far a region spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+            0,
+            0.999,
+            domain="below 1",
+            metavar="0...1",
+        ),
+        Parameter(
+            "tolerance",
+            "number",
+            8.0,
+            "How different two colours may be and still count as alike, in units of CIE Lab.",
+            1,
+            100,
+            "lab",
+            argument="photometric_bandwidth",
+        ),
+        *(p for p in _filter(share=0.6)[1:] if p.name != "patch_size"),
+    ),
 )
 
 ABSTRACT = Edit(

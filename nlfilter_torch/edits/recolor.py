@@ -4,25 +4,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance
-from nlfilter_torch.edits.components import Components, Scribbles, correlations, find_components
+from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.edits.mask import fit_regions
+from nlfilter_torch.edits.matting import REFINED, colours_beside, refine_mask, sides_margin
 from nlfilter_torch.edits.parameters import RECOLOR
-from nlfilter_torch.edits.source import Fitted, Guide, Source, edited
-from nlfilter_torch.filtering.scribbles import walk_basis
+from nlfilter_torch.edits.source import Fitted, Source, edited
 
-LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
-FAINT, FULL = 0.2, 0.5  # likeness below FAINT leaves a pixel as it is, above FULL it takes the whole colour
-DOUBT = 0.05  # variance of what a component tells, in units of a pixel's own: two colours on one thing are no error
+FAINT, FULL = 0.2, 0.5  # a mask below FAINT leaves a pixel as it is, above FULL it takes the whole colour
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
-
-CONVERTED = 8192  # pixels that one thread converts at once
-VECTOR = 64  # a multiple of the floats that a processor works on at once
 
 
 @full_precision
@@ -37,11 +32,9 @@ def recolor(
     patch_size: int = RECOLOR.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
-    """Give the colour of strokes to everything that looks like the spots they are painted on.
+    """Give the colour of strokes to the thing that they are painted on, and to what looks like it around it.
 
-    Paper: Sec. V-A, with a regression on correlations in place of k-means: it is soft, and any number of spots with any
-    number of colours divide the image among them. A spot, which is paint of one colour without a gap, stands for what
-    most of it covers, and takes its colour all over. Hue and saturation count before lightness, in CIE Lab.
+    Paper: Sec. V-A, with :func:`region_mask` in place of k-means: any number of colours divide the image among them.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
@@ -52,9 +45,9 @@ def recolor(
             over it.
         reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
             alike.
-        photometric_bandwidth: in hundredths of Lab: 0.12 is 12 units.
+        photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         patch_size: of the patches that are compared.
-        **options: further ones of :func:`nonlocal_operator`, such as ``spatial_bandwidth``, ``num_landmarks`` or
+        **options: further ones of :func:`region_mask`, such as ``spatial_bandwidth``, ``num_landmarks`` or
             ``generator``.
 
     Returns:
@@ -103,19 +96,16 @@ def fit_recolor(
 
     colours, regions, counts = _grouped(scribbles)
     old = region_means(split_luminance(scribbles.image.unsqueeze(2))[1], regions.unsqueeze(2))
-    marked = scribbles.weighted(regions * counts.unsqueeze(2))
-    marked = marked if kept is None else marked.joined(kept)
-
+    inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
     options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
-    operator = source.operator(Guide({**options, "guide_channels": "all"}, look=colour_guide, spectral=True))
-    basis = walk_basis(operator.pairs, reach).to(source.dtype)
-    found = find_components(marked, operator.at(marked.places), basis, source.size)
-    directions = [divide(components) for components in found]
-    likeness = operator.each(
-        lambda columns: torch.stack([correlations(*of) for of in zip(basis, directions, columns.factor, strict=True)])
+    found = fit_regions(source, inside, [] if kept is None else [kept], reach=reach, **options)
+    change = Recoloring(colours, old, counts, found.levels)
+    return Fitted(
+        found.planes,
+        lambda image, planes: change(image, found.masks(image, planes)),
+        found.margin + (REFINED + 1) * sides_margin(found.levels),
+        found.step,
     )
-    change = Recoloring(colours, old)
-    return Fitted(lambda pixels: change(pixels.image, likeness(pixels), marked.planes(pixels)))
 
 
 def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
@@ -128,65 +118,39 @@ def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Recoloring:
-    """What scribbles of K colours make of any pixel, given how similar it is to what they cover.
+    """What scribbles of K colours make of an image, given the masks of what they are to colour.
+
+    A pixel on a soft border shows some of the thing and some of what is behind it. The part that is of the thing takes
+    the new colour, so that no rim of the old one is left.
 
     Attributes:
         colours: chroma of the strokes, (B, K, 3).
         old: mean chroma of what they are painted on, (B, K, 3).
+        counts: which of these an image has, (B, K).
+        levels: as of :func:`colours_beside`.
     """
 
     colours: Tensor
     old: Tensor
+    counts: Tensor
+    levels: int
 
-    def __call__(self, pixels: Tensor, likeness: Tensor, marked: Tensor) -> Tensor:
-        """Pixels (B, 3, H, W) in their new colours.
-
-        Args:
-            pixels: RGB.
-            likeness: to each region, (B, K, H, W), and maybe to one more that stays as it is.
-            marked: weights (B, K or K+1, H, W) of what is painted, and kept.
-        """
-        count = self.colours.shape[1]
-        shares = ((likeness[:, :count] - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0)
-        shares = shares * shares * (3 - 2 * shares)  # no edge where the colour sets in
+    def __call__(self, pixels: Tensor, masks: Tensor) -> Tensor:
+        """Pixels (B, 3, H, W) in their new colours, under masks (B, K, H, W)."""
+        shares = ((masks - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0) * self.counts[..., None, None]
         shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
-        # Scribbled pixels take the colour of the scribble, whatever they look like.
-        shares = shares * (1 - marked.sum(1, keepdim=True)) + marked[:, :count]
-
-        # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
-        # saturation.
         luminance, chroma = split_luminance(pixels)
-        usual = self.old.square().sum(2)[..., None, None]  # squared saturation, (B, K, 1, 1)
-        product = (usual * chroma.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
-        relative = (product + SATURATION**2) / (usual + SATURATION**2)
-        new = torch.einsum("bkhw,bkc->bchw", shares * relative.clamp(0.0, 1.5), self.colours)
-        chroma = chroma * (1 - shares.sum(1, keepdim=True)) + new
-        untouched = (shares.sum(1, keepdim=True) == 0).expand_as(pixels)
-        return torch.where(untouched, pixels, merge_luminance(luminance, chroma))
-
-
-def divide(components: Components) -> Tensor:
-    """The vectors (K, M) whose products with a pixel's say how much it resembles one region rather than the others.
-
-    The components share a pixel, about 0 to 1, by the best linear estimate of its region from its correlations with
-    them, so that regions that resemble each other are told apart by what they do not share.
-    """
-    doubtful = components.between.double() + DOUBT * torch.eye(len(components.means)).to(components.means)
-    solved = torch.cholesky_solve(components.owners.double(), torch.linalg.cholesky_ex(doubtful).L)
-    return solved.mT.to(components.means) @ components.means
-
-
-def colour_guide(image: Tensor) -> Tensor:
-    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour.
-
-    To the last bit the same for a pixel wherever it stands, so that landmarks are the same for a picture read by rows.
-    """
-    from kornia.color import rgb_to_lab  # kornia takes half a second to import
-
-    # Powers round differently in the odd pixels that are left over at the end of a tensor, or of a thread's part of it.
-    parts = []
-    for part in image.clamp(0.0, 1.0).flatten(2).split(CONVERTED, dim=2):
-        full = F.pad(part, (0, -part.shape[2] % VECTOR)).unsqueeze(2).contiguous()
-        parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
-    lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
-    return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
+        change, total = torch.zeros_like(chroma), torch.zeros_like(luminance)
+        for k in range(shares.shape[1]):
+            share = refine_mask(chroma, shares[:, k : k + 1], self.levels)
+            inside, outside = colours_beside(chroma, share, self.levels)
+            thing = chroma + (1 - share) * (inside - outside)  # its part of a mixed pixel; all of one inside
+            # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
+            # saturation.
+            usual = self.old[:, k].square().sum(1)[:, None, None, None]  # squared saturation
+            product = (usual * thing.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
+            relative = (product + SATURATION**2) / (usual + SATURATION**2)
+            change = change + share * (relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None] - thing)
+            total = total + share
+        untouched = (total == 0).expand_as(pixels)
+        return torch.where(untouched, pixels, merge_luminance(luminance, chroma + change))

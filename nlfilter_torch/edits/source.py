@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 import torch.nn.functional as F
@@ -29,7 +29,9 @@ from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
-from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum
+from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum, compute_grams
+
+SAMPLE = 1 << 15  # pixels whose sums stand for those of all, where an edit allows it
 
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
@@ -40,32 +42,43 @@ class Guide:
 
     Attributes:
         options: of :func:`nonlocal_operator`.
-        look: makes the guide from an image (B, C, H, W), pixel by pixel; None takes the image.
+        look: makes the guide from an image (B, C, H, W); None takes the image.
+        reach: how many pixels around a pixel ``look`` depends on.
+        planes: channels of the guide; None is as many as the image has.
         blur: standard deviation in pixels of a Gaussian that the guide is blurred by.
         spectral: whether the edit takes sums along eigenvectors.
+        sampled: whether a sample of the pixels may stand for all in these sums, as far as memory does not allow all.
         exact: whether it takes what eigenvectors capture of single pixels, which depends on rare pixels that a sample
             lacks.
     """
 
     options: Mapping[str, Any]
     look: Callable[[Tensor], Tensor] | None = None
+    reach: int = 0
+    planes: int | None = None
     blur: float = 0.0
     spectral: bool = False
+    sampled: bool = False
     exact: bool = False
 
     @property
     def margin(self) -> int:
         """How many pixels around a pixel its value depends on."""
+        return self.reach + self.blur_margin
+
+    @property
+    def blur_margin(self) -> int:
+        """The same for the blur alone."""
         return math.ceil(2.5 * self.blur)
 
     def __call__(self, image: Tensor) -> Tensor:
         """The guide of an image (B, C, H, W) of any size."""
         guide = image if self.look is None else self.look(image)
-        if self.margin == 0:
+        if self.blur_margin == 0:
             return guide
         from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
 
-        margin = self.margin
+        margin = self.blur_margin
         size, padded = 2 * margin + 1, pad_border(guide, margin)
         blurred = gaussian_blur2d(padded, (size, size), (self.blur, self.blur))
         return blurred[..., margin:-margin, margin:-margin]
@@ -143,6 +156,12 @@ class Source(Protocol):
     def all(self, fitted: "Fitted") -> Tensor:
         """The planes (B, C, H, W) that an edit makes of all pixels, for pictures that are small enough."""
 
+    def regions(self, masks: Any, name: str) -> list[Scribbles]:
+        """Scribbles of several regions, one after the other, each as :meth:`scribbles` has them."""
+
+    def colours(self, places: Tensor) -> Tensor:
+        """The colours (B, C, n) of single pixels, numbered along the rows in ascending order."""
+
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
@@ -176,17 +195,21 @@ class InMemory:
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """:func:`nonlocal_operator` of the guide."""
-        key = (guide.blur, *((name, value) for name, value in sorted(guide.options.items()) if name != "generator"))
+        key = (
+            guide.look,
+            guide.blur,
+            *((name, value) for name, value in sorted(guide.options.items()) if name != "generator"),
+        )
         if self.kept is not None and key in self.kept:
             return self.kept[key]
-        operator = InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self)
+        operator = InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
         if self.kept is not None and not any(isinstance(value, Tensor) for value in guide.options.values()):
             self.kept[key] = operator
         return operator
 
     def masks(self, guide: Guide, regions: Tensor, negative: Tensor | None, *, time: Any, width: Any) -> Planes:
         """:func:`diffusion_mask`."""
-        spectrum = self.operator(guide).pairs
+        spectrum = cast(Spectrum, self.operator(guide).pairs)
         masks = diffusion_mask(spectrum, regions.to(self.image), time=time, width=width, negative=negative)
         return lambda _: masks
 
@@ -228,6 +251,15 @@ class InMemory:
         planes = fitted.pixels(self)
         return planes if fitted.finish is None else fitted.finish(self.image, planes)
 
+    def colours(self, places: Tensor) -> Tensor:
+        """Some pixels."""
+        return self.image.flatten(2)[:, :, places]
+
+    def regions(self, masks: Tensor, name: str) -> list[Scribbles]:
+        """From a tensor (B, K, H, W)."""
+        check_image(masks, name, batch=self.batch)
+        return [self.scribbles(mask, None, name) for mask in masks.split(1, dim=1)]
+
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
         return planes(self).mean((2, 3), keepdim=True)
@@ -248,15 +280,26 @@ class InMemoryOperator:
     Attributes:
         operator: W.
         source: the image.
+        sampled: whether the spectrum may be that of a sample of the pixels.
     """
 
     operator: NonlocalOperator
     source: InMemory
+    sampled: bool = False
 
     @cached_property
-    def pairs(self) -> Spectrum:
-        """The spectrum."""
-        return self.operator.spectrum()
+    def pairs(self) -> RitzPairs:
+        """The spectrum, without pixels if it is that of a sample."""
+        factor, remainder = self.operator.factor, self.operator.remainder
+        count = factor.shape[2]
+        if not self.sampled or count <= SAMPLE:
+            return self.operator.spectrum()
+        some = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].to(factor.device)
+        scaling, rest = self.operator.scaling[:, some].double(), None
+        if remainder is not None:
+            rest = remainder[:, some].double()
+        grams = compute_grams(factor[:, :, some].double(), scaling, rest, 1 if rest is None else 2)
+        return RitzPairs.of_sums(grams * (count / SAMPLE), factor.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """All planes."""
@@ -271,7 +314,7 @@ class InMemoryOperator:
 
     def coefficients(self, planes: Planes) -> Tensor:
         """:meth:`Spectrum.coefficients`."""
-        return self.pairs.coefficients(planes(self.source))
+        return cast(Spectrum, self.pairs).coefficients(planes(self.source))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""

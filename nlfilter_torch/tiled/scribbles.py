@@ -1,7 +1,10 @@
 """The scribbled pixels of a picture that is read by rows."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,6 +12,28 @@ from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.tiled.sources import Picture, RowSource, transparency
 
 Rows = Callable[[int, int], Tensor]  # planes of the rows from the first to before the second
+
+
+@dataclass(frozen=True)
+class RegionRows:
+    """The weights of one of several regions: rows (h, W) of rows (h, W, K)."""
+
+    masks: RowSource
+    number: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W)."""
+        return tuple(self.masks.shape[:2])
+
+    @property
+    def dtype(self) -> Any:
+        """That of the weights."""
+        return self.masks.dtype
+
+    def __getitem__(self, rows: slice) -> Any:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        return np.asarray(self.masks[rows])[..., self.number]
 
 
 def read_scribbles(

@@ -18,8 +18,8 @@ from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot
-from nlfilter_torch.tiled.scribbles import check_room, floats_of_scribbled, read_scribbles
+from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot, visit
+from nlfilter_torch.tiled.scribbles import RegionRows, check_room, floats_of_scribbled, read_scribbles
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
 
@@ -58,7 +58,8 @@ class Tiled:
         patch_size, count = options.get("patch_size", 5), options.get("num_landmarks", 100)
         check_count(patch_size, "patch_size")
         check_count(count, "num_landmarks")
-        numbers = patch_size**2 * (self.channels if options.get("guide_channels") == "all" else 1) + 2
+        compared = guide.planes or (self.channels if options.get("guide_channels") == "all" else 1)
+        numbers = patch_size**2 * compared + 2
         for other in self.operators:
             other.kept = KeptColumns(1, 0)  # makes room
         self.kept = 0
@@ -124,6 +125,21 @@ class Tiled:
             raise ValueError(f"{called} must hold a painted pixel, got none; paint at least one")
         self.scribbled += len(found.places)
         return found
+
+    def regions(self, masks: RowSource, name: str) -> list[Scribbles]:
+        """From rows (H, W, K) in [0, 1].
+
+        Raises:
+            ValueError, MemoryError: as of :meth:`scribbles`.
+        """
+        if len(masks.shape) == 2:
+            return [self.scribbles(masks, None, name)]
+        return [self.scribbles(RegionRows(masks, k), None, name) for k in range(masks.shape[2])]
+
+    def colours(self, places: Tensor) -> Tensor:
+        """The colours (1, C, n) of single pixels, read from their rows."""
+        seen = visit(self.picture, 0, places, self.passes.report, "Looking", every=False)
+        return torch.cat([tile.inner.flatten(2)[:, :, chosen] for tile, chosen in seen], dim=2)
 
     @torch.no_grad()
     def resized(self, size: tuple[int, int]) -> "Tiled":

@@ -1,0 +1,130 @@
+"""Masks from scribbles against matting and segmentation: ``python -m benchmarks.masks [--pictures FOLDER] [--quick]``.
+
+Composites with known transparency (:mod:`benchmarks.composites`), with 1, 2 and 4 scribbles on each side, and one on
+the object alone. Mean squared error of the mask, and intersection over union of its upper half, for :func:`region_mask`
+and each of :mod:`benchmarks.mask_peers`; how often it is better than each; what it loses by most; its time.
+``--set choosing`` takes the photographs and seeds that its defaults were chosen on.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.composites import FIRST_SEED, SIZE, Composite, composites, sources
+from benchmarks.mask_peers import PEERS
+from benchmarks.photographs import photograph
+from nlfilter_torch import region_mask
+from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.edits.mask import fit_mask
+from nlfilter_torch.edits.source import InMemory, apply_fitted
+
+OURS = "region_mask"
+COUNTS = (1, 2, 4)
+COMPOSITES = 25
+WON = 0.6  # share of cases in which each peer is to be beaten
+MEGAPIXEL = 1024
+METHODS = {OURS: region_mask, **PEERS}
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of one mask: mean squared error, and intersection over union."""
+
+    error: float
+    overlap: float
+
+
+def score(found: Tensor, wanted: Tensor) -> Score:
+    """Of a mask (1, 1, H, W) against the true one."""
+    both, either = (found > 0.5) & (wanted > 0.5), (found > 0.5) | (wanted > 0.5)
+    return Score(float((found - wanted).square().mean()), float(both.sum() / either.sum()))
+
+
+def measure(composite: Composite, count: int, seed: int) -> dict[str, Score]:
+    """Every method on one composite with so many scribbles on each side; the first key has none on the background."""
+    inside, outside = composite.scribbles(count, seed)
+    found = {name: score(method(composite.image, inside, outside), composite.alpha) for name, method in METHODS.items()}
+    return {"alone": score(region_mask(composite.image, inside), composite.alpha), **found}
+
+
+def report(cases: dict[str, dict[str, Score]]) -> bool:
+    """Print means, wins and the most lost comparisons; whether it is best in the mean and wins often enough."""
+    print(f"{'':14}{'MSE':>8}{'IoU':>8}{'beaten in MSE':>16}{'in IoU':>9}")
+    means, won = {}, []
+    for name in ("alone", *METHODS):
+        scores = [case[name] for case in cases.values()]
+        means[name] = Score(*(statistics.mean(getattr(s, f) for s in scores) for f in ("error", "overlap")))
+        line = f"{name:14}{means[name].error:8.4f}{means[name].overlap:8.3f}"
+        if name in PEERS:
+            less = statistics.mean(case[OURS].error < case[name].error for case in cases.values())
+            more = statistics.mean(case[OURS].overlap > case[name].overlap for case in cases.values())
+            won += [less, more]
+            line += f"{less:16.0%}{more:9.0%}"
+        print(line)
+    lost = [(case[OURS].error - case[name].error, key, name) for key, case in cases.items() for name in PEERS]
+    lost = sorted((entry for entry in lost if entry[0] > 0), reverse=True)
+    print(f"lost {len(lost)} of {len(cases) * len(PEERS)} comparisons of MSE; those lost by most:")
+    for lead, key, name in lost[:12]:
+        case = cases[key]
+        print(f"  {key:52} {OURS} {case[OURS].error:.4f}, {name} {case[name].error:.4f} ({lead:.4f} less)")
+    best = all(means[OURS].error < means[n].error and means[OURS].overlap > means[n].overlap for n in PEERS)
+    return best and min(won) >= WON
+
+
+def timed(call: Callable[[], Tensor]) -> float:
+    """Seconds, the median of three."""
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
+
+
+def speed(side: int) -> None:
+    """Print how long a first mask of a photograph takes, and a further scribble with the operator kept."""
+    image = photograph("astronaut", side, side)
+    inside, outside = torch.zeros(1, 1, side, side), torch.zeros(1, 1, side, side)
+    inside[..., side // 2 : side // 2 + side // 20, side // 2 :][..., : side // 10] = 1
+    outside[..., : side // 20, : side // 10] = 1
+    source = InMemory(image.to(working_dtype(image)), {})
+    apply_fitted(fit_mask(source, inside, outside), source)  # the operator is kept
+
+    first = timed(lambda: region_mask(image, inside, outside))
+    further = timed(lambda: apply_fitted(fit_mask(source, inside, outside), source))
+    print(f"{side}x{side} on {torch.get_num_threads()} threads: {first:.2f} s, a further scribble {further:.2f} s")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="Masks from scribbles, against matting and segmentation.")
+    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
+    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
+    parser.add_argument("--composites", type=int, default=COMPOSITES, help="how many")
+    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to see that it runs")
+    options = parser.parse_args(arguments)
+    count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
+    images, cases = sources(options.pictures, options.set), {}
+    first = FIRST_SEED[options.set]
+    for number, composite in enumerate(composites(count, first, images, size)):
+        for scribbles in COUNTS:
+            key = f"{number} {composite.name}, {scribbles} scribbles"
+            cases[key] = measure(composite, scribbles, first + 10 * number + scribbles)
+    for scribbles in COUNTS:
+        print(f"\n{count} composites of {size[0]}x{size[1]}, {scribbles} scribbles on each side ({options.set} set)")
+        report({key: case for key, case in cases.items() if key.endswith(f", {scribbles} scribbles")})
+    print(f"\nall {len(cases)}")
+    holds = report(cases)
+    if not options.quick:
+        print(f"best in both means, and {WON:.0%} against each: {'holds' if holds else 'FALLS SHORT'}")
+    speed(64 if options.quick else MEGAPIXEL)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""``nlfilter-torch mask``: a soft mask of a thing in a photograph, as a picture of its own."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nlfilter_torch.cli import options
+from nlfilter_torch.cli.edits import signature
+from nlfilter_torch.edits.parameters import MASK
+
+if TYPE_CHECKING:
+    from nlfilter_torch.tiled.sources import Rows
+
+GIVE = "give --region X,Y,W,H or --mask FILE: some of what is to be selected, such as --region 190,60,60,60"
+
+
+def mask(
+    source: str,
+    target: str,
+    *,
+    region: list[str] | None = None,
+    background: list[str] | None = None,
+    mask: Path | None = None,
+    depth: options.FileDepth | None = None,
+    seed: int = 0,
+    memory: float | None = None,
+    full: bool = False,
+    **given: Any,
+) -> None:
+    """See :data:`MASK`."""
+    from nlfilter_torch.cli import editing, scribbles
+    from nlfilter_torch.cli.progress import stages, steps
+    from nlfilter_torch.core.memory import working_bytes
+    from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.edits.mask import fit_mask, region_mask
+    from nlfilter_torch.io.pfm import PFM, write_pfm
+    from nlfilter_torch.io.photographs import Photograph, check_file, check_output, write_photograph
+    from nlfilter_torch.io.rows import check_place, open_picture, write_picture
+    from nlfilter_torch.tiled.scribbles import RegionRows
+    from nlfilter_torch.tiled.source import Tiled
+    from nlfilter_torch.tiled.sources import Picture
+
+    if mask is None and not region:
+        raise ValueError(GIVE)
+    place, floats = Path(target), Path(target).suffix.lower() == PFM
+    kind = options.DEPTHS[depth or ("16" if place.suffix.lower() in (".tif", ".tiff") else "8")]
+    allowed = editing.allowed_memory(memory)
+
+    def arguments(size: tuple[int, int]) -> dict[str, Any]:
+        return {p.keyword: p.argument_of(given[p.name], size) for p in MASK} | {"generator": seeded(seed)}
+
+    def selected_by(size: tuple[int, int], read: scribbles.Open) -> tuple[Any, Any]:
+        """Regions of the foreground and the background."""
+        inside = scribbles.selection(size, mask, region, "--region", read)
+        return inside, scribbles.selection(size, None, background, "--background", read)
+
+    with steps(3) as begin:
+        begin("Reading")
+        photograph = editing.read_if_it_fits(source, target, working_bytes(given["landmarks"], 3), allowed)
+        if photograph is not None:
+            selected = Photograph(photograph.pixels[:, :1], kind)
+            check_file(place) if floats else check_output(place, selected)
+            begin("Selecting")
+            with ExitStack() as files:
+                drawn = selected_by(photograph.size, lambda path: files.enter_context(open_picture(path, allowed)))
+                inside, outside = (None if rows is None else rows.at_once() for rows in drawn)
+            assert inside is not None  # for mypy
+            found = region_mask(photograph.pixels, inside, outside, **arguments(photograph.size))
+            begin("Writing")
+            if floats:
+                write_pfm(place, found[0, 0].float().numpy())
+            else:
+                write_photograph(selected.with_pixels(found), place)
+            return
+    with open_picture(Path(source), allowed) as picture, stages() as report:
+        if floats:
+            raise ValueError(f"{target} takes the whole mask in memory; write a TIFF file, or allow more memory")
+        plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None)
+        check_place(place, kind, plain, allowed)
+        with ExitStack() as files:
+            job = editing.Job(picture, kind, allowed - picture.cached, report, files)
+            tiled = Tiled(Picture(picture.rows, source), job.passes(full), "--region")
+            fitted = fit_mask(tiled, *selected_by(job.size, job.open), **arguments(job.size))
+            write_picture(place, _first_channel(tiled.rows(fitted, place.parent)), kind, plain)
+
+
+def _first_channel(rows: "Rows") -> Iterator[Any]:
+    """The mask alone, without the transparency of the photograph."""
+    for part, values in rows:
+        yield part, values[..., :1]
+
+
+mask.__doc__ = MASK.help
+mask.__signature__ = signature(MASK)  # type: ignore[attr-defined]  # typer looks at it
+mask.__annotations__ = {}

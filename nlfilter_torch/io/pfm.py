@@ -1,0 +1,18 @@
+"""Masks as PFM files: floats of one channel, which darktable and ART read as raster masks."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlfilter_torch.io.photographs import open_beside
+
+PFM = ".pfm"
+
+
+def write_pfm(path: Path, plane: NDArray[np.float32]) -> None:
+    """Write a plane (H, W), rows from the bottom up as the format has them; the file appears complete or not at all."""
+    height, width = plane.shape
+    with open_beside(path) as stream:
+        stream.write(f"Pf\n{width} {height}\n-1.0\n".encode())  # negative: little-endian
+        stream.write(np.ascontiguousarray(plane[::-1], "<f4").tobytes())

@@ -1,0 +1,89 @@
+"""The command ``mask``: files of masks, in memory and in tiles, and its errors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from nlfilter_torch import region_mask
+from nlfilter_torch.cli import main
+from nlfilter_torch.edits.applying import seeded
+from nlfilter_torch.edits.parameters import MASK
+from tests.problems import box, colour
+
+SIZE = (64, 80)
+REGION, GROUND = "30,30,12,8", "4,4,10,8"
+
+
+@pytest.fixture
+def photograph(tmp_path: Path) -> Path:
+    path = tmp_path / "in.tif"
+    pixels = (colour("coffee", *SIZE)[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+    tifffile.imwrite(path, pixels, photometric="rgb")
+    return path
+
+
+def expected(path: Path) -> np.ndarray:
+    image = tifffile.imread(path).astype(np.float32) / 255
+    front, back = box(30, 30, 8, 12, size=SIZE), box(4, 4, 8, 10, size=SIZE)
+    options = {p.keyword: p.argument_of(p.default, SIZE) for p in MASK}
+    import torch
+
+    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
+    return region_mask(planes, front, back, **options, generator=seeded())[0, 0].numpy()
+
+
+def run(source: Path, target: Path, *more: str) -> int:
+    return main(["mask", str(source), str(target), "--region", REGION, "--background", GROUND, *more])
+
+
+def test_files_of_every_kind(photograph: Path, tmp_path: Path) -> None:
+    wanted = expected(photograph)
+    assert run(photograph, tmp_path / "out.png") == 0
+    with Image.open(tmp_path / "out.png") as opened:
+        assert opened.mode == "L"
+        np.testing.assert_allclose(np.asarray(opened) / 255, wanted, atol=1 / 255)
+    assert run(photograph, tmp_path / "out.tif") == 0
+    sixteen = tifffile.imread(tmp_path / "out.tif")
+    assert sixteen.dtype == np.uint16
+    np.testing.assert_allclose(sixteen / 65535, wanted, atol=1e-4)
+    assert run(photograph, tmp_path / "out.pfm") == 0
+    head, size, scale, floats = (tmp_path / "out.pfm").read_bytes().split(b"\n", 3)
+    assert (head, size, scale) == (b"Pf", b"80 64", b"-1.0")
+    np.testing.assert_allclose(np.frombuffer(floats, "<f4").reshape(SIZE)[::-1], wanted, atol=1e-5)
+
+
+def test_a_rough_mask_becomes_a_soft_one(photograph: Path, tmp_path: Path) -> None:
+    rough = np.zeros(SIZE, np.uint8)
+    rough[20:50, 20:60] = 255
+    Image.fromarray(rough).save(tmp_path / "rough.png")
+    assert main(["mask", str(photograph), str(tmp_path / "out.png"), "--mask", str(tmp_path / "rough.png")]) == 0
+    with Image.open(tmp_path / "out.png") as opened:
+        assert np.asarray(opened)[20:50, 20:60].min() > 240
+
+
+def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+    assert run(photograph, tmp_path / "out.tif") == 0
+    found = tifffile.imread(tmp_path / "out.tif")
+    assert found.shape == SIZE
+    np.testing.assert_allclose(found / 65535, expected(photograph), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "give --region X,Y,W,H or --mask FILE: some of what is to be selected"),
+        (["--region", "70,60,20,20"], "--region must lie within the photograph"),
+        (["--region", REGION, "--background", REGION], "background must hold a painted pixel outside the scribbles"),
+        (["--region", REGION, "--background", "0,0,0,0"], "--background must be at least 1 pixel wide and high"),
+    ],
+)
+def test_errors(
+    photograph: Path, tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["mask", str(photograph), str(tmp_path / "out.png"), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out.png").exists()

@@ -1,0 +1,208 @@
+"""Region masks: the regression and the local solve against dense ones, what one scribble does, tiles, gradients."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nlfilter_torch import nonlocal_operator, region_mask
+from nlfilter_torch.edits import mask as masks
+from nlfilter_torch.edits import matting
+from nlfilter_torch.edits.source import InMemory, InMemoryOperator
+from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import Picture
+from nlfilter_torch.tiled.tiles import Passes
+from tests.problems import box, colour, noise
+from tests.test_strokes import kriging
+
+SIZE = (40, 48)
+
+
+def square(height: int = 40, width: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
+    """A reddish square with grain on a bluish ground, and its true mask."""
+    inside = box(height // 4, width // 4, height // 2, width // 2, size=(height, width))
+    image = 0.15 * noise(1, 3, height, width, dtype=torch.float32) + 0.2
+    image[:, :1] += 0.4 * inside
+    image[:, 2:] += 0.4 * (1 - inside)
+    return image, inside
+
+
+def test_one_scribble_is_enough_and_the_background_may_be_painted() -> None:
+    image, inside = square()
+    scribble, ground = box(18, 20, 3, 6, size=SIZE), box(3, 3, 3, 6, size=SIZE)
+    for background in (None, ground):
+        found = region_mask(image, scribble, background)
+        assert found.shape == inside.shape
+        assert (found - inside).abs().mean() < 0.03
+        assert ((found > 0.5) == (inside > 0.5)).float().mean() > 0.99
+
+
+def test_the_regression_is_the_best_estimate_from_scribbles_and_the_frame() -> None:
+    image = colour("coffee", 20, 24).double()
+    front, back = box(9, 10, 3, 4, size=(20, 24)).double(), box(2, 3, 2, 3, size=(20, 24)).double()
+    source = InMemory(image)
+    options = {"photometric_bandwidth": 0.2, "num_landmarks": 60, "patch_size": 1, "guide_channels": "all"}
+    operator = nonlocal_operator(masks.region_guide(image), **options)
+    marked = masks._against(source.regions(front, "a"), 0, source.regions(back, "b"))
+    held = InMemoryOperator(operator, source)
+    places = masks.frame_places((20, 24))
+    unlike = noise(1, 1, len(places), seed=4)
+    found = masks._regression(source, held, marked, held.at(places), unlike, 0.6)(source)
+
+    def estimate(values: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
+        flat = (values.flatten().numpy(), weights.flatten().numpy())
+        return kriging(operator.spectrum(), *flat, 1.0, 0.6, masks.SMOOTHNESS)
+
+    first = estimate(front, front + back)
+    weights = (front + back).flatten()
+    assert not bool(weights[places].any())  # here scribbles and frame are apart
+    weights[places] = torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
+    expected = estimate(front, weights)
+    np.testing.assert_allclose(found.flatten(), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch, channels: int) -> None:
+    monkeypatch.setattr(matting, "STEPS", (3000,))
+    height, width = 7, 9
+    image, rough = noise(1, channels, height, width), noise(1, 2, height, width, seed=1)
+    trust = 0.05 + noise(1, 2, height, width, seed=2)
+    found = matting.solve_mask(image, rough, trust, min(height, width))
+    pixels = image[0].flatten(1).T.numpy()
+    rows, columns = np.divmod(np.arange(height * width), width)
+    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) == 1
+    squares = np.square(pixels[:, None] - pixels).mean(2)
+    weights = near * (np.exp(-matting.STEEPNESS * squares) + matting.LEAST)
+    laplacian = np.diag(weights.sum(1)) - weights
+    for k in range(2):
+        c = trust[0, k].flatten().numpy()
+        expected = np.linalg.solve(laplacian + np.diag(c), c * rough[0, k].flatten().numpy())
+        np.testing.assert_allclose(found[0, k].flatten(), expected, atol=1e-6)
+
+
+def test_regions_are_background_to_each_other_and_batches_are_their_images() -> None:
+    image, inside = square()
+    ground = box(3, 3, 3, 6, size=SIZE)
+    both = torch.cat([box(18, 20, 3, 6, size=SIZE), ground], dim=1)
+    found = region_mask(image, both, spatial_bandwidth=math.inf)
+    assert ((found[:, :1] > 0.5) == (inside > 0.5)).float().mean() > 0.99
+    assert ((found[:, 1:] > 0.5) == (inside < 0.5)).float().mean() > 0.95
+    alone = region_mask(image, both[:, :1], ground, spatial_bandwidth=math.inf)
+    torch.testing.assert_close(found[:, :1], alone)
+    images = torch.cat([image, image.flip(3)])
+    together = region_mask(images, torch.cat([both, both.flip(3)]), spatial_bandwidth=math.inf)
+    torch.testing.assert_close(together[:1], found, atol=2e-3, rtol=0)
+
+
+def test_what_is_scribbled_over_stays() -> None:
+    image, inside = square()
+    assert (region_mask(image, inside)[inside > 0] > 0.95).all()  # the whole subject
+    assert (region_mask(image, torch.ones_like(inside)) > 0.95).all()  # the whole picture
+    over = box(18, 20, 6, 6, size=SIZE)
+    found = region_mask(image, over, over + box(3, 3, size=SIZE))  # background below the scribble does not count
+    torch.testing.assert_close(found, region_mask(image, over, box(3, 3, size=SIZE)))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (30, 5)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_small_and_flat_pictures(size: tuple[int, int], dtype: torch.dtype) -> None:
+    for image in (torch.full((1, 3, *size), 0.4, dtype=dtype), noise(1, 1, *size, dtype=dtype)):
+        scribble = torch.zeros(1, 1, *size, dtype=dtype)
+        scribble[..., 0, 0] = 1
+        found = region_mask(image, scribble)
+        assert found.shape == scribble.shape
+        assert found.dtype == dtype
+        assert torch.isfinite(found).all()
+        assert found[..., 0, 0] > 0.9
+
+
+def test_it_is_the_same_again_and_leaves_the_generator_alone() -> None:
+    image, _ = square()
+    state = torch.random.get_rng_state()
+    scribble = box(18, 20, 3, 6, size=SIZE)
+    first = region_mask(image, scribble)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        again = region_mask(image, scribble)
+    assert torch.equal(first, again)
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+def test_gradients() -> None:
+    image = colour("coffee", 10, 12).double()
+    front, back = box(4, 5, 2, 3, size=(10, 12)).double(), box(0, 0, 2, 3, size=(10, 12)).double()
+    direction = noise(1, 1, 10, 12, seed=3)
+
+    def loss(image: torch.Tensor, front: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
+        found = region_mask(image, front, back, reach=reach, num_landmarks=20, landmarks="uniform")
+        return (found * direction).sum()
+
+    at = [image, 0.8 * front, torch.tensor(0.5, dtype=torch.float64)]
+    inputs = [t.clone().requires_grad_() for t in at]
+    gradients = torch.autograd.grad(loss(*inputs), inputs)
+    for number, gradient in enumerate(gradients):
+        step = 1e-6 * noise(*at[number].shape, seed=5) if at[number].ndim else torch.tensor(1e-6).double()
+        if number == 1:
+            step = step * front  # weights stay above 0
+        ends = [loss(*(t + sign * step if i == number else t for i, t in enumerate(at))) for sign in (-1, 1)]
+        assert float(ends[1] - ends[0]) / 2 == pytest.approx(float((gradient * step).sum()), rel=2e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize("tile_rows", [16, 40])
+def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "CHUNK", 300)
+    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
+    image = colour("coffee", 110, 130)
+    front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
+    wanted = region_mask(image, front, back, num_landmarks=40)
+    rows: list[Any] = [t[0].permute(1, 2, 0).numpy() for t in (image, front, back)]
+    tiled = Tiled(Picture(rows[0]), Passes("float32", "full", tile_rows=tile_rows))
+    fitted = masks.fit_mask(tiled, rows[1], rows[2], num_landmarks=40)
+    found = np.concatenate([values for _, values in tiled.rows(fitted)])
+    np.testing.assert_allclose(found[..., 0], wanted[0, 0].numpy(), atol=0.02)
+    assert abs(found[..., 0] - wanted[0, 0].numpy()).mean() < 1e-3
+
+
+def test_the_solve_sees_no_further_than_it_says() -> None:
+    height, width = 300, 260
+    image, rough = noise(1, 3, height, width, dtype=torch.float32), noise(1, 1, height, width, dtype=torch.float32)
+    trust = torch.full_like(rough, 0.02)
+    levels = matting.pyramid_levels(width)
+    assert levels > 0
+    margin, step = matting.pyramid_margin(levels), 1 << levels
+    start = -(-(margin + 1) // step) * step
+    assert start < height
+    rows = (..., slice(start - margin, None), slice(None))
+    whole = matting.solve_mask(image, rough, trust, width)
+    part = matting.solve_mask(image[rows], rough[rows], trust[rows], width)
+    torch.testing.assert_close(part[..., margin:, :], whole[..., start:, :])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scribbles": torch.zeros(1, 1, *SIZE)}, "scribbles must hold a painted pixel"),
+        ({"scribbles": 2 * torch.ones(1, 1, *SIZE)}, r"scribbles must be in \[0, 1\]"),
+        ({"scribbles": torch.ones(1, 1, 9, 9)}, "scribbles must have the height and width of the image"),
+        ({"background": torch.zeros(1, 1, *SIZE)}, "background must hold a painted pixel"),
+        ({"background": box(18, 20, size=SIZE)}, "background must hold a painted pixel outside the scribbles"),
+        ({"background": torch.ones(1, 3, *SIZE)}, "background must have 1 channel or one for each of the 1 regions"),
+        ({"reach": 1.0}, "reach must be"),
+        ({"photometric_bandwidth": -1.0}, "photometric_bandwidth must be positive"),
+        ({"image": torch.ones(1, 2, *SIZE)}, "image must have 1 or 3 channels"),
+    ],
+)
+def test_errors(change: dict[str, Any], message: str) -> None:
+    arguments = {"image": square()[0], "scribbles": box(18, 20, size=SIZE), **change}
+    with pytest.raises(ValueError, match=message):
+        region_mask(**arguments)
+
+
+def test_no_spatial_term_finds_what_is_alike_anywhere() -> None:
+    image, _ = square(40, 96)
+    image = torch.cat([image, image], dim=3)
+    scribble = box(18, 40, 3, 6, size=(40, 192))
+    far = box(14, 130, 12, 30, size=(40, 192)) > 0
+    assert region_mask(image, scribble, spatial_bandwidth=math.inf)[far].min() > 0.9
