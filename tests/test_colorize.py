@@ -33,6 +33,17 @@ def test_strength_decides_what_becomes_of_the_rest() -> None:
     assert chroma(0.0) < 0.01 < chroma(0.5) < chroma(1.0)
 
 
+def test_a_line_between_equal_greys_keeps_their_colours_apart() -> None:
+    grey = torch.full((1, 1, 40, 60), 0.5)
+    grey[..., 29:31] = 0.1
+    left, right = box(10, 24, size=(40, 60)), box(26, 33, size=(40, 60))
+    found = colorize(grey, paint(0.8, 0.2, 0.2, left) + paint(0.2, 0.2, 0.8, right), left + right, num_landmarks=40)
+    redder = (found[:, 0] - found[:, 2])[0]
+    # By similarity alone a quarter of the right would be red.
+    assert (redder[:, :28] > 0).float().mean() > 0.97
+    assert (redder[:, 32:] < 0).float().mean() > 0.97
+
+
 def test_one_pixel_and_all_pixels_may_be_painted() -> None:
     image = colour("chelsea", 40, 60)
     dot = box(20, 30, 1, 1, size=(40, 60))
