@@ -22,7 +22,7 @@ from benchmarks.photographs import photograph
 from nlfilter_torch import region_mask
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.mask import fit_mask
-from nlfilter_torch.edits.source import InMemory, apply_fitted
+from nlfilter_torch.edits.source import InMemory
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)
@@ -94,10 +94,10 @@ def speed(side: int) -> None:
     inside[..., side // 2 : side // 2 + side // 20, side // 2 :][..., : side // 10] = 1
     outside[..., : side // 20, : side // 10] = 1
     source = InMemory(image.to(working_dtype(image)), {})
-    apply_fitted(fit_mask(source, inside, outside), source)  # the operator is kept
+    source.all(fit_mask(source, inside, outside))  # the operator is kept
 
     first = timed(lambda: region_mask(image, inside, outside))
-    further = timed(lambda: apply_fitted(fit_mask(source, inside, outside), source))
+    further = timed(lambda: source.all(fit_mask(source, inside, outside)))
     print(f"{side}x{side} on {torch.get_num_threads()} threads: {first:.2f} s, a further scribble {further:.2f} s")
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels import columns, definitions_only, grams, sweeps
+from nlfilter_torch.core.kernels import columns, definitions_only, grams, tall_skinny
 from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 
@@ -75,8 +75,8 @@ def test_weights_count_pixels() -> None:
     repeated = (part.repeat_interleave(copies, dim=-1) for part in (factor, diagonal))
     for context in (nullcontext(), definitions_only()):
         with context:
-            scaling, found = sweeps.sweep(factor, diagonal, half, 2.0, copies.expand(2, -1).float())
-    many, expected = sweeps.sweep(*repeated, half, 2.0)
+            scaling, found = tall_skinny.sweep(factor, diagonal, half, 2.0, copies.expand(2, -1).float())
+    many, expected = tall_skinny.sweep(*repeated, half, 2.0)
     torch.testing.assert_close(scaling.repeat_interleave(copies, dim=1), many)
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
 

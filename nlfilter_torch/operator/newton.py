@@ -19,8 +19,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.kernels.grams import gram, sum_grams
-from nlfilter_torch.core.kernels.sweeps import sweep, weigh
-from nlfilter_torch.core.kernels.tall_skinny import gather, spread
+from nlfilter_torch.core.kernels.tall_skinny import gather, spread, sweep, weigh
 from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import KernelMatrix, Solution, scaling_from_moment
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.sweeps import positive_root
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread
 
 EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # by which rounding may take the d of a pixel above 1
 

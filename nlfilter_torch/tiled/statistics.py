@@ -21,8 +21,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.kernels.grams import sum_grams
-from nlfilter_torch.core.kernels.sweeps import positive_root
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.operator import Columns
