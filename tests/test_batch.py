@@ -319,7 +319,9 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ("--memory", 0),
     ):
         assert options[0].strip("-").replace("-", "_") in refused(capsys, source, target, *options).replace("-", "_")
-    assert "'--spatial-bandwidth': " in refused(capsys, source, target, "--spatial-bandwidth", 0)
+    assert "--spatial-bandwidth must be a positive number of pixels" in refused(
+        capsys, source, target, "--spatial-bandwidth", 0
+    )
     assert not target.exists()
 
     fill(target, 1)

@@ -200,7 +200,7 @@ def test_a_full_disk_is_named(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], file_limit: Any, target: str
 ) -> None:
     with file_limit(20_000):
-        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE)
+        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE, "--threshold", "0")  # nothing between
     assert f"{target} cannot be written: File too large; make room there or write elsewhere" in sentence
 
 

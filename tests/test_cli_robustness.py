@@ -47,7 +47,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("detail --bandwidth 1e-40", "--bandwidth must be from 0.01 to 1000000 grey levels, or auto, got '1e-40'"),
         ("recolor --tolerance 1e-40", "'--tolerance' / '--bandwidth': "),
         ("tone --bandwidth 1e-40", "--bandwidth must be from 0.01 to 1000000 grey levels, or auto, got '1e-40'"),
-        ("detail --spatial-bandwidth 1e-40", "'--spatial-bandwidth': "),
+        (
+            "detail --spatial-bandwidth 1e-40",
+            "--spatial-bandwidth must be from 0.01 to 1000000 pixels, or none, got '1e-40'",
+        ),
         ("detail --spatial-bandwidth nan", "--spatial-bandwidth"),
         (f"detail --patch-size {LONG}", "'--patch-size': "),
         (f"detail --landmarks {LONG}", "'--landmarks': "),

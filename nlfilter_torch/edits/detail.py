@@ -68,7 +68,7 @@ def enhance(
         mask_bandwidth: photometric bandwidth of the masks.
         threshold: standard deviation of luminance around a pixel at which detail is strengthened half as much as the
             sliders say, less where it is smaller; 0 strengthens all alike.
-        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+        limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
             clip.
         viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
             bandwidths are in pixels of that; 0 is the size of the image.

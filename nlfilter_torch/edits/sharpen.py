@@ -37,7 +37,7 @@ def sharpen(
         amount: sliders alpha_2 and alpha_3, a number or a tensor of shape () or (B,); 1 changes nothing, 4 is visible,
             8 is strong.
         guide_blur: standard deviation in pixels of the blur of the guide, at most half the short side, 0 for none.
-        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+        limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
             clip.
         viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
             bandwidths are in pixels of that; 0 is the size of the image.

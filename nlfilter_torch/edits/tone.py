@@ -37,7 +37,7 @@ def adjust_tone(
         contrast: alpha_{k+1}, a number or a tensor of shape () or (B,); 1 changes nothing, 1.4 is strong.
         clarity: alpha_k, likewise; bears larger values.
         order: k, at least 1.
-        limits: ``"soft"`` keeps what highlights and shadows show, see :func:`change_luminance`; ``"none"`` lets them
+        limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
             clip, and holds the mean exactly.
         viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
             bandwidths are in pixels of that; 0 is the size of the image.

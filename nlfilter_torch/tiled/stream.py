@@ -62,8 +62,9 @@ def stream_detail(
             16,384 pixels, or a multiple.
         memory: bytes that may be used, besides those of source and target.
         report: called with the name of a stage, the part done and the total.
-        **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``; bandwidths are
-            numbers.
+        **options: ``threshold``, ``limits``, ``viewing_size`` and bandwidths of :func:`~nlfilter_torch.enhance`, and
+            further ones of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``;
+            bandwidths are numbers.
 
     Raises:
         TypeError, ValueError: if an argument does not fit, or the source changes its size during the work.
