@@ -47,7 +47,7 @@ class LocalValues:
 
     @staticmethod
     def of(guide: Tensor, step: int, width: int, places: Tensor, weights: Tensor, values: Tensor) -> "LocalValues":
-        """From values (B, C, n) and weights (B, 1, n) of the scribbled pixels with these numbers (n,) in the picture."""
+        """From values (B, C, n) and weights (B, 1, n) of scribbled pixels, and their numbers (n,) along the rows."""
         rows, columns = guide.shape[2:]
         blocks = places // width // step * columns + places % width // step
         weighted = torch.cat([values * weights, weights], dim=1)
