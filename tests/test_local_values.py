@@ -1,6 +1,5 @@
 """Values that spread from scribbles over neighbouring pixels."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch import colorize
 from nlfilter_torch.edits import local_values
-from nlfilter_torch.edits.local_values import LocalValues
+from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.source import InMemory, luminance
 from nlfilter_torch.tiled import stream_colorize
 from nlfilter_torch.tiled.source import Tiled
@@ -29,9 +28,15 @@ def halves(height: int = 24, width: int = 40) -> Tensor:
 
 def spread(image: Tensor, mask: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Values times influence, and influence."""
-    source = InMemory(image)
-    scribbles = source.scribbles(mask, None, "mask")
-    return LocalValues.of(source, scribbles, values.flatten(2)[:, :, scribbles.places])(source)
+    places = mask.flatten().nonzero().squeeze(1)
+    return local(image, places, mask.flatten(2)[:, :, places], values.flatten(2)[:, :, places])
+
+
+def local(image: Tensor, places: Tensor, weights: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """The same, from scribbled pixels."""
+    step = block_size((image.shape[2], image.shape[3]))
+    guide = InMemory(image).reduced(luminance, step)
+    return LocalValues.of(guide, step, image.shape[3], places, weights, values)(image, 0)
 
 
 def test_values_stay_on_their_side_of_a_border() -> None:
@@ -63,9 +68,7 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
     monkeypatch.setattr(local_values, "FIXED", 2.0)  # differences of what is fixed have no digits left
 
     def found(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        source = InMemory(0.1 * image)
-        scribbles = replace(source.scribbles(torch.ones(1, 1, 5, 6), None, "mask"), places=places, weights=weights)
-        return LocalValues.of(source, scribbles, values)(source)
+        return local(0.1 * image, places, weights, values)
 
     given = (image, values.flatten(2)[..., :4], weights.flatten(2)[..., :4])
     assert torch.autograd.gradcheck(found, tuple(tensor.clone().requires_grad_() for tensor in given), atol=1e-6)

@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
-from nlfilter_torch.edits.local_values import LocalValues
+from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Source, edited, luminance
 from nlfilter_torch.filtering.masks import segment_mask
@@ -176,7 +176,10 @@ def fit_colorize(
         pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
         return Fitted(lambda some: merge_luminance(luminance(some), chroma))
-    local = LocalValues.of(source, scribbles, wanted[:, ::2])  # without green, which follows from red and blue
+    step = block_size(source.size)
+    guide = source.reduced(luminance, step)
+    # Without green, which follows from red and blue.
+    local = LocalValues.of(guide, step, source.size[1], scribbles.places, scribbles.weights, wanted[:, ::2])
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
@@ -195,8 +198,9 @@ def fit_colorize(
     far, near = parts
 
     def coloured(some: Any) -> Tensor:
-        alike, (connected, influence) = far(some) + near(some), local(some)
-        return merge_luminance(luminance(some), alike + SHARE * (with_green(connected) - influence * alike))
+        grey, alike = luminance(some), far(some) + near(some)
+        connected, influence = local(grey, some.first)
+        return merge_luminance(grey, alike + SHARE * (with_green(connected) - influence * alike))
 
     return Fitted(coloured)
 

@@ -17,8 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.components import Scribbles
-from nlfilter_torch.edits.source import Pixels, Source, luminance
 from nlfilter_torch.filtering.neighbours import neighbour_weights, solve_neighbours
 from nlfilter_torch.operator.features import pad_border
 
@@ -48,40 +46,38 @@ class LocalValues:
     width: int
 
     @staticmethod
-    def of(source: Source, scribbles: Scribbles, values: Tensor) -> "LocalValues":
-        """From values (B, C, n) of scribbled pixels."""
-        height, width = source.size
-        step = max(1, round(math.sqrt(height * width / SOLVED)))
-        guide = source.reduced(luminance, step)
+    def of(guide: Tensor, step: int, width: int, places: Tensor, weights: Tensor, values: Tensor) -> "LocalValues":
+        """From values (B, C, n) and weights (B, 1, n) of scribbled pixels, and their numbers (n,) along the rows."""
         rows, columns = guide.shape[2:]
-        places = scribbles.places
         blocks = places // width // step * columns + places % width // step
-        weighted = torch.cat([values * scribbles.weights, scribbles.weights], dim=1)
+        weighted = torch.cat([values * weights, weights], dim=1)
         sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
         sums = sums.unflatten(2, (rows, columns)) * (FIXED / step**2)
         # In flat parts the system is a u = 3 u'', as there are three neighbours in every direction.
         anchor = sums[:, -1:] + 3 / (REACH**2 * rows * columns)
-        weights = neighbour_weights(guide, lambda squared: torch.exp(-squared) + LEAST, variance=local_variance(guide))
-        solved = solve_neighbours(weights, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
+        links = neighbour_weights(guide, lambda squared: torch.exp(-squared) + LEAST, variance=local_variance(guide))
+        solved = solve_neighbours(links, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
         return LocalValues(solved, guide, step, width)
 
-    def __call__(self, pixels: Pixels) -> tuple[Tensor, Tensor]:
+    def __call__(self, own: Tensor, first: int) -> tuple[Tensor, Tensor]:
         """Values times influence (B, C, h, W), and influence (B, 1, h, W) in [0, 1], of some rows.
 
         The influence is the square root of how far the scribbles determine a pixel.
+
+        Args:
+            own: luminance of the rows, (B, 1, h, W).
+            first: number of their first pixel.
         """
-        found = self._at(pixels)
+        found = self._at(own, first // self.width)
         influence = found[:, -1:].clamp(min=1e-6).sqrt()
         return found[:, :-1] / influence, influence
 
-    def _at(self, pixels: Pixels) -> Tensor:
+    def _at(self, own: Tensor, start: int) -> Tensor:
         """The solutions (B, C+1, h, W) at some rows."""
-        if self.step == 1:
-            start = pixels.first // self.width
-            return self.values[:, :, start : start + pixels.image.shape[2]]
-        own = luminance(pixels)
         height, width = own.shape[2:]
-        rows = self._between(pixels.first // self.width, height, self.guide.shape[2], own)
+        if self.step == 1:
+            return self.values[:, :, start : start + height]
+        rows = self._between(start, height, self.guide.shape[2], own)
         columns = self._between(0, width, self.guide.shape[3], own)
         total, weight = torch.zeros(()), torch.zeros(())
         for row, row_share in rows:
@@ -99,6 +95,11 @@ class LocalValues:
         share = (position - before).to(like)
         number = before.long()
         return [(number.clamp(0, blocks - 1), 1 - share), ((number + 1).clamp(0, blocks - 1), share)]
+
+
+def block_size(size: tuple[int, int]) -> int:
+    """Rows and columns of the blocks of a picture (H, W)."""
+    return max(1, round(math.sqrt(size[0] * size[1] / SOLVED)))
 
 
 def local_variance(guide: Tensor) -> Tensor:
