@@ -103,7 +103,7 @@ def methods(scene: Scene) -> dict[str, Strength]:
     held = [
         polynomial_filter(operator, noisy, torch.tensor([2.0, 2.0, 2.0, 1.0]), residual=r) - noisy for r in (None, 1.0)
     ]
-    middle = sharpen(noisy, amount=2.0) - noisy  # linear in the amount, as all of them
+    middle = sharpen(noisy, amount=2.0, limits="none") - noisy  # linear in the amount, as all of them
     added = {
         "sharpen (softened guide)": middle,
         "sliders a,a,a,1": held[0],

@@ -35,6 +35,14 @@ from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
+PLAIN: dict[str, Any] = {  # the filter as it is, in pixels of the file
+    "limits": "none",
+    "threshold": 0.0,
+    "viewing_size": 0.0,
+    "photometric_bandwidth": "auto",
+    "spatial_bandwidth": "none",
+    "num_landmarks": 100,
+}
 PIECE = 256  # side of a piece of the mosaic
 NAMES = ("astronaut", "chelsea", "coffee", "rocket", "camera", "moon", "coins", "page", "brick", "grass", "gravel")
 Array = NDArray[np.uint8]
@@ -94,7 +102,7 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
 
     with open_picture(source, memory) as picture:
         tiled = Tiled(Picture(picture.rows), Passes("uint8", statistics, memory=memory, report=report))
-        rows = tiled.rows(fit_detail(tiled, ALPHA, num_landmarks=landmarks))
+        rows = tiled.rows(fit_detail(tiled, ALPHA, **(PLAIN | {"num_landmarks": landmarks})))
         write_picture(target, rows, "uint8", picture)
         pixels = picture.shape[0] * picture.shape[1]
     report("", 0, 0)
@@ -137,7 +145,7 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
 
     def by_rows(**options: Any) -> NDArray[np.float32]:
         edited = np.empty_like(picture)
-        stream_detail(picture, edited, ALPHA, **{"sample": min(SAMPLE, side * side // 4)} | options)
+        stream_detail(picture, edited, ALPHA, **(PLAIN | {"sample": min(SAMPLE, side * side // 4)} | options))
         return edited
 
     sampled = by_rows(tile_rows=tiles[0])
