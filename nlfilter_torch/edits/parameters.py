@@ -343,7 +343,7 @@ RECOLOR = Edit(
             former=(("bandwidth", 1.0),),
             slider=Slider("Tolerance", 3, 40, 1, live=False),
         ),
-        *_filter(share=0.6, patch_size=1)[1:],
+        *_filter(share=1.2, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
