@@ -100,8 +100,10 @@ def test_full_passes_recolour_as_in_memory(options: dict[str, Any], kept: bool, 
     given = {"keep": keep} if kept else {}
     edited = recoloured(picture, strokes, mask, statistics="full", tile_rows=17, **given, **options)
     assert np.abs(rows_of(whole) - picture).max() > 0.1
-    # Whitening multiplies the rounding of affinities by up to 316; in 32 bits that shows, in 64 it does not.
-    assert np.abs(edited - rows_of(whole)).max() < (2e-5 if dtype == np.float32 else 1e-8)
+    # The colours beside a border are divided by how much of each side is there: that multiplies rounding at few pixels.
+    apart = np.abs(edited - rows_of(whole))
+    assert apart.max() < (2e-3 if dtype == np.float32 else 2e-6)
+    assert np.quantile(apart, 0.95) < (2e-5 if dtype == np.float32 else 1e-7)
 
 
 @pytest.mark.usefixtures("small_blocks")

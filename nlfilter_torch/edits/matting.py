@@ -20,6 +20,7 @@ STEEPNESS = 300.0  # of the weights, per mean squared difference of the channels
 LEAST = 1e-4  # weight of neighbours that differ as much as they can
 REFINED, CONTRAST = 2, 0.03  # rounds; difference of colours from which on they tell how much of each a pixel holds
 SIDES = 4  # coarsest pixels that the colours on either side of a border are averaged over, to each direction
+KNOWN = 0.02  # share of a side, of what is nearby, at which its colour counts as half known
 TINY = 1e-4  # weight of pixels that hardly belong to a side
 SHIFTS = ((0, 1), (1, -1), (1, 0), (1, 1))  # to half of the neighbours; the other half lies opposite
 REFERENCE = 112  # short side for which confidences are meant
@@ -117,8 +118,9 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: list[Tensor], 
     return found
 
 
-def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Tensor]:
-    """The mean colours nearby of what is inside a mask and of what is outside, both (B, C, H, W).
+def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The mean colours nearby of what is inside a mask and of what is outside, both (B, C, H, W), and whether these are
+    known, (B, 1, H, W) in [0, 1]: hardly where nearly all or nearly nothing nearby is inside.
 
     Args:
         image: (B, C, H, W).
@@ -134,11 +136,14 @@ def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Te
     # Along one axis after the other; nothing is outside the picture.
     sums = F.avg_pool2d(coarse, (size, 1), 1, (SIDES, 0))
     sums = F.avg_pool2d(sums, (1, size), 1, (0, SIDES))
-    both = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
+    means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
+    least = sums[:, :2].amin(1, keepdim=True)
+    found = torch.cat([means.flatten(1, 2), least / (least + KNOWN)], dim=1)
     if levels:
-        both = F.interpolate(both.flatten(1, 2), scale_factor=step, mode="bilinear", align_corners=False)
-    both = both.reshape(len(image), 2, image.shape[1], *both.shape[-2:])[..., :height, :width]
-    return both[:, 0], both[:, 1]
+        found = F.interpolate(found, scale_factor=step, mode="bilinear", align_corners=False)
+    channels = image.shape[1]
+    inside, outside, known = found[..., :height, :width].split([channels, channels, 1], dim=1)
+    return inside, outside, known
 
 
 def refine_mask(image: Tensor, mask: Tensor, levels: int) -> Tensor:
@@ -152,10 +157,10 @@ def refine_mask(image: Tensor, mask: Tensor, levels: int) -> Tensor:
         levels: as of :func:`colours_beside`.
     """
     for _ in range(REFINED):
-        inside, outside = colours_beside(image, mask, levels)
+        inside, outside, known = colours_beside(image, mask, levels)
         across = inside - outside
         contrast = across.square().mean(1, keepdim=True)
         share = ((image - outside) * across).mean(1, keepdim=True) / (contrast + TINY * CONTRAST)
-        trust = contrast / (contrast + CONTRAST**2) * (1 - (2 * mask - 1).pow(8))  # 0 and 1 are certain
+        trust = known * contrast / (contrast + CONTRAST**2) * (1 - (2 * mask - 1).pow(8))  # 0 and 1 are certain
         mask = torch.lerp(mask, share.clamp(0.0, 1.0), trust)
     return mask

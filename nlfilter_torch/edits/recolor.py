@@ -145,8 +145,8 @@ class Recoloring:
         change, total = torch.zeros_like(chroma), torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
             share = refine_mask(chroma, shares[:, k : k + 1], self.levels)
-            inside, outside = colours_beside(chroma, share, self.levels)
-            thing = chroma + (1 - share) * (inside - outside)  # its part of a mixed pixel; all of one inside
+            inside, outside, known = colours_beside(chroma, share, self.levels)
+            thing = chroma + known * (1 - share) * (inside - outside)  # its part of a mixed pixel; all of one inside
             # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
             # saturation.
             usual = self.old[:, k].square().sum(1)[:, None, None, None]  # squared saturation

@@ -290,16 +290,13 @@ class InMemoryOperator:
     @cached_property
     def pairs(self) -> RitzPairs:
         """The spectrum, without pixels if it is that of a sample."""
-        factor, remainder = self.operator.factor, self.operator.remainder
-        count = factor.shape[2]
+        count = self.operator.factor.shape[2]
         if not self.sampled or count <= SAMPLE:
             return self.operator.spectrum()
-        some = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].to(factor.device)
-        scaling, rest = self.operator.scaling[:, some].double(), None
-        if remainder is not None:
-            rest = remainder[:, some].double()
-        grams = compute_grams(factor[:, :, some].double(), scaling, rest, 1 if rest is None else 2)
-        return RitzPairs.of_sums(grams * (count / SAMPLE), factor.dtype)
+        some = sampled_places(count).to(self.operator.factor.device)
+        of = Columns(self.operator.factor, self.operator.scaling, self.operator.remainder)
+        columns = Columns(of.factor[:, :, some], of.scaling[:, some], of.remainder[:, some])
+        return sampled_pairs([columns], count, of.factor.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """All planes."""
@@ -324,6 +321,20 @@ class InMemoryOperator:
         """Some columns of the factor."""
         columns = self.operator.factor[:, :, places]
         return lambda: [columns]
+
+
+def sampled_places(count: int) -> Tensor:
+    """Numbers of :data:`SAMPLE` of so many pixels, ascending; the same ones in memory and in tiles."""
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
+
+
+def sampled_pairs(blocks: Iterable[Columns], count: int, dtype: torch.dtype) -> RitzPairs:
+    """The spectrum of an operator of ``count`` pixels from the columns at :func:`sampled_places`, block by block."""
+    grams: Tensor | float = 0.0
+    for block in blocks:
+        factor, scaling, remainder = (part.double() for part in (block.factor, block.scaling, block.remainder))
+        grams = grams + compute_grams(factor, scaling, remainder, 2)
+    return RitzPairs.of_sums(torch.as_tensor(grams) * (count / SAMPLE), dtype)
 
 
 def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.source import Blocks, Planes
+from nlfilter_torch.edits.source import SAMPLE, Blocks, Planes, sampled_pairs, sampled_places
 from nlfilter_torch.filtering.fitted import layers_of_columns
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.kernel import Kernel
@@ -235,6 +235,10 @@ class TiledOperator:
     @cached_property
     def pairs(self) -> RitzPairs:
         """The spectrum."""
+        count = self.guide.pixels
+        if self.guide.guide.sampled and count > SAMPLE:
+            features = self.features_at(sampled_places(count))
+            return sampled_pairs(map(self.columns, features.split(sampling.CHUNK, dim=2)), count, self.guide.dtype)
         known = next((sums for _, sums in self._sums.values()), None)
         sums = known or self.sums(first_plane, 1)
         return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
