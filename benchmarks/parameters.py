@@ -63,7 +63,10 @@ def places(edit: Edit, parameter: Parameter) -> list[str]:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         if file == "edits/parameters.py":
             scope = next(n for n in tree.body if isinstance(n, ast.Assign) and named(n.targets[0]) == edit.name.upper())
-            found += [f"{file}:{n.lineno}" for n in ast.walk(scope) if declares(n, parameter.name)]
+            names_in = {node.id for node in ast.walk(scope.value) if isinstance(node, ast.Name)}  # of what edits share
+            scopes = [scope, *(n for n in tree.body if isinstance(n, ast.Assign) and named(n.targets[0]) in names_in)]
+            nodes = [node for one in scopes for node in ast.walk(one)]
+            found += [f"{file}:{n.lineno}" for n in nodes if declares(n, parameter.name)]
         elif own:
             found += [f"{file}:{line}" for line, name in literals(tree) if name in names]
     return found

@@ -183,7 +183,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         (["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels, such as 20, or auto, got '0'"),
         (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),
         (["--bandwidth", "inf"], "--bandwidth must be a positive number of grey levels"),
-        (["--spatial-bandwidth", "-2"], "Invalid value for '--spatial-bandwidth': "),
+        (["--spatial-bandwidth", "-2"], "--spatial-bandwidth must be a positive number of pixels, such as 20, or none"),
         (["--patch-size", "4"], "patch_size must be odd and at least 1, got 4; try 5"),
         (["--landmarks", "0"], "Invalid value for '--landmarks': "),
         (["--sampling", "best"], "Invalid value for '--sampling': 'best' is not one of"),
@@ -248,9 +248,9 @@ def test_too_large_for_memory(
     free = psutil.virtual_memory()._replace(available=1_000_000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     sentence = refused(capsys, "tone", photo, tmp_path / "out.png")  # not even in tiles
-    assert "in.png needs 4 MB of memory at least, but 1 MB may be used; allow more, or use fewer landmarks" in sentence
+    assert "in.png needs 21 MB of memory at least, but 1 MB may be used; allow more, or use fewer landmarks" in sentence
     sentence = refused(capsys, "inspect", photo, tmp_path)  # needs all pixels at once
-    assert "has 90x60 pixels and needs about 13 MB of memory, but 1 MB is free; use fewer landmarks" in sentence
+    assert "has 90x60 pixels and needs about 34 MB of memory, but 1 MB is free; use fewer landmarks" in sentence
 
 
 def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -202,7 +202,7 @@ def test_files_from_before_there_was_a_list_of_steps() -> None:
     assert Recipe.from_json(text, "edit.json") == Recipe(
         (
             Step("detail", (IN,), alpha=(1.0,) * 4, inside=INSIDE, time=0.7),
-            Step("recolor", (BLUE,), tolerance=20.0),
+            Step("recolor", (BLUE,), reach=0.8, tolerance=20.0),
             Step("abstract", power=0.0, edges=0.5, edge_width=3.0 * 0.1),
         )
     )

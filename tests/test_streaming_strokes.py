@@ -156,15 +156,15 @@ def test_tiles_of_any_size_give_the_same(statistics: Any) -> None:
 
 def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
-    picture = cat(90, 60)
-    painted = paint(90, 60)
+    picture = cat(240, 60)
+    painted = paint(240, 60)
     settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
-    source, *paints = (Rows(rows, most=10 + 4) for rows in (picture, *painted))
+    source, *paints = (Rows(rows, most=10 + 2 * 40) for rows in (picture, *painted))  # with what masks and borders see
     edited = np.empty_like(picture)
     stream_recolor(source, edited, paints[0], paints[1], keep=paints[2], **settings)
     np.testing.assert_array_equal(edited, recoloured(picture, *painted[:2], keep=painted[2], **settings))
-    assert paints[0].read < 60  # where there is paint
-    assert paints[1].read == paints[2].read == 90  # once
+    assert paints[0].read < 200  # where there is paint
+    assert paints[1].read == paints[2].read == 240  # once
     stream_colorize(source, edited, paints[0], paints[1], **settings)
     np.testing.assert_array_equal(edited, coloured(picture, *painted[:2], **settings))
 
@@ -209,18 +209,19 @@ def test_report_tells_every_stage() -> None:
     stages = [
         "Reading strokes",
         "Looking",
+        "Comparing strokes",
         "Sampling",
         "Balancing",
         "Bounding",
         "Summing up",
-        "Comparing strokes",
+        "Comparing",
         "Filtering",
     ]
     assert list(dict.fromkeys(seen)) == stages
 
 
 def test_painted_pixels_need_memory() -> None:
-    picture, (strokes, mask, _) = cat(90, 120), paint(90, 120)
+    picture, (strokes, mask, _) = cat(180, 240), paint(180, 240)
     with pytest.raises(MemoryError, match=r"the strokes on source cover \d+ pixels or more .* paint less"):
         read_scribbles(
             Picture(picture),
@@ -233,7 +234,7 @@ def test_painted_pixels_need_memory() -> None:
         )
     for edit in (recoloured, coloured):
         with pytest.raises(MemoryError, match="the strokes on source cover"):
-            edit(picture, strokes, 0 * mask + 1, memory=3_000_000, num_landmarks=5)
+            edit(picture, strokes, 0 * mask + 1, memory=7_000_000, num_landmarks=5)
         with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least"):
             edit(picture, strokes, mask, memory=1_000_000)
 
@@ -354,7 +355,9 @@ def test_by_rows_as_whole(photo: Path, verb: str, source: str, options: tuple[st
     one, other = (read_photograph(folder / name) for name in ("whole.tif", "rows.tif"))
     assert one.depth == other.depth
     assert (one.pixels - read_photograph(folder / source).pixels).abs().max() > 0.01
-    assert (one.pixels - other.pixels).abs().max() < (1.1 / 255 if "8" in options else 1e-4)
+    assert (one.pixels - other.pixels).abs().max() < (
+        1.1 / 255 if "8" in options else 1e-3 if verb == "recolor" else 1e-4
+    )
 
 
 def test_what_cannot_be_done_by_rows_leaves_nothing(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:

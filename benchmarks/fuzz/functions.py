@@ -220,6 +220,11 @@ FUNCTIONS = {
         | {"radius": _short_side(0.5), "aperture": _one_of("disc", "gaussian")}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
+    "region_mask": Function(
+        nlf.region_mask,
+        {"image": _image(1, 3), "scribbles": lambda scene: scene.mask(1)},
+        LOCAL | {"reach": _number(0, 0.99), "photometric_bandwidth": _plain(0.03, 0.5)},
+    ),
     "recolor": Function(
         nlf.recolor,
         {"image": _image(3)} | PAINTED,

@@ -43,7 +43,7 @@ def defocus(
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
             variance.
         photometric_bandwidth: as of :func:`region_mask`, in hundredths of Lab.
-        spatial_bandwidth: likewise, in pixels; None is 0.38 of the short side.
+        spatial_bandwidth: likewise, in pixels; None is 0.3 of the short side.
         patch_size: of the patches that are compared.
         **options: further ones of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
 

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import LIGHTNESS, colour_guide, nearby
 from nlfilter_torch.edits.components import Scribbles, scribbled_blocks
@@ -33,6 +33,7 @@ FRAME = 64  # points along the upper or left border of a picture, about
 CONTRAST = 4.0  # with which a likelihood becomes a rough mask
 TRUST, CERTAIN = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 COMPARED = 512  # scribbled pixels, about, that the frame is compared with
+ODD = 0.1  # share of the scribbled pixels that has to be like a point of the frame for this to be no background
 TINY = 1e-6
 
 
@@ -112,7 +113,7 @@ def region_mask(
         >>> scribble = torch.zeros(1, 1, 32, 32)
         >>> scribble[..., 14:18, 12:20] = 1
         >>> mask = region_mask(image, scribble, num_landmarks=50)
-        >>> bool(mask[..., 10:22, 10:22].min() > 0.9), bool(mask[..., :6, :].max() < 0.1)
+        >>> bool(mask[..., 10:22, 10:22].min() > 0.8), bool(mask[..., :6, :].max() < 0.1)
         (True, True)
     """
     check_photograph(image, "image")
@@ -192,8 +193,11 @@ def fit_regions(
 
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
+    check_count(options["num_landmarks"], "num_landmarks")
     options["num_landmarks"] = min(options["num_landmarks"], source.size[0] * source.size[1])
-    if spatial_bandwidth is None or isinstance(spatial_bandwidth, Tensor) or spatial_bandwidth < math.inf:
+    if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
+        if spatial_bandwidth is not None:
+            check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
         options["spatial_bandwidth"] = nearby(spatial_bandwidth, MASK["spatial_bandwidth"].share, source.size)
     operator = source.operator(Guide(options, region_guide, MARGIN, PLANES, spectral=True, sampled=True))
     places = frame_places(source.size)
@@ -259,8 +263,9 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
     scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
     left, right = (lab_of(t.unsqueeze(2)).squeeze(2) for t in (others, some))
     squares = (left.unsqueeze(3) - right.unsqueeze(2)).square().mean(1) / scale.square()  # (B, k, n)
-    alike = torch.exp(-squares) * counted.unsqueeze(1)
-    return alike.amax(2).unsqueeze(1)
+    counted = counted.to(others).unsqueeze(1)
+    share = (torch.exp(-squares) * counted).sum(2) / counted.sum(2).clamp(min=1.0)
+    return (share / ODD).clamp(max=1.0).unsqueeze(1)
 
 
 def _regression(

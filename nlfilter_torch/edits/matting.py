@@ -119,8 +119,9 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: list[Tensor], 
 
 
 def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The mean colours nearby of what is inside a mask and of what is outside, both (B, C, H, W), and whether these are
-    known, (B, 1, H, W) in [0, 1]: hardly where nearly all or nearly nothing nearby is inside.
+    """The mean colours nearby of what is inside a mask and of what is outside, both (B, C, H, W).
+
+    Third, how far these are known, (B, 1, H, W) in [0, 1]: hardly where nearly all or nearly nothing nearby is inside.
 
     Args:
         image: (B, C, H, W).

@@ -428,7 +428,7 @@ DEFOCUS = Edit(
             argument="photometric_bandwidth",
             former=(("bandwidth", 100 / 255),),
         ),
-        *_filter(share=0.38, patch_size=1)[1:],
+        *_filter(share=0.3, patch_size=1)[1:],
     ),
     hint="Paint some of what is to stay sharp; the rest of it is found, and what is around is blurred.",
     brushes=(("in", "Keep sharp"),),

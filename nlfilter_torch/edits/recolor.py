@@ -29,6 +29,7 @@ def recolor(
     keep: Tensor | None = None,
     reach: float | Tensor = RECOLOR.defaults["reach"],
     photometric_bandwidth: float | Tensor = RECOLOR.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = RECOLOR.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
@@ -46,9 +47,9 @@ def recolor(
         reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
             alike.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
+        spatial_bandwidth: in pixels; None is 1.2 of the short side, ``math.inf`` no limit.
         patch_size: of the patches that are compared.
-        **options: further ones of :func:`region_mask`, such as ``spatial_bandwidth``, ``num_landmarks`` or
-            ``generator``.
+        **options: further ones of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
 
     Returns:
         (B, 3, H, W), of the luminance of ``image``, and equal to it where a pixel resembles no stroke. Differentiable
@@ -75,6 +76,7 @@ def recolor(
         keep=keep,
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         **options,
     )
