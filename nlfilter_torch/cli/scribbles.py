@@ -1,5 +1,6 @@
 """Scribbles, masks and rectangles on a photograph, from the options of a command, as rows."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ class Rectangle:
 
 
 @dataclass(frozen=True)
-class Overlay:
+class Overlay(ABC):
     """What lies over a photograph: a picture of its size, and rectangles on top. Rows (h, W, S).
 
     Attributes:
@@ -70,8 +71,9 @@ class Overlay:
     marked: ClassVar[int]  # the channel that is above 0 where something is marked
     empty: ClassVar[str]  # end of the error for a picture in which nothing is marked
 
+    @abstractmethod
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
-        raise NotImplementedError
+        """Some rows of the picture, before rectangles are laid over it."""
 
     def __getitem__(self, rows: slice) -> Floats:
         """The rows from ``rows.start`` to ``rows.stop``."""

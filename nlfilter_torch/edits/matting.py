@@ -7,11 +7,12 @@ neighbourhood, so that tiles agree with the whole picture.
 """
 
 import math
-from collections.abc import Iterator
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from nlfilter_torch.filtering.neighbours import SIDES, neighbour_weights
 
 STEPS = (2, 4, 8)  # on each level from the finest on; the last number holds for all further ones, and the coarsest
 COARSEST = 48  # pixels of the short side on the coarsest level, at least
@@ -19,10 +20,9 @@ LEVELS = 4  # at most, beside the picture itself
 STEEPNESS = 300.0  # of the weights, per mean squared difference of the channels
 LEAST = 1e-4  # weight of neighbours that differ as much as they can
 REFINED, CONTRAST = 2, 0.03  # rounds; difference of colours from which on they tell how much of each a pixel holds
-SIDES = 4  # coarsest pixels that the colours on either side of a border are averaged over, to each direction
+BESIDE = 4  # coarsest pixels that the colours on either side of a border are averaged over, to each direction
 KNOWN = 0.02  # share of a side, of what is nearby, at which its colour counts as half known
 TINY = 1e-4  # weight of pixels that hardly belong to a side
-SHIFTS = ((0, 1), (1, -1), (1, 0), (1, 1))  # to half of the neighbours; the other half lies opposite
 REFERENCE = 112  # short side for which confidences are meant
 
 
@@ -45,7 +45,7 @@ def steps_on(level: int, levels: int) -> int:
 
 def sides_margin(levels: int) -> int:
     """How many pixels around a pixel :func:`colours_beside` depends on."""
-    return (2 + SIDES) << levels
+    return (2 + BESIDE) << levels
 
 
 def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor, short: int) -> Tensor:
@@ -69,7 +69,7 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor, short: int) -> 
     pyramid = [planes]
     for _ in range(levels):
         pyramid.append(F.avg_pool2d(pyramid[-1], 2))
-    count = rough.shape[1]
+    count, steepness = rough.shape[1], -STEEPNESS / image.shape[1]
     found: Tensor | None = None
     for level, some in reversed(list(enumerate(pyramid))):
         colours, target, trust = some.split([image.shape[1], count, count], dim=1)
@@ -79,41 +79,26 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor, short: int) -> 
             found = target / trust
         else:
             found = F.interpolate(found, scale_factor=2, mode="bilinear", align_corners=False)
-        found = jacobi(found, target, trust, list(neighbour_weights(colours)), steps_on(level, levels))
+        weights = neighbour_weights(colours, lambda squared: torch.exp(steepness * squared) + LEAST)
+        found = jacobi(found, target, trust, weights, steps_on(level, levels))
     assert found is not None  # for mypy
     return found[..., :height, :width].clamp(0.0, 1.0)
 
 
-def neighbour_weights(colours: Tensor) -> Iterator[Tensor]:
-    """Weights (B, 1, h, w) of the links to the neighbours at each of :data:`SHIFTS`, of pixels that have one there."""
-    for shift in SHIFTS:
-        here, there = _linked(colours, shift)
-        yield torch.exp((here - there).square().mean(1, keepdim=True) * -STEEPNESS) + LEAST
-
-
-def _linked(planes: Tensor, shift: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The pixels that have a neighbour at a shift, and these neighbours."""
-    (down, right), (height, width) = shift, planes.shape[-2:]
-    left = max(-right, 0)
-    here = planes[..., : height - down, left : width - max(right, 0)]
-    there = planes[..., down:, left + right : width + min(right, 0)]
-    return here, there
-
-
-def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: list[Tensor], steps: int) -> Tensor:
+def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps: int) -> Tensor:
     """Steps towards the solution from ``found``, given products of confidences with the rough mask, and the former."""
     total = trust.clone()
-    for shift, weight in zip(SHIFTS, weights, strict=True):
-        for part in _linked(total, shift):
-            part += weight
+    links = [weights[:, k : k + 1, *here] for k, (here, _) in enumerate(SIDES)]
+    for (here, there), weight in zip(SIDES, links, strict=True):
+        total[..., *here] += weight
+        total[..., *there] += weight
     inverse = 1 / total
     for _ in range(steps):
         # A new tensor each time, which the gradient needs.
         following = target.clone()
-        for shift, weight in zip(SHIFTS, weights, strict=True):
-            (here, there), (to_here, to_there) = _linked(found, shift), _linked(following, shift)
-            to_here.addcmul_(weight, there)
-            to_there.addcmul_(weight, here)
+        for (here, there), weight in zip(SIDES, links, strict=True):
+            following[..., *here].addcmul_(weight, found[..., *there])
+            following[..., *there].addcmul_(weight, found[..., *here])
         found = following * inverse
     return found
 
@@ -133,10 +118,10 @@ def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Te
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
     planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
     coarse = F.avg_pool2d(planes, step)
-    size = 2 * SIDES + 1
+    size = 2 * BESIDE + 1
     # Along one axis after the other; nothing is outside the picture.
-    sums = F.avg_pool2d(coarse, (size, 1), 1, (SIDES, 0))
-    sums = F.avg_pool2d(sums, (1, size), 1, (0, SIDES))
+    sums = F.avg_pool2d(coarse, (size, 1), 1, (BESIDE, 0))
+    sums = F.avg_pool2d(sums, (1, size), 1, (0, BESIDE))
     means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
     least = sums[:, :2].amin(1, keepdim=True)
     found = torch.cat([means.flatten(1, 2), least / (least + KNOWN)], dim=1)

@@ -3,6 +3,7 @@
 ``docs/parameters.md`` is made from it (``python -m benchmarks.parameters docs/parameters.md``).
 """
 
+from dataclasses import replace
 from typing import Any
 
 from nlfilter_torch.edits.declaration import (
@@ -112,6 +113,17 @@ VIEWING_SIZE = Parameter(
     domain="not negative",
     zero="0 is the size of the image",
     metavar="MEGAPIXELS",
+)
+#: Of all edits that find a thing.
+TOLERANCE = Parameter(
+    "tolerance",
+    "number",
+    8.0,
+    "How different two colours may be and still count as alike, in units of CIE Lab.",
+    1,
+    100,
+    "lab",
+    argument="photometric_bandwidth",
 )
 DETAIL = Edit(
     "detail",
@@ -331,18 +343,7 @@ RECOLOR = Edit(
             metavar="0...1",
             slider=Slider("Reach", 0, 0.95, 0.05),
         ),
-        Parameter(
-            "tolerance",
-            "number",
-            8.0,
-            "How different two colours may be and still count as alike, in units of CIE Lab.",
-            1,
-            100,
-            "lab",
-            argument="photometric_bandwidth",
-            former=(("bandwidth", 1.0),),
-            slider=Slider("Tolerance", 3, 40, 1, live=False),
-        ),
+        replace(TOLERANCE, former=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
         *_filter(share=1.2, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
@@ -417,17 +418,7 @@ DEFOCUS = Edit(
             domain="choice",
             choices=("disc", "gaussian"),
         ),
-        Parameter(
-            "tolerance",
-            "number",
-            8.0,
-            "How different two colours may be and still count as alike, in units of CIE Lab.",
-            1,
-            100,
-            "lab",
-            argument="photometric_bandwidth",
-            former=(("bandwidth", 100 / 255),),
-        ),
+        replace(TOLERANCE, former=(("bandwidth", 100 / 255),)),
         *_filter(share=0.3, patch_size=1)[1:],
     ),
     hint="Paint some of what is to stay sharp; the rest of it is found, and what is around is blurred.",
@@ -458,16 +449,7 @@ MASK = Edit(
             domain="below 1",
             metavar="0...1",
         ),
-        Parameter(
-            "tolerance",
-            "number",
-            8.0,
-            "How different two colours may be and still count as alike, in units of CIE Lab.",
-            1,
-            100,
-            "lab",
-            argument="photometric_bandwidth",
-        ),
+        TOLERANCE,
         *(p for p in _filter(share=0.6)[1:] if p.name != "patch_size"),
     ),
 )
