@@ -2,11 +2,13 @@
 
 import ast
 import fcntl
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -281,14 +283,32 @@ def test_signals_while_modules_are_imported(
     assert (finished.returncode, finished.stderr) == (status, told)
 
 
+@pytest.mark.parametrize("importing", [False, True])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals_while_a_file_is_written(
-    photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, status: int
+    photo: Path,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+    status: int,
+    importing: bool,
 ) -> None:
+    """Also while a module is imported that catches every exception."""
     before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "catches_everything.py").write_text(
+        f"import os\ntry:\n    os.kill(os.getpid(), {int(number)})\nexcept BaseException:\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "catches_everything", raising=False)
 
     def interrupted(*_: object) -> None:
         assert len(list(tmp_path.glob(".*.part"))) == 1
+        if importing:
+            importlib.import_module("catches_everything")
+            time.sleep(60)
+            raise AssertionError("the signal was lost")
         os.kill(os.getpid(), number)
 
     monkeypatch.setattr(files, "encode", interrupted)
