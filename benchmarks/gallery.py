@@ -13,8 +13,7 @@ from torch import Tensor
 from benchmarks.figures.colours import BLUE, TRUE, reached
 from benchmarks.figures.focus import PORTRAIT, WIDE, default_map
 from benchmarks.figures.scenes import luminance, marked, painted_over, scene, spots, strokes
-from nlfilter_torch import abstract, colorize, defocus, enhance, recolor
-from nlfilter_torch.edits.detail import colour_masks
+from nlfilter_torch import abstract, colorize, defocus, enhance, recolor, region_mask
 from nlfilter_torch.plotting import save_figure, show_images
 
 SIDE = 270  # of a panel
@@ -29,8 +28,8 @@ def detail() -> dict[str, Tensor]:
     wide = (..., slice(130, 130 + round(512 / WIDE)), slice(None))
     panels = {
         "A spot (yellow)": marked(image, spot),
-        "What is like it": colour_masks(image, spot, time=2.0),
-        "Detail where it is alike": enhance(image, torch.tensor(ALPHA), spot, time=2.0),
+        "What is like it": region_mask(image, spot),
+        "Detail where it is alike": enhance(image, torch.tensor(ALPHA), spot),
     }
     return {title: panel[wide] for title, panel in panels.items()}
 

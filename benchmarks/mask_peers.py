@@ -15,9 +15,8 @@ from skimage.color import rgb2lab
 from skimage.segmentation import random_walker
 from torch import Tensor
 
-from nlfilter_torch import nonlocal_operator, propagate_strokes
+from nlfilter_torch import diffusion_mask, nonlocal_operator, propagate_strokes
 from nlfilter_torch.edits.colour import colour_guide
-from nlfilter_torch.edits.detail import colour_masks
 
 Mask = Callable[[Tensor, Tensor, Tensor], Tensor]
 COMPONENTS, FLOOR = 5, 4.0  # of a Gaussian mixture, and its least variance in squared units of Lab
@@ -98,7 +97,8 @@ def walker(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
 
 def diffusion(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
     """:func:`diffusion_mask` of colours, the paper's way."""
-    return colour_masks(image, inside, negative=outside)
+    operator = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all")
+    return diffusion_mask(operator.spectrum(), inside, negative=outside)
 
 
 def strokes(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:

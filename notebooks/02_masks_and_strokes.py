@@ -69,7 +69,7 @@ show_images(masks, side=220)
 # %%
 regions = torch.cat([spot(117, 24), spot(12, 100)], dim=1)
 alpha = torch.tensor([[3.0, 3.0, 3.0, 1.0], [0.0, 0.2, 0.5, 1.0]])
-show_images({"before": image, "suit crisp, background smooth": enhance(image, alpha, regions, time=3.0)}, side=400)
+show_images({"before": image, "suit crisp, background smooth": enhance(image, alpha, regions)}, side=400)
 
 # %% [markdown]
 # ## 4. Another colour

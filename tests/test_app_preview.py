@@ -6,13 +6,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nlfilter_torch import diffusion_mask, estimate_bandwidth, nonlocal_operator, polynomial_filter
-from nlfilter_torch.app.preview import MaskMaker, Preview, reduce, sampled_operator, stride_for
+from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_filter, region_mask
+from nlfilter_torch.app.preview import Preview, reduce, sampled_operator, stride_for
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.applying import apply_step, prepare
+from nlfilter_torch.edits.applying import apply_step, prepare, seeded
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
-from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.scribbles import Stroke, mask_of
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import cat, difference
@@ -33,7 +33,7 @@ def test_what_is_shown_is_what_is_saved(colour: bool) -> None:
         Recipe(),
         Recipe((Step("detail", alpha=(3.0, 2.0, 1.0)),)),
         Recipe((Step("detail", bandwidth=15.0, spatial_bandwidth=20.0, patch_size=3, landmarks=40),)),
-        Recipe((Step("detail", (region, outside), alpha=(0.2, 1.0, 1.0, 1.0), inside=(3.0, 3.0, 4.0, 1.0), time=0.5),)),
+        Recipe((Step("detail", (region, outside), alpha=(0.2, 1.0, 1.0), inside=(3.0, 4.0, 1.0), reach=0.5),)),
         Recipe((Step("detail", alpha=(2.0, 1.0, 1.0, 1.0)), Step("defocus", (region,)))),
         Recipe((Step("denoise"), Step("detail", residual=1.0), Step("tone"), Step("sharpen"))),
     ):
@@ -211,15 +211,18 @@ def test_preview_of_a_large_photograph_shows_what_saving_gives(step: Step, share
     assert error(preview.render(recipe)) < share * error(recipe.apply(preview.pixels).clamp(0, 1))
 
 
-def test_masks_are_those_of_the_library() -> None:
+def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     image = cat()
-    spectrum = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all").spectrum()
-    maker = MaskMaker(spectrum, ())
-    first, second = torch.zeros(2, 1, 1, 100, 150).unbind()
-    first[..., 20:25, 30:40], second[..., 80:90, 5:9] = 1, 1
-    for region, negative, time in ((first, None, 1.0), (second, None, 1.0), (first, second, 1.0), (first, None, 0.3)):
-        wanted = diffusion_mask(spectrum, region, time=time, negative=negative)
-        assert (maker.mask(region, negative, time) - wanted).abs().max() < 2e-3
+    first, second = Stroke(((0.2, 0.2), (0.3, 0.2)), 0.04, "in"), Stroke(((0.8, 0.8),), 0.04, "out")
+    preview, size = Preview(image), (image.shape[-2], image.shape[-1])
+    inner, outer = mask_of((first,), size), mask_of((second,), size)
+    wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
+    assert torch.equal(preview.mask(Step("detail", (first,))), wanted[0])
+    monkeypatch.setattr("nlfilter_torch.edits.source.nonlocal_operator", None)
+    assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=40)), wanted[1])
+    assert not torch.equal(preview.mask(Step("detail", (first, second), reach=0.9)), wanted[1])
+    with pytest.raises(TypeError):
+        preview.mask(Step("detail", (first, second), tolerance=20.0))
 
 
 def test_areas_are_means() -> None:

@@ -134,8 +134,8 @@ def test_tone(photo: Path, pixels: torch.Tensor) -> None:
 def test_detail_of_regions(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
     sliders, own = torch.tensor([4.0, 3.0, 1.0]), torch.tensor([0.0, 0.5, 1.0])
     regions = torch.cat([box(8, 10, 6, 8), box(30, 40, 8, 8)], dim=1)
-    wanted = enhance(pixels, torch.stack([sliders, own]), regions, time=2.0, num_landmarks=40)
-    arguments = ("--alpha", "4,3,1", "--region", "10,8,8,6", "--region", "40,30,8,8:0,0.5,1", "--spread", 2)
+    wanted = enhance(pixels, torch.stack([sliders, own]), regions, reach=0.75, num_landmarks=40)
+    arguments = ("--alpha", "4,3,1", "--region", "10,8,8,6", "--region", "40,30,8,8:0,0.5,1", "--reach", 0.75)
     assert is_written(run("detail", photo, *arguments), wanted)
     write_photograph(Photograph(regions[:, :1]), tmp_path / "mask.png")
     whole = run("detail", photo, "--alpha", "4,3,1")
@@ -203,7 +203,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "Invalid value for '--radius': "),
         ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
         ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers with commas between"),
-        ("detail", ["--region", "1,2,5,4", "--spread", "0"], "Invalid value for '--time' / '--spread': "),
+        ("detail", ["--region", "1,2,5,4", "--reach", "1"], "Invalid value for '--reach': "),
         ("abstract", ["--tones", "1"], "Invalid value for '--tones'"),
         ("abstract", ["--edge-width", "0"], "Invalid value for '--edge-width': "),
         ("denoise", ["--noise-level", "-1"], "Invalid value for '--noise-level'"),

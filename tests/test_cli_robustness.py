@@ -61,7 +61,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("detail --alpha 1e30,1", "--alpha must be numbers from -1000000 to 1000000"),
         (f"detail --alpha {','.join('1' * 101)}", "--alpha must have at most 100 numbers, got 101"),
         ("detail --residual 1e300", "'--residual': "),
-        ("detail --time nan --region 1,1,3,3", "--time"),
+        ("detail --reach nan --region 1,1,3,3", "--reach"),
         ("detail --memory 1e300", "--memory must be a positive number of gigabytes"),
         ("sharpen --amount nan", "--amount"),
         ("sharpen --guide-blur nan", "--guide-blur"),

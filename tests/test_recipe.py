@@ -8,11 +8,10 @@ import pytest
 import skimage.data
 import torch
 
-from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
+from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, region_mask, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.detail import colour_masks
 from nlfilter_torch.edits.parameters import CRISP, EDITS
 from nlfilter_torch.edits.presets import PRESETS, Preset, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
@@ -28,7 +27,7 @@ LINE = ((0.25, 0.25), (0.5, 0.25))
 IN, OUT = Stroke(LINE, 0.05, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
 BLUE, KEEP = Stroke(LINE, 0.05, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
 ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
-DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, time=0.7, bandwidth=30.0)
+DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, reach=0.7, bandwidth=30.0)
 COLORIZE = Step("colorize", (BLUE,), strength=0.5)
 RECOLOR = Step("recolor", (BLUE, KEEP), reach=0.5, tolerance=20.0)
 DEFOCUS = Step("defocus", (IN,), radius=4.0)
@@ -92,7 +91,7 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
     plain = DETAIL.changed(limits="none", threshold=0.0)
     found = Recipe((plain,)).apply(pixels)
     regions = mask_of([IN], SIZE), mask_of([OUT], SIZE)
-    mask = colour_masks(pixels, regions[0], negative=regions[1], time=0.7, num_landmarks=300, generator=seeded())
+    mask = region_mask(pixels, *regions, reach=0.7, generator=seeded())
     operator = nonlocal_operator(
         reduce_channels(pixels, "luminance"),
         photometric_bandwidth=30 / 255,
@@ -201,7 +200,7 @@ def test_files_from_before_there_was_a_list_of_steps() -> None:
     )
     assert Recipe.from_json(text, "edit.json") == Recipe(
         (
-            Step("detail", (IN,), alpha=(1.0,) * 4, inside=INSIDE, time=0.7),
+            Step("detail", (IN,), alpha=(1.0,) * 4, inside=INSIDE, reach=0.7 / (0.7 + 2 / 3)),
             Step("recolor", (BLUE,), reach=0.8, tolerance=20.0),
             Step("abstract", power=0.0, edges=0.5, edge_width=3.0 * 0.1),
         )

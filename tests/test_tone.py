@@ -61,8 +61,10 @@ def test_detail_reaches_the_likes_of_a_region_only() -> None:
     change, full = (part - image).abs().mean(1), (whole - image).abs().mean(1)
     assert change[0, 36:50, 8:15].mean() > 0.4 * full[0, 36:50, 8:15].mean()
     assert change[0, 2:18, 40:46].mean() < 0.15 * full[0, 2:18, 40:46].mean()
-    none = enhance(image, sliders, box(37, 8), negative=box(37, 8))
-    assert (none - image).abs().mean() < (part - image).abs().mean()
+    less = enhance(image, sliders, box(37, 8), negative=box(45, 10))
+    assert (less - image).abs()[SUIT].mean() < 0.7 * (part - image).abs()[SUIT].mean()
+    with pytest.raises(ValueError, match="negative must hold a painted pixel outside the scribbles of each region"):
+        enhance(image, sliders, box(37, 8), negative=box(37, 8))
     two = enhance(
         image, torch.stack([sliders, torch.tensor([0.0, 0.0, 1.0, 1.0])]), torch.cat([box(37, 8), box(4, 42)], 1)
     )

@@ -194,7 +194,7 @@ FUNCTIONS = {
     "enhance with regions": Function(
         nlf.enhance,
         {"image": _image(1, 3)} | REGIONS | ROWS,
-        NEGATIVE | RESIDUAL | TIME | WIDTH | FILTER | {"mask_bandwidth": _plain(0.03, 0.5)},
+        RESIDUAL | FILTER | {"reach": _plain(0.1, 0.9), "mask_bandwidth": _plain(0.03, 0.5)},
     ),
     "sharpen": Function(
         nlf.sharpen, {"image": _image(1, 3)}, FILTER | {"amount": _number(0, 8), "guide_blur": _short_side(0.5)}

@@ -5,7 +5,7 @@ neighbouring pixels differ by more. The preview therefore compares every n-th pa
 filters the reduced picture with the resulting operator. This halves the error against the reduced result of the whole
 photograph.
 
-Slow results are cached with the settings they depend on: the layers that the sliders weigh, the spectrum for masks, the
+Slow results are cached with the settings they depend on: the layers that the sliders weigh, the filter for masks, the
 filter of the step that is being changed, and the picture after each step.
 """
 
@@ -19,18 +19,18 @@ from torch import Tensor
 
 from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared, viewed_stride
 from nlfilter_torch.edits.colour import change_luminance, nearby_or_far
-from nlfilter_torch.edits.detail import MASK_BANDWIDTH, activity, held_back, split_sliders
+from nlfilter_torch.edits.detail import activity, held_back, split_sliders
+from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
-from nlfilter_torch.filtering.masks import mask_of_exponents
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.spectrum import Spectrum
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
 PIXELS = 1_000_000  # of a preview, at most
@@ -81,47 +81,6 @@ class Layers:
     eigenvalues: Tensor
 
 
-class MaskMaker:
-    """:func:`diffusion_mask` for many regions of the same picture, in a fraction of the time.
-
-    The squared distance of pixels to a region's mean is a quadratic form of their columns of the factor. With cached
-    norms, a new region costs one product of the factor with a vector.
-    """
-
-    def __init__(self, spectrum: Spectrum, key: Key) -> None:
-        self.key = key
-        self._spectrum = spectrum
-        self._time: float | None = None
-
-    def _prepare(self, time: float) -> None:
-        """Cache the quadratic form and the norms for a diffusion time."""
-        if time == self._time:
-            return
-        spectrum = self._spectrum
-        core = spectrum.gain(lambda eigenvalues: eigenvalues.pow(2 * time)).to(spectrum.factor)
-        blocks = spectrum.factor.split(1 << 15, dim=2)
-        norms = torch.cat([(block * (core @ block)).sum(1) for block in blocks], dim=1)
-        self._norms = norms * spectrum.scaling.square()  # |x_i|^2 of the diffusion map, (1, N)
-        self._core, self._time = core, time
-
-    def _distances(self, region: Tensor) -> Tensor:
-        """Squared distances (1, N) of all pixels to the mean of a region (1, 1, h, w)."""
-        spectrum = self._spectrum
-        weights = region.flatten() / region.sum()
-        inside = weights.nonzero().squeeze(1)
-        mean = spectrum.factor[:, :, inside] @ (weights * spectrum.scaling[0])[inside].unsqueeze(1)  # (1, M, 1)
-        product = (mean.mT @ self._core) @ spectrum.factor  # (1, 1, N)
-        square = mean.mT @ self._core @ mean
-        return (self._norms - 2 * product[:, 0] * spectrum.scaling + square[:, 0]).clamp(min=0.0)
-
-    def mask(self, region: Tensor, negative: Tensor | None, time: float, width: float = 4.0) -> Tensor:
-        """The mask (1, 1, h, w) of a region; arguments as those of :func:`diffusion_mask`."""
-        self._prepare(time)
-        scale = region.numel() / width
-        others = None if negative is None else scale * self._distances(negative)
-        return mask_of_exponents(scale * self._distances(region), others).view_as(region)
-
-
 class Preview:
     """A reduced photograph under any edit.
 
@@ -135,7 +94,8 @@ class Preview:
         self.photograph = photograph
         self.pixels = reduce(photograph.float(), self.stride)
         self._layers: Layers | None = None
-        self._masks: MaskMaker | None = None
+        self._source = InMemory(self.pixels, {})  # with the filter of the masks
+        self._tolerance: float | None = None  # of that filter
         self._mask: tuple[Key, Tensor] | None = None
         self._active: tuple[int, Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
@@ -195,23 +155,23 @@ class Preview:
         """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""
         if not detail.has_region():
             return None
-        key = (detail.strokes, detail["time"], detail["landmarks"], detail["spatial_bandwidth"], detail["viewing_size"])
+        key = (detail.strokes, detail["reach"], detail["tolerance"])
         if self._mask is None or self._mask[0] != key:
-            if self._masks is None or self._masks.key != key[2:]:
-                plain = Step("detail", landmarks=detail["landmarks"], spatial_bandwidth=detail["spatial_bandwidth"])
-                stride, guide = self._compared(detail)
-                operator = sampled_operator(
-                    guide,
-                    stride,
-                    plain,
-                    bandwidth=MASK_BANDWIDTH,
-                    distance=detail["spatial_bandwidth"] and self._distance(detail, guide, stride),
-                    channels="all",
-                    patch_size=5,
-                )
-                self._masks = MaskMaker(operator.spectrum(), key[2:])
+            if detail["tolerance"] != self._tolerance:
+                self._source, self._tolerance = InMemory(self.pixels, {}), detail["tolerance"]
             (inner,), others = scribbles_of(detail, self.size)
-            self._mask = (key, self._masks.mask(inner, others.get("negative"), detail["time"]))
+            names = ("mask_bandwidth", "reach")
+            bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
+            fitted = fit_mask(
+                self._source,
+                inner,
+                others.get("negative"),
+                names=("regions", "negative"),
+                photometric_bandwidth=bandwidth,
+                reach=reach,
+                generator=seeded(),
+            )
+            self._mask = (key, self._source.all(fitted))
         return self._mask[1]
 
     def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:

@@ -47,7 +47,7 @@ Preset = Annotated[
 ]
 
 
-@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name != "time"))
+@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance")))
 def batch(
     context: typer.Context,
     folder: Folder,

@@ -26,7 +26,7 @@ References = Annotated[
 ]
 
 
-@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name != "time"))
+@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance")))
 def frames(
     folder: Frames,
     target: Edited,

@@ -5,7 +5,7 @@ Imports no torch, so that help and lists of the command line appear at once.
 
 import json
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -78,8 +78,8 @@ class Parameter:
         argument: name of the function's argument, if it is another one.
         share: of the short side that None stands for, for distances; 0 is no limit.
         least: pixels that a length in hundredths of the short side has at least.
-        former: other names in files, and what values under them are multiplied by; those of the same unit are names of
-            the option, too.
+        former: other names in files, and what values under them are multiplied by, or a function that converts them;
+            those of the same unit are names of the option, too.
         metavar: stands for a value in the help, where it is not that of the unit.
         slider: of the editor.
         is_option: whether the command takes it, beside files.
@@ -101,7 +101,7 @@ class Parameter:
     argument: str = ""
     share: float = 0.0
     least: float = 0.0
-    former: tuple[tuple[str, float], ...] = ()
+    former: tuple[tuple[str, float | Callable[[float], float]], ...] = ()
     metavar: str | None = None
     slider: Slider | None = None
     is_option: bool = True

@@ -15,16 +15,13 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import Limits, nearby_or_far
+from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, FILTER
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.filtering.filters import blend_regions, blend_sliders
-from nlfilter_torch.filtering.masks import diffusion_mask
-from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 
-MASK_BANDWIDTH = 25 / 255  # of the masks, which compare colours
 CALM, CALM_MARGIN = 2.0, 6  # Gaussian window in pixels in which a picture is calm or not, and how far it reaches
 TINY = 1e-12
 
@@ -39,9 +36,8 @@ def enhance(
     outside: Tensor | None = None,
     residual: float | Tensor | None = DETAIL.defaults["residual"],
     channels: str = DETAIL.defaults["channels"],
-    time: float | Tensor = DETAIL.defaults["time"],
-    width: float | Tensor = 4.0,
-    mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    reach: float | Tensor = DETAIL.defaults["reach"],
+    mask_bandwidth: float | Tensor = DETAIL.defaults["mask_bandwidth"],
     threshold: float | Tensor = DETAIL.defaults["threshold"],
     limits: Limits = DETAIL.defaults["limits"],
     viewing_size: float = DETAIL.defaults["viewing_size"],
@@ -52,20 +48,20 @@ def enhance(
 ) -> Tensor:
     """Move the detail sliders of a photograph, each region's own sliders for all that looks like it.
 
-    Paper: eq. (12), (13) inside the masks of eq. (17). The filter compares luminance, the masks compare colours.
+    Paper: eq. (12), (13). The filter compares luminance; the masks are those of :func:`region_mask`.
 
     Args:
         image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
-        alpha: sliders, fine to coarse: (k+1,) or (B, k+1) without regions, one row per region, (K, k+1) or (B, K, k+1),
-            with them; (k+1,) is for all regions.
-        regions: (B, K, H, W), non-negative weights of the pixels of K regions; None edits the whole image.
-        negative: (B, 1 or K, H, W), weights of pixels whose likes are left out, see :func:`diffusion_mask`.
+        alpha: sliders, fine to coarse: (k+1,) or (B, k+1) without regions, one row per region, (K, k+1), with them;
+            (k+1,) is for all regions.
+        regions: (B, K, H, W) in [0, 1], above 0 on some or all of each of K regions, as the scribbles of
+            :func:`region_mask`; None edits the whole image.
+        negative: (B, 1 or K, H, W) in [0, 1], above 0 on some of what is in no region, or not in that one.
         outside: sliders (k+1,) of what is in no region; None leaves it as it is.
         residual: weight of what the eigenvectors do not explain, see :func:`polynomial_filter`.
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
-        time: diffusion time of the masks; larger reaches further.
-        width: squared diffusion distance at which a mask has fallen to 1/e.
-        mask_bandwidth: photometric bandwidth of the masks.
+        reach: of the masks, in [0, 1); larger takes in what is less alike.
+        mask_bandwidth: photometric bandwidth of the masks, in hundredths of Lab.
         threshold: standard deviation of luminance around a pixel at which detail is strengthened half as much as the
             sliders say, less where it is smaller; 0 strengthens all alike.
         limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
@@ -74,8 +70,8 @@ def enhance(
             bandwidths are in pixels of that; 0 is the size of the image.
         photometric_bandwidth: h_y of the filter, or ``"auto"``.
         spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares spots
-            however far apart they are, so that shading is detail, too. One that is given holds for the masks as well.
-        num_landmarks: M, of the masks as well; a spatial term needs more.
+            however far apart they are, so that shading is detail, too.
+        num_landmarks: M of the filter; a spatial term needs more.
         **options: further ones of :func:`nonlocal_operator`, for the filter; ``generator`` holds for the masks as well.
 
     Returns:
@@ -105,8 +101,7 @@ def enhance(
         outside=outside,
         residual=residual,
         channels=channels,
-        time=time,
-        width=width,
+        reach=reach,
         mask_bandwidth=mask_bandwidth,
         threshold=threshold,
         limits=limits,
@@ -127,9 +122,8 @@ def fit_detail(
     outside: Tensor | None = None,
     residual: float | Tensor | None = DETAIL.defaults["residual"],
     channels: str = DETAIL.defaults["channels"],
-    time: float | Tensor = DETAIL.defaults["time"],
-    width: float | Tensor = 4.0,
-    mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
+    reach: float | Tensor = DETAIL.defaults["reach"],
+    mask_bandwidth: float | Tensor = DETAIL.defaults["mask_bandwidth"],
     threshold: float | Tensor = DETAIL.defaults["threshold"],
     limits: Limits = DETAIL.defaults["limits"],
     viewing_size: float = DETAIL.defaults["viewing_size"],
@@ -144,9 +138,6 @@ def fit_detail(
     DETAIL["limits"].check_argument(limits)
     DETAIL["viewing_size"].check_argument(viewing_size)
     DETAIL["threshold"].check_argument(threshold, source.batch)
-    check_positive(time, "time", source.batch)
-    check_positive(width, "width", source.batch)
-    check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
     if residual is not None:
         check_weight(residual, "residual", source.batch)
     if regions is None and (negative is not None or outside is not None):
@@ -156,51 +147,60 @@ def fit_detail(
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
     sliders = alpha - 1  # their change is 0 to the last bit where they are 1
 
-    def change(viewed: Source) -> Fitted:
-        def weights(of: Any, name: str) -> Any:
-            return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
-
-        nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, viewed.size)
-        masks = None
-        if regions is not None:
-            compared = {
-                "photometric_bandwidth": mask_bandwidth,
-                "spatial_bandwidth": None if spatial_bandwidth is None else nearness,
-                "num_landmarks": num_landmarks,
-                "guide_channels": "all",
-            }
-            if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
-                compared["generator"] = options["generator"].clone_state()
-            seen = Guide(compared, spectral=True)
-            masks = viewed.masks(
-                seen, weights(regions, "regions"), weights(negative, "negative"), time=time, width=width
+    if regions is not None:
+        check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
+        count = regions.shape[1] if source.whole else 1 if len(regions.shape) == 2 else regions.shape[2]
+        if alpha.ndim == 1:
+            sliders = sliders.expand(count, -1)
+        elif alpha.ndim != 2 or len(alpha) != count:
+            raise ValueError(
+                f"alpha must have shape ({count}, k+1), a row of sliders for each of the regions, or (k+1,), got "
+                f"{tuple(alpha.shape)}; reshape it"
             )
+
+    def change(viewed: Source) -> Fitted:
+        nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, viewed.size)
         filter_options = options | {
             "photometric_bandwidth": photometric_bandwidth,
             "spatial_bandwidth": nearness,
             "num_landmarks": num_landmarks,
         }
+        compared = {"photometric_bandwidth": mask_bandwidth, "reach": reach}
+        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
+            compared["generator"] = options["generator"].clone_state()
         operator = viewed.operator(Guide(filter_options, exact=residual is not None))
         changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
 
-        def part(pixels: Pixels, inside: Tensor, elsewhere: Tensor | None, weight: Any) -> Tensor:
-            if masks is None:
-                return changed(pixels, inside, weight)
-            found = masks(pixels)
-            inside = inside.expand(found.shape[1], -1) if inside.ndim == 1 else inside
-            if elsewhere is not None:
-                return changed(pixels, blend_sliders(found, inside, elsewhere), weight)
-            still = torch.zeros_like(planes(pixels))
-            return blend_regions(still, found, inside, lambda moved: changed(pixels, moved, weight))
+        def added_and_rest(pixels: Pixels, moved: Tensor) -> Tensor:
+            halves = zip(split_sliders(moved), (0.0, None), strict=True)
+            return torch.cat([changed(pixels, half, weight) for half, weight in halves], dim=1)
 
-        def added_and_rest(pixels: Pixels) -> Tensor:
-            elsewhere = (None, None) if outside is None else split_sliders(outside - 1)
-            halves = zip(split_sliders(sliders), elsewhere, (0.0, None), strict=True)
-            return torch.cat([part(pixels, *half) for half in halves], dim=1)
+        def limited(image: Tensor, found: Tensor) -> Tensor:
+            return held_back(found, activity(image), threshold)
 
-        if not isinstance(threshold, Tensor) and threshold == 0:
-            return Fitted(lambda pixels: sum_of(added_and_rest(pixels)))
-        return Fitted(added_and_rest, lambda image, found: held_back(found, activity(image), threshold), CALM_MARGIN)
+        if regions is None:
+            if not isinstance(threshold, Tensor) and threshold == 0:
+                return Fitted(lambda pixels: sum_of(added_and_rest(pixels, sliders)))
+            return Fitted(lambda pixels: added_and_rest(pixels, sliders), limited, CALM_MARGIN)
+
+        def weights(of: Any, name: str) -> Any:
+            return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
+
+        marked = weights(regions, "regions"), weights(negative, "negative")
+        masks = select_regions(viewed, *marked, names=("regions", "negative"), **compared)
+        elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
+        rows = [*sliders, elsewhere]
+
+        def parts(pixels: Pixels) -> Tensor:
+            return torch.cat([*(added_and_rest(pixels, row) for row in rows), masks.planes(pixels)], dim=1)
+
+        def blended(image: Tensor, found: Tensor) -> Tensor:
+            changes, marks = found[:, : -3 * count], found[:, -3 * count :]
+            inside = masks.masks(image, marks)
+            return limited(image, blend_changes(changes, inside))
+
+        margin = -(-CALM_MARGIN // masks.step) * masks.step
+        return Fitted(parts, blended, max(masks.margin, margin), masks.step)
 
     return fit_change(source, change, planes, viewing_size, limits)
 
@@ -219,6 +219,17 @@ def sum_of(changes: Tensor) -> Tensor:
     """Added detail and the rest (B, 2 C, H, W) together."""
     added, rest = changes.chunk(2, dim=1)
     return added + rest
+
+
+def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
+    """The change of an image (B, S, H, W) from those of K regions and that elsewhere, (B, (K + 1) S, H, W), by masks.
+
+    Where the masks (B, K, H, W) sum to more than 1, they are divided by their sum.
+    """
+    shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
+    rest = (1 - shares.sum(1, keepdim=True)).clamp(min=0.0)
+    apart = changes.unflatten(1, (masks.shape[1] + 1, -1))
+    return (torch.cat([shares, rest], dim=1).unsqueeze(2) * apart).sum(1)
 
 
 def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
@@ -249,18 +260,3 @@ def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
     found = {name: value for name, value in step.arguments(size).items() if name in FILTER}
     share = DETAIL["spatial_bandwidth"].share
     return found | {"spatial_bandwidth": nearby_or_far(found["spatial_bandwidth"], share, size)}
-
-
-def colour_masks(
-    image: Tensor,
-    regions: Tensor,
-    *,
-    negative: Tensor | None = None,
-    time: float | Tensor = DETAIL.defaults["time"],
-    width: float | Tensor = 4.0,
-    mask_bandwidth: float | Tensor = MASK_BANDWIDTH,
-    **options: Any,
-) -> Tensor:
-    """Diffusion masks (B, K, H, W) by colour, as :func:`enhance` uses them, with its arguments."""
-    operator = nonlocal_operator(image, photometric_bandwidth=mask_bandwidth, guide_channels="all", **options)
-    return diffusion_mask(operator.spectrum(), regions.to(image), time=time, width=width, negative=negative)

@@ -132,21 +132,7 @@ def region_mask(
 
 def fit_mask(source: Source, scribbles: Any, background: Any = None, **options: Any) -> Fitted:
     """:func:`region_mask` for any source."""
-    if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
-    inside = source.regions(scribbles, "scribbles")
-    others = [] if background is None else source.regions(background, "background")
-    if len(others) not in (0, 1, len(inside)):
-        raise ValueError(
-            f"background must have 1 channel or one for each of the {len(inside)} regions, got {len(others)}; "
-            "add or drop some"
-        )
-    found = fit_regions(source, inside, others, **options)
-    if others and bool((found.around.detach() <= 0).any()):
-        raise ValueError(
-            "background must hold a painted pixel outside the scribbles of each region in every image, got none; "
-            "paint beside them, or leave it out"
-        )
+    found = select_regions(source, scribbles, background, **options)
     return Fitted(found.planes, found.masks, found.margin, found.step)
 
 
@@ -172,6 +158,36 @@ class Regions:
     def step(self) -> int:
         """See :attr:`Fitted.step`."""
         return 1 << self.levels
+
+
+def select_regions(
+    source: Source,
+    scribbles: Any,
+    background: Any = None,
+    *,
+    names: tuple[str, str] = ("scribbles", "background"),
+    **options: Any,
+) -> Regions:
+    """The masks of regions from scribbles in whatever form a source has these; ``names`` are theirs in errors.
+
+    Further arguments are those of :func:`region_mask`.
+    """
+    if source.channels not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
+    inside = source.regions(scribbles, names[0])
+    others = [] if background is None else source.regions(background, names[1])
+    if len(others) not in (0, 1, len(inside)):
+        raise ValueError(
+            f"{names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(others)}; "
+            "add or drop some"
+        )
+    found = fit_regions(source, inside, others, **options)
+    if others and bool((found.around.detach() <= 0).any()):
+        raise ValueError(
+            f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
+            "paint beside them, or leave it out"
+        )
+    return found
 
 
 def fit_regions(

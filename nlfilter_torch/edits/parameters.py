@@ -125,6 +125,25 @@ TOLERANCE = Parameter(
     "lab",
     argument="photometric_bandwidth",
 )
+#: Of all edits that find regions.
+REACH = Parameter(
+    "reach",
+    "number",
+    0.6,
+    "How far a region spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+    0,
+    0.999,
+    domain="below 1",
+    metavar="0...1",
+)
+REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
+
+
+def reach_of_time(time: float) -> float:
+    """The reach of a region for the diffusion time that files had in its place: 0.6 for 1, the default of both."""
+    return time / (time + 2 / 3) if time > 0 else time
+
+
 DETAIL = Edit(
     "detail",
     """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
@@ -187,18 +206,8 @@ DETAIL = Edit(
             domain="choice",
             choices=("luminance", "all"),
         ),
-        Parameter(
-            "time",
-            "number",
-            1.0,
-            "How far the edit of a region spreads to what is less like it: 0.5 little, 5 far.",
-            0.05,
-            20,
-            domain="positive",
-            former=(("spread", 1.0),),
-            metavar="TIME",
-            slider=Slider("Reach of the region", 0.1, 5, 0.1),
-        ),
+        replace(REACH, former=(("time", reach_of_time), ("spread", reach_of_time)), slider=REACH_SLIDER),
+        replace(TOLERANCE, argument="mask_bandwidth"),
         Parameter(
             "threshold",
             "number",
@@ -439,16 +448,7 @@ MASK = Edit(
     A rough mask to a soft one: `nlfilter-torch mask in.jpg mask.tif --mask rough.png`
     """,
     (
-        Parameter(
-            "reach",
-            "number",
-            0.6,
-            "How far a region spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
-            0,
-            0.999,
-            domain="below 1",
-            metavar="0...1",
-        ),
+        REACH,
         TOLERANCE,
         *(p for p in _filter(share=0.6)[1:] if p.name != "patch_size"),
     ),

@@ -24,7 +24,6 @@ from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
-from nlfilter_torch.filtering.masks import diffusion_mask
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import pad_border, reduce_channels
@@ -133,9 +132,6 @@ class Source(Protocol):
     def operator(self, guide: Guide) -> Operator:
         """The filter of the picture."""
 
-    def masks(self, guide: Guide, regions: Any, negative: Any, *, time: Any, width: Any) -> Planes:
-        """Diffusion masks (B, K, h, W) of regions, in whatever form the source has these."""
-
     def scribbles(self, mask: Any, colours: Any, name: str, *, needed: bool = True) -> Scribbles:
         """Scribbles, in whatever form the source has these; ``name`` is that of the mask in errors.
 
@@ -207,12 +203,6 @@ class InMemory:
             self.kept[key] = operator
         return operator
 
-    def masks(self, guide: Guide, regions: Tensor, negative: Tensor | None, *, time: Any, width: Any) -> Planes:
-        """:func:`diffusion_mask`."""
-        spectrum = cast(Spectrum, self.operator(guide).pairs)
-        masks = diffusion_mask(spectrum, regions.to(self.image), time=time, width=width, negative=negative)
-        return lambda _: masks
-
     def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
         """From tensors (B, 1, H, W) and (B, 3, H, W)."""
         named = [(mask, name, 1), *([] if colours is None else [(colours, "strokes", 3)])]
@@ -243,8 +233,8 @@ class InMemory:
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Weights in another size."""
         check_same_size(weights, self.size, name, "image")
-        least = float(weights.detach().min())  # interpolation may go below it, but hides no weight that is invalid
-        return resize(weights.to(self.image), size).clamp(min=least)
+        ends = weights.detach().aminmax()  # interpolation may go beyond them, but hides no weight that is invalid
+        return resize(weights.to(self.image), size).clamp(float(ends.min), float(ends.max))
 
     def all(self, fitted: "Fitted") -> Tensor:
         """All pixels under an edit."""

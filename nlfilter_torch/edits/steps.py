@@ -5,7 +5,7 @@ Imports no torch.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -152,7 +152,9 @@ class Step:
                 names = [*(p.name for p in declared), *(["strokes"] if declared.brushes else [])]
                 raise ValueError(f"{place} must hold no other entries than {', '.join(names)}, got {entry}; remove it")
             parameter, factor = found
-            converted = value * factor if factor != 1 and is_within(value, -1e300, 1e300) else value
+            converted = value
+            if is_within(value, -1e300, 1e300) and factor != 1:
+                converted = factor(value) if callable(factor) else value * factor
             if not parameter.is_valid(converted):
                 where = f"{'in' if bare else 'of'} {place}"
                 raise ValueError(f"{entry} {where} must be {parameter.wanted}, got {shown(value)}; correct it")
@@ -163,10 +165,10 @@ class Step:
         return step
 
 
-def _find(declared: Edit, entry: str) -> tuple[Parameter, float] | None:
-    """The parameter that an entry is, and what its value is multiplied by."""
+def _find(declared: Edit, entry: str) -> tuple[Parameter, float | Callable[[float], float]] | None:
+    """The parameter that an entry is, and what its value is multiplied or converted by."""
     for parameter in declared:
-        factors: Mapping[str, float] = {parameter.name: 1.0, **dict(parameter.former)}
+        factors: dict[str, float | Callable[[float], float]] = {parameter.name: 1.0, **dict(parameter.former)}
         if entry in factors:
             return parameter, factors[entry]
     return None

@@ -330,12 +330,6 @@ def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[T
     return torch.lerp(image, edit(inside), share.to(image))
 
 
-def blend_sliders(masks: Tensor, alpha: Tensor, outside: Tensor) -> Tensor:
-    """Sliders (B, k+1, H, W) of all pixels: those of :func:`blend_regions`, and ``outside`` (k+1,) elsewhere."""
-    inside, share = _within(masks, alpha)
-    return torch.lerp(outside.to(inside).view(1, -1, 1, 1).expand_as(inside), inside, share)
-
-
 def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Sliders (B, k+1, H, W), averaged over the regions with their masks as weights, and the sum of masks."""
     total = masks.sum(1, keepdim=True)

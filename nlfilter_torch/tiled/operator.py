@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +18,7 @@ from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.sampling import Draws, KeptColumns, Pilot, Report, over_all, patches_at, scaled_patches, visit
-from nlfilter_torch.tiled.sources import GuidePicture, RowSource, Tile
+from nlfilter_torch.tiled.sources import GuidePicture, Tile
 from nlfilter_torch.tiled.statistics import (
     CONVERGED,
     Block,
@@ -296,23 +295,3 @@ class TiledOperator:
             guide = reduce_channels(seen.pixels, recipe.guide_channels)
             patches.append(patches_at(guide, seen, chosen, size))
         return scaled_patches(torch.cat(patches, dim=2), places, self.guide, recipe)
-
-    def region_means(self, regions: RowSource, name: str) -> Tensor:
-        """The mean column of F over each region, (1, M, K) in float64."""
-        rows, size = self.guide.statistics_rows, self.guide.size
-        total = torch.zeros(1, self.balancing.moment.shape[1], regions.shape[2], dtype=torch.float64)
-        weight = torch.zeros(regions.shape[2], dtype=torch.float64)
-        for start in range(0, size[0], rows):
-            self.report("Finding regions", start, size[0])
-            stop = min(start + rows, size[0])
-            weights = torch.from_numpy(np.array(regions[start:stop], np.float32)).flatten(0, 1)  # (n, K)
-            if bool((weights < 0).any()) or not bool(torch.isfinite(weights).all()):
-                raise ValueError(f"{name} must be non-negative and finite, got others; clamp them at 0")
-            if not bool((weights > 0).any()):
-                continue
-            columns = self.columns(self.features(self.guide.picture.tile(start, stop, self.margin)))
-            total += ((columns.factor * columns.scaling.unsqueeze(1)) @ weights.to(columns.factor)).double()
-            weight += weights.double().sum(0)
-        if not bool((weight > 0).all()):
-            raise ValueError(f"{name} must each hold a pixel of positive weight, got an empty one; select some pixels")
-        return total / weight

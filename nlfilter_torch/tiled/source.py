@@ -13,9 +13,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted, Guide, Planes, block_means
-from nlfilter_torch.filtering.masks import check_negative, mask_of_exponents, squared_distances
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
-from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot, visit
@@ -156,24 +154,21 @@ class Tiled:
 
     @torch.no_grad()
     def resized_weights(self, weights: RowSource, size: tuple[int, int], name: str) -> RowSource:
-        """Weights, rows (H, W, K), in a smaller size."""
-        self._check_weights(weights, name)
-        least = [0.0]  # interpolation may go below it, but hides no weight that is invalid
+        """Weights, rows (H, W, K) or (H, W), in a smaller size."""
+        if tuple(weights.shape[:2]) != self.size:
+            raise ValueError(
+                f"{name} must have the height and width of the picture, {self.size}, got {tuple(weights.shape[:2])}; "
+                "resize them"
+            )
+        ends: list[float] = []  # interpolation may go beyond them, but hides no weight that is invalid
 
         def read(start: int, stop: int) -> Tensor:
-            rows = torch.from_numpy(np.array(weights[start:stop], np.float32)).permute(2, 0, 1)[None]
-            least.append(float(rows.min()))
+            rows = torch.from_numpy(np.atleast_3d(np.array(weights[start:stop], np.float32)))
+            rows = rows.permute(2, 0, 1)[None]
+            ends.extend((float(rows.min()), float(rows.max())))
             return rows
 
-        return resized(read, self.size, size).clamp(min=min(least))[0].permute(1, 2, 0).contiguous().numpy()
-
-    def _check_weights(self, weights: RowSource, name: str) -> None:
-        """Raise unless they have the size of the picture."""
-        if tuple(weights.shape[:2]) != self.size or len(weights.shape) != 3:
-            raise ValueError(
-                f"{name} must have the shape {(*self.size, 'K')}, the picture's and the number of regions, got "
-                f"{tuple(weights.shape)}; resize them"
-            )
+        return resized(read, self.size, size).clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
 
     def all(self, fitted: Fitted) -> Tensor:
         """The planes (1, C, H, W) that an edit makes of all pixels."""
@@ -222,36 +217,6 @@ class Tiled:
             ranks = ranks - torch.where(found > 0, summed.gather(1, (found - 1).clamp(min=0)), 0)
             upper = upper << 16 | found[:, 0]
         return upper.int().view(torch.float32)[None].to(self.dtype)
-
-    @torch.no_grad()
-    @full_precision
-    def masks(
-        self, guide: Guide, regions: RowSource, negative: RowSource | None, *, time: float, width: float
-    ) -> Planes:
-        """Diffusion masks (1, K, h, W) of regions, rows (H, W, K) of weights. Paper: eq. (15) to (17).
-
-        Raises:
-            ValueError: if a region does not fit, is negative or empty.
-        """
-        for rows, name in ((regions, "regions"), (negative, "negative")):
-            if rows is not None:
-                self._check_weights(rows, name)
-        check_negative(1 if negative is None else negative.shape[2], regions.shape[2])
-        operator = self.operator(guide)
-        core = operator.pairs.basis(lambda eigenvalues: eigenvalues.pow(time))
-        inner = (core @ operator.region_means(regions, "regions")).mT
-        outer = None if negative is None else (core @ operator.region_means(negative, "negative")).mT
-        scale = self.picture.pixels / width
-
-        def masks(columns: Columns) -> Tensor:
-            coordinates = core.to(columns.factor) @ (columns.factor * columns.scaling.unsqueeze(1))
-
-            def exponents(centres: Tensor) -> Tensor:
-                return scale * squared_distances(coordinates, centres.to(coordinates))
-
-            return mask_of_exponents(exponents(inner), None if outer is None else exponents(outer))
-
-        return operator.each(masks)
 
     def pixels_of(self, tile: Tile) -> TilePixels:
         """All pixels of a tile of the picture."""

@@ -24,8 +24,7 @@ def stream_detail(
     *,
     negative: RowSource | None = None,
     residual: float | None = None,
-    time: float = DETAIL.defaults["time"],
-    width: float = 4.0,
+    reach: float = DETAIL.defaults["reach"],
     channels: Literal["luminance", "all"] = DETAIL.defaults["channels"],
     statistics: Statistics = "sample",
     sample: int = SAMPLE,
@@ -46,13 +45,12 @@ def stream_detail(
         target: receives the rows in order, by assignment to a slice; of the source's shape and any dtype.
         alpha: sliders (k+1,), as of :func:`~nlfilter_torch.polynomial_filter`; with regions (K, k+1), a row for each,
             or (k+1,) for all.
-        regions: rows (H, W, K), non-negative weights of the pixels of K regions; similar pixels are edited, as by
+        regions: rows (H, W, K) in [0, 1], above 0 on some or all of each of K regions, as of
             :func:`~nlfilter_torch.enhance`. None edits the whole picture.
-        negative: rows (H, W, 1 or K), weights of pixels whose similar pixels are left out, likewise.
+        negative: rows (H, W, 1 or K) in [0, 1], above 0 on some of what is in no region, or not in that one.
         residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since the part that
             the eigenvectors capture depends on rare pixels that a sample lacks.
-        time: diffusion time of the regions' masks; larger extends them further.
-        width: squared diffusion distance at which a mask has fallen to 1/e.
+        reach: of the regions' masks, in [0, 1); larger takes in what is less alike.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
         statistics: ``"sample"`` balances the filter and computes its coefficients on a sample of the pixels that
             favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
@@ -64,7 +62,7 @@ def stream_detail(
         report: called with the name of a stage, the part done and the total.
         **options: ``threshold``, ``limits``, ``viewing_size`` and bandwidths of :func:`~nlfilter_torch.enhance`, and
             further ones of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``;
-            bandwidths are numbers.
+            bandwidths, also ``mask_bandwidth``, are numbers.
 
     Raises:
         TypeError, ValueError: if an argument does not fit, or the source changes its size during the work.
@@ -81,18 +79,13 @@ def stream_detail(
     check_target(target, source)
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
-    if regions is not None and alpha.ndim == 2 and len(alpha) != regions.shape[-1]:
-        raise ValueError(
-            f"alpha must have a row for each of the {regions.shape[-1]} regions, got {len(alpha)}; add or drop some"
-        )
     fitted = fit_detail(
         tiled,
         alpha,
         regions,
         negative=negative,
         residual=residual,
-        time=time,
-        width=width,
+        reach=reach,
         channels=channels,
         **options,
     )
