@@ -35,7 +35,8 @@ class Editor:
         command = [sys.executable, "-m", "nlfilter_torch", "app", "--no-open", *arguments]
         # NiceGUI would take the process for a test of its own if pytest's variables reached it.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-        environment = inherited | {"OMP_NUM_THREADS": str(threads)}
+        self.state = folder.parent / f"{folder.name}-state"
+        environment = inherited | {"OMP_NUM_THREADS": str(threads), "XDG_STATE_HOME": str(self.state)}
         self.log = folder / "log.txt"
         with self.log.open("w") as stream:
             self.process = subprocess.Popen(

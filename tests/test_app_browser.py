@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urljoin
 
 import pytest
 import skimage.data
@@ -78,7 +79,7 @@ def opened(tab: Tab, folder: Path) -> Tab:
 
 def shown(tab: Tab) -> torch.Tensor:
     """The picture in the page, (1, 3, H, W)."""
-    answer = tab.page.request.get(tab.page.url.rstrip("/") + tab.source())
+    answer = tab.page.request.get(urljoin(tab.page.url, tab.source()))
     picture = Image.open(io.BytesIO(answer.body()))
     return (
         torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8)
@@ -163,9 +164,8 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     assert (saved - read_photograph(folder / "cli.png").pixels).abs().max() <= 1 / 255
     assert difference(shown(opened), saved) < 5
 
-    page.reload()
-    opened.open(folder / "cat.png")
-    opened.wait_for_picture()
+    page.get_by_role("button", name="Reset").click()
+    expect(opened.mask).not_to_be_visible()
     before = opened.source()
     opened.load_edit(folder / "edit.json")
     opened.wait_for_picture(before)
@@ -249,9 +249,10 @@ def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
     expect(page.get_by_text("detail in edit.json must hold no other entries than")).to_be_visible()
 
     page.get_by_role("button", name="Save photo").click()
-    page.get_by_label("Name").fill("../out.png")
-    page.get_by_role("button", name="Save", exact=True).click()
-    expect(page.get_by_text("the name must be one of a file")).to_be_visible()
+    for name, sentence in (("../out.png", "the name must be one of a file"), ("out.gif", "out.gif must end in .png")):
+        page.get_by_label("Name").fill(name)
+        page.get_by_role("button", name="Save", exact=True).click()
+        expect(page.get_by_text(sentence)).to_be_visible()
     page.get_by_role("button", name="Cancel").click()
 
     assert "Traceback" not in page.content()
@@ -300,6 +301,42 @@ def test_foreign_names_of_this_machine_are_refused(editor: Editor) -> None:
         connection.request("GET", "/", headers={"Host": name})
         assert connection.getresponse().status == status
         connection.close()
+
+
+def test_other_sites_reach_nothing(tab: Tab, editor: Editor, browser: Browser) -> None:
+    """A page of another site opens a websocket and sends a file to the editor: both are refused."""
+    address = editor.url.removeprefix("http://").rstrip("/")
+    opens = """address => new Promise(done => {
+        const socket = new WebSocket(`ws://${address}/_nicegui_ws/socket.io/?EIO=4&transport=websocket`);
+        socket.onopen = () => done("open"); socket.onerror = () => done("refused"); })"""
+    assert tab.page.evaluate(opens, address) == "open"
+    foreign = browser.new_page()
+    foreign.route("http://evil.example/", lambda route: route.fulfill(body="<p>hello</p>", content_type="text/html"))
+    foreign.goto("http://evil.example/")
+    assert foreign.evaluate(opens, address) == "refused"
+    foreign.close()
+    host, port = address.split(":")
+    for headers, status in (
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": f"http://{address}", "Content-Length": "5000000000"}, 413),
+    ):
+        connection = http.client.HTTPConnection(host, int(port))
+        connection.request("POST", "/", headers=headers)
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, editor: Editor, folder: Path) -> None:
+    """The log stays empty; the fixture of the editor looks at it."""
+    other = Tab(browser.new_page(viewport={"width": 1280, "height": 900}))
+    other.page.goto(editor.url)
+    other.open(folder / "cat.png")
+    other.wait_for_picture()
+    other.page.get_by_role("button", name="Save photo").click()
+    expect(other.page.get_by_label("Name")).to_be_visible()
+    other.page.close()
+    opened.page.wait_for_timeout(5000)  # after three seconds a page counts as gone
+    assert editor.log.read_text() == ""
 
 
 def test_pictures_are_for_those_who_know_their_address(opened: Tab, editor: Editor) -> None:

@@ -79,10 +79,13 @@ def test_names_to_save_under(session: Session, name: str, photograph: Photograph
 def test_files_that_are_no_images_leave_all_as_it_was(session: Session, tmp_path: Path) -> None:
     session.set("abstract", power=0.1)
     opened, recipe = session.opened, session.recipe
+    copy = tmp_path / "copy"
+    copy.write_bytes(b"dear diary")
     with pytest.raises(ValueError, match=r"^notes\.txt is not a PNG, JPEG, TIFF or WebP image"):
-        session.open_bytes(b"dear diary", "notes.txt")
+        session.open(copy, "notes.txt")
+    copy.write_bytes(b"")
     with pytest.raises(ValueError, match=r"^empty\.png is empty"):
-        session.open_bytes(b"", "empty.png")
+        session.open(copy, "empty.png")
     with pytest.raises(FileNotFoundError, match="does not exist"):
         session.open(tmp_path / "none.png")
     assert (session.opened, session.recipe) == (opened, recipe)
@@ -91,13 +94,12 @@ def test_files_that_are_no_images_leave_all_as_it_was(session: Session, tmp_path
 def test_a_photograph_too_large_for_the_machine(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     free = type("Memory", (), {"available": 8 * 10**9})
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
-    content = io.BytesIO()
-    Image.new("L", (10_000, 10_000)).save(content, format="PNG")
+    Image.new("L", (10_000, 10_000)).save(session.folder / "copy", format="PNG")
     opened = session.opened
     with pytest.raises(
         MemoryError, match=r"^huge\.png has 10000x10000 pixels and needs about 76.0 GB of memory, but 8.0 GB is"
     ):
-        session.open_bytes(content.getvalue(), "huge.png")
+        session.open(session.folder / "copy", "huge.png")
     assert session.opened is opened
 
 

@@ -1,6 +1,5 @@
 """A session of the editor, without its page: its steps, its strokes and its history."""
 
-import io
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from tests.problems import LINE
 
 
 def test_undo_and_redo(session: Session) -> None:
+    assert not session.can_undo
     assert not session.undo()
     session.set("detail", alpha=(2.0, 1.0, 1.0, 1.0))
     session.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))  # still the same drag
@@ -23,7 +23,10 @@ def test_undo_and_redo(session: Session) -> None:
     session.commit()
     session.commit()  # nothing new
     edited = session.recipe
+    assert session.can_undo
+    assert not session.can_redo
     assert session.undo()
+    assert session.can_redo
     assert session.recipe == Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),))
     assert session.undo()
     assert session.recipe == Recipe()
@@ -90,9 +93,8 @@ def test_a_stroke_before_a_photograph(tmp_path: Path) -> None:
 def test_another_photograph_begins_a_new_edit(session: Session, tmp_path: Path) -> None:
     session.set("abstract", power=0.1)
     session.commit()
-    content = io.BytesIO()
-    Image.fromarray(skimage.data.coffee()[::8, ::8]).save(content, format="JPEG")
-    session.open_bytes(content.getvalue(), "../coffee.jpg")
+    Image.fromarray(skimage.data.coffee()[::8, ::8]).save(tmp_path / "copy", format="JPEG")
+    session.open(tmp_path / "copy", "coffee.jpg")
     assert session.opened is not None
     assert session.opened.name == "coffee.jpg"
     assert session.recipe == Recipe()

@@ -14,7 +14,7 @@ class Canvas:
     """A photograph with its mask, its scribbles and the version before the edit, built into the open element.
 
     Pictures are image files, by their kind, at addresses that hold the token. ``drawn`` is called when a stroke is
-    complete, ``show_error`` with a sentence for the user.
+    complete, ``show_error`` with a sentence for the user. ``session`` may be replaced by another.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class Canvas:
         show_error: Callable[[str], None],
     ) -> None:
         self.pictures: dict[str, bytes] = {}
-        self._session = session
+        self.session = session
         self._brush = brush
         self._token = token
         self._drawn = drawn
@@ -85,8 +85,8 @@ class Canvas:
 
     def draw(self, upto: str | None) -> None:
         """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
-        self.pictures["after"] = drawing.picture(self._session.render(upto))
-        mask = self._session.preview.mask(self._session.recipe.last("detail"))
+        self.pictures["after"] = drawing.picture(self.session.render(upto))
+        mask = self.session.mask()
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
 
     def show(self) -> None:
@@ -103,17 +103,17 @@ class Canvas:
     def draw_strokes(self) -> None:
         """Show the strokes of the step and the one being drawn, unless strokes are hidden."""
         strokes: tuple[Stroke, ...] = ()
-        if self._session.opened is not None and self._show_strokes.value:
-            strokes = self._session.recipe.last(self._step).strokes
+        if self.session.opened is not None and self._show_strokes.value:
+            strokes = self.session.recipe.last(self._step).strokes
             if self._line:
-                height, width = self._session.preview.size
+                height, width = self.session.preview.size
                 points = tuple((x / width, y / height) for x, y in self._line)
                 strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
-            self._photo.set_content(drawing.strokes_svg(strokes, self._session.preview.size))
+            self._photo.set_content(drawing.strokes_svg(strokes, self.session.preview.size))
 
     def _pointer(self, kind: str, x: float, y: float) -> None:
         """Begin, continue or end a stroke."""
-        if self._step not in BRUSHES or self._session.opened is None:
+        if self._step not in BRUSHES or self.session.opened is None:
             return
         if kind == "pointerdown":
             self._line = [(x, y)]
@@ -123,7 +123,7 @@ class Canvas:
             self._line.append((x, y))
         else:
             line, self._line = self._line, []
-            self._session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
+            self.session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
             self._drawn()
         self.draw_strokes()
 

@@ -2,44 +2,63 @@
 
 import asyncio
 import secrets
+import tempfile
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nicegui import background_tasks, events, ui
+from nicegui.elements.upload_files import FileUpload
 
 from nlfilter_torch.app import drawing
+from nlfilter_torch.app.access import LARGEST
 from nlfilter_torch.app.canvas import Canvas
+from nlfilter_torch.app.library import Library
 from nlfilter_torch.app.panel import Brush, Panel
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
+from nlfilter_torch.edits.recipe import Recipe
 
 EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
+LARGEST_PRESET = 20_000_000  # bytes
 PATIENCE = 0.3  # seconds until the page shows that it is working
+LASTING = 10.0  # seconds that an error is shown
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
+# The browser asks before it leaves a page whose edit has changed since a file was written. Nothing is lost if the
+# editor has ended: the edit is kept in a file.
+LEAVING = """<script>
+window.unsaved = false;
+window.addEventListener("beforeunload", (e) => { if (window.unsaved) { e.preventDefault(); e.returnValue = ""; } });
+</script>"""
+DISCONNECTED = "window.socket.on('disconnect', () => { window.unsaved = false; });"
 
 
 class Editor:
-    """One tab of the browser and its session.
+    """One tab of the browser, and the session of the photograph that it shows.
 
     Args:
-        session: of editing.
+        library: where sessions come from.
     """
 
-    def __init__(self, session: Session) -> None:
-        self.session = session
+    def __init__(self, library: Library) -> None:
+        self.library = library
+        self.session = library.new()
+        self._error: ui.notification | None = None
+        self._told: str | None = None  # the last trouble of the session that was shown
         self._token = secrets.token_urlsafe(16)
         self._wanted: list[str | None] = []  # at most one: the last step of the picture to draw next
         self._drawing = False
 
-    def build(self, image: Path | None) -> None:
-        """Lay the page out, and open a photograph if there is one."""
+    def build(self, image: Path | None, address: str = "") -> None:
+        """Lay the page out, and open the photograph of an address that the page had before, or an image."""
         EDITORS[self._token] = self
         self._client = ui.context.client
         self._client.on_delete(lambda: EDITORS.pop(self._token, None))
         ui.add_css(CSS)
+        ui.add_head_html(LEAVING)
         self._build_header()
         brush = Brush()
         with ui.element("div").classes("editor"):
@@ -48,8 +67,7 @@ class Editor:
             with ui.column().classes("panel"):
                 self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
         ui.keyboard(on_key=self._key)
-        if image is not None:
-            self._client.on_connect(lambda: self._begin(image))
+        self._client.on_connect(lambda: self._begin(image, address))
 
     @property
     def pictures(self) -> dict[str, bytes]:
@@ -67,21 +85,39 @@ class Editor:
                 ui.spinner(size="20px", color="white")
                 self._doing = ui.label("").classes("hint")
             self._working.set_visibility(False)
-            photographs = self._upload(self._take_photograph, "image/*")
-            presets = self._upload(self._take_preset, ".json,application/json")
-            _button("Open", "folder_open", "A PNG, JPEG, TIFF or WebP file", js=_pick(photographs))
-            _button("Undo", "undo", "Ctrl+Z", self._undo)
-            _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
+            photographs = self._upload(self._take_photograph, "image/*", LARGEST)
+            presets = self._upload(self._take_preset, ".json,application/json", LARGEST_PRESET)
+            kinds = f"A PNG, JPEG, TIFF or WebP file of at most {LARGEST / 1e9:g} GB"
+            _button("Open", "folder_open", kinds, js=_pick(photographs))
+            self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
+            self._redo_button = _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
+            self._reset_button = _button(
+                "Reset", "restart_alt", "Begin the edit anew; Undo brings it back", self._reset
+            )
             _button("Load edit", "tune", "A saved edit, or sliders found by nlfilter-torch fit", js=_pick(presets))
             _button("Save edit", "bookmark_add", "For other photographs, and for the command line", self._ask_edit_name)
             _button("Save photo", "save", "At full size, into a file", self._ask_photo_name).props(
                 "color=primary unelevated", remove="flat"
             )
 
-    @staticmethod
-    def _upload(action: Callable[[events.UploadEventArguments], Awaitable[None]], accept: str) -> ui.upload:
-        upload = ui.upload(auto_upload=True, on_upload=action)
+    def _upload(
+        self, action: Callable[[events.UploadEventArguments], Awaitable[None]], accept: str, largest: int
+    ) -> ui.upload:
+        upload = ui.upload(auto_upload=True, on_upload=action, max_file_size=largest)
+        upload.on(
+            "rejected",
+            lambda event: self._refuse(event.args[0], event.args[1], largest),
+            js_handler="(entries) => emit([entries[0].failedPropValidation, entries[0].file.name])",
+        )
         return upload.props(f'accept="{accept}"').classes("hidden")
+
+    def _refuse(self, reason: str, name: str, largest: int) -> None:
+        """Say why the browser did not send a file."""
+        if reason == "max-file-size":
+            size = f"{largest / 1e9:g} GB" if largest >= 1e9 else f"{largest / 1e6:g} MB"
+            self._show_error(f"{name} must be at most {size}; make it smaller, or use the command line")
+        else:
+            self._show_error(f"{name} is not a file of the kind that is opened here; choose another")
 
     # Changes
 
@@ -95,9 +131,29 @@ class Editor:
             self._redraw(step)
 
     def _changed(self) -> None:
-        """Show the edit after a complete change."""
+        """Show the edit after a complete change, in all tabs."""
+        self._clear_error()
+        for editor in list(EDITORS.values()):
+            if editor.session is self.session:
+                editor.follow()
+
+    def follow(self) -> None:
+        """Show the edit."""
         self._panel.follow()
+        self._show_state()
         self._redraw()
+
+    def _show_state(self) -> None:
+        """Show what can be undone, and whether the edit is kept."""
+        session = self.session
+        self._undo_button.set_enabled(session.can_undo)
+        self._redo_button.set_enabled(session.can_redo)
+        self._reset_button.set_enabled(session.recipe != Recipe())
+        self._client.run_javascript(f"window.unsaved = {'true' if session.unsaved else 'false'}")
+        if session.trouble != self._told:
+            self._told = session.trouble
+            if session.trouble is not None:
+                self._show_error(session.trouble)
 
     def _undo(self) -> None:
         if self.session.undo():
@@ -106,6 +162,10 @@ class Editor:
     def _redo(self) -> None:
         if self.session.redo():
             self._changed()
+
+    def _reset(self) -> None:
+        self.session.load(Recipe())
+        self._changed()
 
     def _key(self, event: events.KeyEventArguments) -> None:
         if event.action.keydown and event.modifiers.ctrl and str(event.key).lower() == "z":
@@ -141,23 +201,39 @@ class Editor:
 
     # Files
 
-    def _begin(self, image: Path) -> None:
-        if self.session.opened is None:  # a browser that reconnects keeps its edit
-            self._start(self._open(lambda: self.session.open(image)))
+    def _begin(self, image: Path | None, address: str) -> None:
+        self._client.run_javascript(DISCONNECTED)
+        self._show_state()
+        if self.session.opened is not None:  # a browser that reconnects keeps its edit
+            return
+        if address and (image is None or address != image.name):
+            self._start(self._open(lambda: self.library.reopen(address)))
+        elif image is not None:
+            self._start(self._open(lambda: self.library.open(image)))
 
     async def _take_photograph(self, event: events.UploadEventArguments) -> None:
-        content = await event.file.read()
         event.sender.run_method("reset")
-        self._start(self._open(lambda: self.session.open_bytes(content, event.file.name)))
+        self._start(self._open_upload(event.file))
 
-    async def _open(self, read: Callable[[], None]) -> None:
-        await self._run("Opening", read)
+    async def _open_upload(self, file: FileUpload) -> None:
+        with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
+            copy = Path(folder) / "photograph"
+            await file.save(copy)
+            await self._open(lambda: self.library.open_upload(copy, file.name))
+
+    async def _open(self, find: Callable[[], Session]) -> None:
+        self.session = self._canvas.session = self._panel.session = await self._run("Opening", find)
         opened = self.session.opened
-        if opened is None:
+        if opened is None or self._client.is_deleted:
             return
         self._title.set_text(opened.name)
         self._canvas.open(opened)
-        self._changed()
+        self._clear_error()
+        self.follow()
+        with self._client:
+            ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")
+            if self.session.recipe != Recipe():
+                ui.notify("The edit is as you left it. Reset begins anew.", position="bottom-left", timeout=4000)
 
     async def _take_preset(self, event: events.UploadEventArguments) -> None:
         content = await event.file.read()
@@ -173,14 +249,15 @@ class Editor:
         if self.session.opened is None:
             self._show_error("open a photograph first; there is nothing to save")
             return
-        await self._ask("Save the photograph", self.session.suggested_name(), self.session.save)
+        session = self.session
+        await self._ask("Save the photograph", session.suggested_name(), session.check_photograph, session.save)
 
     async def _ask_edit_name(self) -> None:
         name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
-        await self._ask("Save the edit", f"{name}.json", self.session.save_preset)
+        await self._ask("Save the edit", f"{name}.json", self.session.check_preset, self.session.save_preset)
 
-    async def _ask(self, title: str, name: str, save: Callable[[str], Path]) -> None:
-        """Ask for a name, and whether to replace a file of that name, and save."""
+    async def _ask(self, title: str, name: str, check: Callable[[str], Path], save: Callable[[str], Path]) -> None:
+        """Ask for a name that passes a check, and whether to replace a file of that name, and save."""
         with self._client, ui.dialog() as dialog, ui.card().classes("dialog"):
             ui.label(title).classes("text-h6")
             field = ui.input("Name", value=name).props("outlined autofocus").classes("w-full")
@@ -191,7 +268,7 @@ class Editor:
 
             def confirm() -> None:
                 try:
-                    exists = self.session.target(field.value).exists()
+                    exists = check(field.value).exists()
                 except EXPECTED as error:
                     note.set_text(str(error))
                     return
@@ -205,12 +282,17 @@ class Editor:
             field.on("keydown.enter", confirm)
             ok.on_click(confirm)
         chosen = await dialog
-        dialog.delete()
+        if not dialog.is_deleted:  # a tab that is closed takes its dialogs with it
+            dialog.delete()
         if chosen is not None:
             self._start(self._save(save, chosen))
 
     async def _save(self, save: Callable[[str], Path], name: str) -> None:
         path: Path = await self._run("Saving", lambda: save(name))
+        self._clear_error()
+        if self._client.is_deleted:
+            return
+        self._show_state()
         with self._client:
             ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
 
@@ -230,8 +312,18 @@ class Editor:
             raise  # for the log
 
     def _show_error(self, sentence: str) -> None:
-        with self._client:
-            ui.notify(sentence, type="negative", position="bottom", timeout=10000, close_button="OK", multi_line=True)
+        """Show a sentence until something succeeds, or for some seconds."""
+        self._clear_error()
+        if not self._client.is_deleted:
+            with self._client:
+                self._error = ui.notification(
+                    sentence, type="negative", position="bottom", timeout=LASTING, close_button="OK", multi_line=True
+                )
+
+    def _clear_error(self) -> None:
+        error, self._error = self._error, None
+        if error is not None and not error.is_deleted:
+            error.dismiss()
 
     async def _run(self, doing: str, work: Callable[[], Any]) -> Any:
         """Run something in a thread; the page shows ``doing`` if it takes long."""
@@ -249,6 +341,7 @@ def _button(
     label: str, icon: str, tip: str, action: Callable[[], Any] | None = None, *, js: str | None = None
 ) -> ui.button:
     button = ui.button(label, icon=icon, on_click=action).props("flat no-caps dense color=white").classes("q-px-sm")
+    button.props(f'aria-label="{label}"')
     if js is not None:
         button.on("click", js_handler=js)
     return button.tooltip(tip)

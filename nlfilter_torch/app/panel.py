@@ -42,11 +42,11 @@ class Panel:
     """Tabs with sliders, brushes and presets, built into the open element.
 
     They show the settings of the brush, call ``change`` with changes of a step, and ``switch`` with the step of a tab
-    that was opened.
+    that was opened. ``session`` may be replaced by another.
     """
 
     def __init__(self, session: Session, brush: Brush, change: Change, switch: Callable[[str], None]) -> None:
-        self._session, self._brush, self._change = session, brush, change
+        self.session, self._brush, self._change = session, brush, change
         self._following = False
         self._sliders: list[Slider] = []
         self._layout: tuple[int, bool] = (0, False)
@@ -67,7 +67,7 @@ class Panel:
 
     def follow(self) -> None:
         """Show the current edit."""
-        detail = self._session.recipe.last("detail")
+        detail = self.session.recipe.last("detail")
         self._following = True
         if self._layout != (len(detail["alpha"]), detail.has_region()):
             self._layout = (len(detail["alpha"]), detail.has_region())
@@ -86,7 +86,7 @@ class Panel:
         self._response.set_content(svg)
 
     def _slider(self, control: Control, suffix: str = "") -> Slider:
-        return Slider(control, lambda: self._session.recipe, self._change, suffix)
+        return Slider(control, lambda: self.session.recipe, self._change, suffix)
 
     def _build_detail(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
@@ -160,7 +160,7 @@ class Panel:
         if name is None:
             return
         self._presets.set_value(None)  # so that the same one can be chosen again
-        preset, inside = PRESETS[name], self._session.recipe.last("detail")["inside"]
+        preset, inside = PRESETS[name], self.session.recipe.last("detail")["inside"]
         entries = {entry: getattr(preset, entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
         entries["inside"] = inside if inside is not None and len(inside) == len(preset.alpha) else None
         self._change("detail", entries, True)

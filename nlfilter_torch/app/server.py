@@ -1,4 +1,4 @@
-"""The editor's server: one page, one session per tab, pictures at an address that only that tab knows.
+"""The editor's server: one page, one session per photograph, pictures at an address that only that tab knows.
 
 Why NiceGUI and not Gradio: Gradio 6.31 excludes Pillow 13, its ImageEditor sends whole bitmaps, and in a trial with
 headless Chromium its change event had not arrived three seconds after a stroke. NiceGUI reports the pointer in pixels
@@ -11,13 +11,12 @@ from pathlib import Path
 
 from fastapi import Response
 from nicegui import app, ui
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 
+from nlfilter_torch.app.access import Guard
+from nlfilter_torch.app.library import Library
 from nlfilter_torch.app.page import EDITORS, Editor
-from nlfilter_torch.app.session import Session
 
 TITLE = "nlfilter-torch"
-LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
@@ -27,9 +26,8 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
         ValueError: if it cannot listen on that address; port 0 is a free one.
     """
     port = _check_address(host, port)
-    if host in LOCAL:
-        # Against DNS rebinding: other sites must not reach the editor by a host name of their own.
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost", "[::1]"])
+    app.add_middleware(Guard, host=host)
+    library = Library(folder, None if image is None else image.parent)
 
     @app.get("/picture/{token}/{kind}")
     def _picture(token: str, kind: str) -> Response:
@@ -41,8 +39,8 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
     @ui.page("/", title=TITLE)
-    def _page() -> None:
-        Editor(Session(folder)).build(image)
+    def _page(photo: str = "") -> None:
+        Editor(library).build(image, photo)
 
     shown = f"[{host}]" if ":" in host else host
     app.on_startup(lambda: print(f"Editor at http://{shown}:{port}/ - Ctrl+C ends it", flush=True))

@@ -1,6 +1,6 @@
 """The editing of one photograph: what is open, the edit, and what can be undone. Independent of the page."""
 
-import tempfile
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from nlfilter_torch.app.preview import PIXELS, Preview
+from nlfilter_torch.app.sidecar import Sidecar
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
@@ -38,17 +39,28 @@ class Opened:
 
 
 class Session:
-    """The state of one page.
+    """The state of the pages that show a photograph.
 
     Args:
         folder: where files are saved.
         pixels: largest number of pixels of the preview.
+
+    Attributes:
+        recipe: the edit.
+        opened: the photograph, or None.
+        address: by which a page finds the session again.
+        saved: the edit of the file that was written last.
     """
 
     def __init__(self, folder: Path, pixels: int = PIXELS) -> None:
         self.folder = folder
         self.recipe = Recipe()
         self.opened: Opened | None = None
+        self.address = ""
+        self.saved = Recipe()
+        self._sidecar: Sidecar | None = None
+        self._kept = Recipe()  # what the sidecar holds
+        self._drawing = threading.Lock()  # previews keep what was computed, one picture at a time
         self._pixels = pixels
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
@@ -67,15 +79,41 @@ class Session:
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
         self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels))
-        self.recipe = self._shown = Recipe()
+        self.recipe = self._shown = self.saved = Recipe()
         self._past, self._future = [], []
 
-    def open_bytes(self, content: bytes, name: str) -> None:
-        """:meth:`open` with a file's content, as a browser sends it."""
-        with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
-            path = Path(folder) / "photograph"
-            path.write_bytes(content)
-            self.open(path, Path(name).name)
+    def keep_in(self, sidecar: Sidecar) -> None:
+        """Keep the edit in a file from now on, beginning with the edit that is there."""
+        self._sidecar = sidecar
+        self.recipe = self._shown = self.saved = self._kept = sidecar.read() or Recipe()
+
+    def restore(self) -> None:
+        """Load what is kept if another program has changed it."""
+        if self._sidecar is not None:
+            found = self._sidecar.read() or Recipe()
+            if found != self._kept:
+                self._kept = found
+                self.load(found)
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the edit is not kept, or None."""
+        return None if self._sidecar is None else self._sidecar.trouble
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether the edit has changed since it was opened or written."""
+        return self.opened is not None and self.recipe != self.saved
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a change to undo."""
+        return bool(self._past)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is a change that was undone."""
+        return bool(self._future)
 
     @property
     def preview(self) -> Preview:
@@ -94,6 +132,14 @@ class Session:
             self._past = [*self._past[-UNDOS + 1 :], self._shown]
             self._future = []
             self._shown = self.recipe
+            self._keep()
+
+    def _keep(self) -> None:
+        written = self._shown.written
+        if self._sidecar is not None and written != self._kept:
+            self._sidecar.write(written)
+            if self._sidecar.trouble is None:
+                self._kept = written
 
     def load(self, recipe: Recipe) -> None:
         """Replace the edit, as one change."""
@@ -113,6 +159,7 @@ class Session:
             return False
         back.append(self._shown)
         self.recipe = self._shown = there.pop()
+        self._keep()
         return True
 
     def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
@@ -136,7 +183,13 @@ class Session:
 
     def render(self, upto: str | None = None) -> Tensor:
         """The preview under the edit, (1, C, h, w) in [0, 1]; see :meth:`Preview.render`."""
-        return self.preview.render(self.recipe, upto)
+        with self._drawing:
+            return self.preview.render(self.recipe, upto)
+
+    def mask(self) -> Tensor | None:
+        """The mask of the sliders inside; see :meth:`Preview.mask`."""
+        with self._drawing:
+            return self.preview.mask(self.recipe.last("detail"))
 
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
@@ -146,6 +199,21 @@ class Session:
                 f"the name must be one of a file, such as photo-edited.png, got {name!r}; files go to {self.folder}"
             )
         return self.folder / path
+
+    def check_photograph(self, name: str) -> Path:
+        """:meth:`target` of a name under which the photograph can be saved; raises ValueError for others."""
+        target = self.target(name)
+        if self.opened is None:
+            raise ValueError("open a photograph first; there is nothing to save")
+        check_output(target, self.opened.photograph)
+        return target
+
+    def check_preset(self, name: str) -> Path:
+        """:meth:`target` of a name under which the edit can be saved; raises ValueError for others."""
+        target = self.target(name)
+        if target.suffix.lower() != ".json":
+            raise ValueError(f"the name of a preset must end in .json, got {name!r}")
+        return target
 
     def suggested_name(self) -> str:
         """The name of the photograph with ``-edited``, and an extension of a file type that can hold it."""
@@ -165,15 +233,14 @@ class Session:
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
         """
-        target = self.target(name)
-        if self.opened is None:
-            raise ValueError("open a photograph first; there is nothing to save")
+        target = self.check_photograph(name)
+        assert self.opened is not None  # for mypy
         recipe, photograph = self.recipe, self.opened.photograph
-        check_output(target, photograph)
         height, width = photograph.size
         needed = recipe.bytes_per_pixel
         check_memory(Path(self.opened.name), width, height, needed)
         write_photograph(photograph.with_pixels(recipe.apply(photograph.pixels)), target)
+        self.saved = recipe
         return target
 
     def save_preset(self, name: str) -> Path:
@@ -182,11 +249,10 @@ class Session:
         Raises:
             ValueError, OSError: if it cannot be written.
         """
-        target = self.target(name)
-        if target.suffix.lower() != ".json":
-            raise ValueError(f"the name of a preset must end in .json, got {name!r}")
+        target, recipe = self.check_preset(name), self.recipe
         with open_beside(target) as stream:
-            stream.write(self.recipe.to_json().encode())
+            stream.write(recipe.to_json().encode())
+        self.saved = recipe
         return target
 
     def load_preset(self, content: bytes, name: str) -> None:

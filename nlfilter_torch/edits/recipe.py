@@ -46,6 +46,11 @@ class Recipe:
         """The steps that change anything."""
         return tuple(step for step in self.steps if step.changes())
 
+    @property
+    def written(self) -> "Recipe":
+        """The edit without steps that change nothing and hold no strokes, as it is written to a file."""
+        return Recipe(tuple(step for step in self.steps if step.changes() or step.strokes))
+
     def last(self, edit: str) -> Step:
         """The last step of an edit, or one that changes nothing if there is none."""
         return next((step for step in reversed(self.steps) if step.edit == edit), Step.idle(edit))
@@ -97,7 +102,7 @@ class Recipe:
         return result
 
     def to_json(self) -> str:
-        """The edit as text, without steps that change nothing.
+        """The edit as text, without steps that change nothing and hold no strokes.
 
         >>> print(Recipe((Step("tone"), Step("detail", alpha=(2.0, 1.0)))).to_json())
         {
@@ -115,7 +120,7 @@ class Recipe:
         }
         <BLANKLINE>
         """
-        return in_file(step.to_json("    ") for step in self.acting)
+        return in_file(step.to_json("    ") for step in self.written.steps)
 
     @staticmethod
     def from_json(text: str, name: str, remedy: str = REMEDY) -> "Recipe":

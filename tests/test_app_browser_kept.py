@@ -1,0 +1,131 @@
+"""Edits in the browser that outlive the page, the tab and the editor."""
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Dialog, expect
+
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.io.photographs import Photograph, write_photograph
+from tests.browser import CHROMIUM, Editor, Tab, chromium
+from tests.problems import cat
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> Path:
+    """A folder with two photographs."""
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    write_photograph(Photograph(cat()), folder / "cat.png")
+    write_photograph(Photograph(cat().flip(3)), tmp_path / "elsewhere.png")
+    return folder
+
+
+def visit(browser: Browser, url: str) -> Tab:
+    tab = Tab(browser.new_page(viewport={"width": 1280, "height": 800}))
+    tab.page.goto(url)
+    return tab
+
+
+def shown(tab: Tab) -> None:
+    """Wait for the photograph."""
+    expect(tab.page.get_by_text("150×100 pixels")).to_be_visible()
+    tab.wait_for_picture()
+    expect(tab.page.locator(".response circle")).not_to_have_count(0)
+
+
+def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
+    editor = Editor(shots, "cat.png")
+    kept = shots / "cat.png.edit.json"
+    try:
+        tab = visit(browser, editor.url)
+        page = tab.page
+        shown(tab)
+        undo = page.get_by_role("button", name="Undo")
+        expect(undo).to_be_disabled()
+        tab.paint((0.2, 0.9), (0.3, 0.9))
+        expect(page.get_by_text("In the region")).to_be_visible()
+        expect(undo).to_be_enabled()
+        asked: list[str] = []
+
+        def stay(dialog: Dialog) -> None:
+            asked.append(dialog.type)
+            dialog.dismiss()
+
+        page.on("dialog", stay)
+        page.evaluate("() => { location.href = 'about:blank'; }")
+        page.wait_for_timeout(500)
+        assert asked == ["beforeunload"]
+        assert page.url.endswith("?photo=cat.png")
+        page.remove_listener("dialog", stay)
+
+        page.reload()
+        expect(page.locator("path.stroke")).to_have_count(1)
+        expect(page.get_by_text("In the region")).to_be_visible()
+        other = visit(browser, page.url)
+        shown(other)
+        expect(other.page.locator("path.stroke")).to_have_count(1)
+        other.paint((0.6, 0.2), (0.7, 0.2))
+        expect(page.locator("path.stroke")).to_have_count(2)  # in both
+        page.get_by_role("button", name="Undo").click()
+        expect(other.page.locator("path.stroke")).to_have_count(1)
+        other.page.close()
+        recipe = Recipe.from_json(kept.read_text(), "")
+        assert len(recipe.last("detail").strokes) == 1
+        port = editor.url.rstrip("/").rsplit(":", 1)[1]
+        editor.process.send_signal(signal.SIGKILL)
+        editor.process.wait(30)
+        editor.stop()
+        editor = Editor(shots, "--port", port)
+        # The page finds the new editor by itself, and asks nothing: the edit is kept.
+        expect(undo).to_be_disabled(timeout=60_000)
+        shown(tab)
+        expect(page.locator("path.stroke")).to_have_count(1)
+        expect(page.get_by_text("In the region")).to_be_visible()
+        before = tab.source()
+        page.get_by_role("button", name="Reset").click()
+        tab.wait_for_picture(before)
+        expect(page.locator("path.stroke")).to_have_count(0)
+        page.close()
+        assert not kept.exists()
+        assert editor.log.read_text() == ""
+    finally:
+        editor.stop()
+
+
+def test_a_photograph_of_another_folder(browser: Browser, shots: Path) -> None:
+    """The browser does not tell where it is: its edit is kept in the user's folder, and comes back with it."""
+    editor = Editor(shots)
+    try:
+        tab = visit(browser, editor.url)
+        tab.open(shots.parent / "elsewhere.png")
+        shown(tab)
+        tab.paint((0.2, 0.9), (0.3, 0.9))
+        expect(tab.page.get_by_text("In the region")).to_be_visible()
+        tab.page.reload()
+        expect(tab.page.locator("path.stroke")).to_have_count(1)
+        address = tab.page.url
+        tab.page.close()
+        assert [path.name for path in (editor.state / "nlfilter-torch").glob("*-elsewhere.png.edit.json")] != []
+        assert {path.name for path in shots.iterdir()} == {"cat.png", "log.txt"}
+        port = editor.url.rstrip("/").rsplit(":", 1)[1]
+        editor.stop()
+        editor = Editor(shots, "--port", port)
+        tab = visit(browser, address)
+        expect(tab.page.get_by_text("open the photograph again")).to_be_visible()
+        tab.open(shots.parent / "elsewhere.png")
+        expect(tab.page.locator("path.stroke")).to_have_count(1)
+        expect(tab.page.get_by_text("open the photograph again")).not_to_be_visible()
+        tab.page.close()
+    finally:
+        editor.stop()
