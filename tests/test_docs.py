@@ -147,7 +147,7 @@ def test_the_table_of_presets_is_theirs() -> None:
 
 def test_every_claim_about_training_has_its_test() -> None:
     table = PAGES["training"].text.split("| test |\n|---|---|---|\n")[1].split("\n\n")[0]
-    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py"))
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
     for row in table.splitlines():
         tests = re.findall(r"`(test_\w+)`", row.split("|")[3])
         assert tests, row

@@ -15,6 +15,7 @@ from nlfilter_torch import (
     detail_layers,
     diffusion_map,
     diffusion_mask,
+    enhance,
     estimate_bandwidth,
     nonlocal_operator,
     polynomial_filter,
@@ -58,7 +59,6 @@ BAD_IMAGES: dict[str, tuple[Any, type[Exception], str]] = {
     "rank 5": (EMPTY[None], ValueError, "must have shape (B, C, H, W), got (1, 2, 1, 8, 9)"),
     "no row": (EMPTY[:, :, :0], ValueError, "must hold at least one pixel, got shape (2, 1, 0, 9)"),
     "no channel": (EMPTY[:, :0], ValueError, "must hold at least one pixel, got shape (2, 0, 8, 9)"),
-    "no image": (EMPTY[:0], ValueError, "must hold at least one pixel, got shape (0, 1, 8, 9)"),
     "NaN": (EMPTY + NAN, ValueError, "must be finite, got 144 NaN or infinite value(s)"),
     "infinity": (INFINITY * PAINTED.where(PAINTED > 0, 1), ValueError, "must be finite, got 144 NaN or infinite"),
     "one NaN": (EMPTY.index_fill(3, torch.tensor([4]), NAN), ValueError, "must be finite, got 16 NaN or infinite"),
@@ -87,6 +87,19 @@ def test_bad_images(function: str, bad: str) -> None:
     name, call = TAKE_AN_IMAGE[function]
     value, error, message = BAD_IMAGES[bad]
     raises(lambda: call(value), error, f"{name} {message}")
+
+
+def test_empty_batches_are_refused_where_they_make_no_sense() -> None:
+    fits = ("nonlocal_operator", "estimate_bandwidth")  # all others have two images beside none
+    for function, (name, call) in TAKE_AN_IMAGE.items():
+        if function not in fits:
+            name = "image" if function == "NonlocalFilter" else name
+            raises(lambda call=call: call(EMPTY[:0]), ValueError, f"{name} must h")  # type: ignore[misc]
+    raises(
+        lambda: enhance(EMPTY[:0], torch.ones(4)),
+        ValueError,
+        "image must hold at least one pixel, got shape (0, 1, 8, 9)",
+    )
 
 
 def test_values_whose_sum_overflows_are_finite() -> None:

@@ -239,19 +239,24 @@ def test_bandwidths_can_be_assigned() -> None:
         learned.photometric_bandwidth = -1.0
 
 
-def test_state_dicts_of_earlier_versions_load() -> None:
+@pytest.mark.parametrize("shape", [(), (1,)])
+def test_state_dicts_of_earlier_versions_load(shape: tuple[int, ...]) -> None:
     layer = everything()
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter += 0.1
     names = {f"affinity.log_{name}": f"affinity.{name}.logarithm" for name in LEARNED}
     earlier = {names.get(name, name): value for name, value in layer.state_dict().items()}
+    assert earlier["sliders.residual"].shape == (1,)
+    earlier = {name: value.reshape(shape) if value.numel() == 1 else value for name, value in earlier.items()}
     assert set(names.values()) < earlier.keys()
     other = everything()
     other.load_state_dict(earlier)
     torch.testing.assert_close(other(image()), layer(image()), atol=0, rtol=0)
     mask = DiffusionMask(learn=("time", "width"))
-    mask.load_state_dict({"time.logarithm": torch.tensor(0.5), "width.logarithm": torch.tensor(1.5)})
+    logarithms = {"time": 0.5, "width": 1.5}
+    mask.load_state_dict({f"{k}.logarithm": torch.full(shape, value) for k, value in logarithms.items()})
+    assert other.photometric_bandwidth.shape == mask.time.shape == ()  # type: ignore[union-attr]
     assert (mask.time.item(), mask.width.item()) == pytest.approx((math.exp(0.5), math.exp(1.5)))
 
 

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.values import is_hidden
+
 # Pixels in a block, per core. A block of affinities is M x CACHED floats, 0.8 MB for M = 100, and stays in the cache of
 # its core until it is multiplied by the inverse Cholesky factor. Rows of 2048 floats would map to the same few cache
 # sets and evict each other; 2032 floats are an odd number of cache lines. A sweep writes only vectors, so its blocks
@@ -24,7 +26,7 @@ def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
     On Linux numpy requests huge pages and torch does not: the first write of 400 MB takes 50 ms instead of 200. The
     tensor is aligned to a cache line, so that whole lines can be written without being read first.
     """
-    if like.device.type != "cpu" or like.dtype not in (torch.float32, torch.float64):
+    if is_hidden(like) or like.dtype not in (torch.float32, torch.float64):
         return like.new_empty(shape)
     numbers = np.empty(math.prod(shape) + LINE, np.float64 if like.dtype == torch.float64 else np.float32)
     start = -(numbers.ctypes.data // numbers.itemsize) % LINE

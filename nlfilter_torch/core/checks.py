@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
+
+from nlfilter_torch.core.values import is_hidden
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Response = Callable[[Tensor], Tensor]
@@ -55,13 +56,15 @@ def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
         raise TypeError(f"{name} must be a {kind.__name__}, got {type(value).__name__}; {remedy}")
 
 
-def check_image(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
-    """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with at least one pixel."""
+def check_image(
+    image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None, empty: bool = False
+) -> None:
+    """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with pixels; B may be 0 if ``empty``."""
     check_tensor(image, name, "convert it with torch.as_tensor")
     check_dtype(image, name, "divide integer pixels by their largest value", values=" with values in [0, 1]")
     if image.ndim != 4:
         raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
-    if image.numel() == 0:
+    if 0 in image.shape[empty:]:
         raise ValueError(f"{name} must hold at least one pixel, got shape {tuple(image.shape)}; pass a non-empty image")
     if channels is not None and image.shape[1] != channels:
         raise ValueError(
@@ -73,7 +76,7 @@ def check_image(image: Tensor, name: str, *, channels: int | None = None, batch:
 
 
 def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise if ``tensor`` holds NaN or infinity; skipped on accelerators (no synchronisation) and while compiling."""
+    """Raise if ``tensor`` holds NaN or infinity; skipped where :func:`~nlfilter_torch.core.values.is_hidden` holds."""
     if is_hidden(tensor):
         return
     values = tensor.detach()
@@ -105,18 +108,13 @@ def warn_of_scale(image: Tensor, name: str) -> None:
     Skipped where :func:`check_finite` is. Images with other numbers of channels are feature maps, which may have any
     values; HDR pictures stay below 16.
     """
-    if is_hidden(image) or image.shape[1] not in (1, 3):
+    if is_hidden(image) or image.shape[1] not in (1, 3) or len(image) == 0:
         return
     largest = float(image.detach().max())
     if largest > FAR_OUTSIDE:
         warn(
             f"{name} must be in [0, 1] or near it, got values up to {largest:g}; divide by the value of white, say 255"
         )
-
-
-def is_hidden(tensor: Tensor) -> bool:
-    """Whether the values of a tensor cannot be checked: on an accelerator, while compiling, or in ``torch.func``."""
-    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_functorch_wrapped_tensor(tensor)
 
 
 def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str) -> None:
@@ -330,10 +328,10 @@ def check_eigenvalues(values: Tensor) -> None:
         )
 
 
-def check_features(features: Tensor, name: str, size: int | None = None) -> None:
-    """Raise unless ``features`` is a finite floating-point (B, D, N) tensor, of ``size`` D if that is given."""
+def check_features(features: Tensor, name: str, size: int | None = None, *, empty: bool = False) -> None:
+    """Raise unless ``features`` is a finite (B, D, N) tensor, of ``size`` D if given; B may be 0 if ``empty``."""
     check_dtype(features, name, "convert them")
-    if features.ndim != 3 or features.numel() == 0:
+    if features.ndim != 3 or 0 in features.shape[empty:]:
         raise ValueError(
             f"{name} must have shape (B, D, N) with at least one point, got {tuple(features.shape)}; "
             "put points last and add the missing dimensions"

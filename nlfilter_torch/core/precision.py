@@ -12,6 +12,7 @@ from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -20,6 +21,15 @@ R = TypeVar("R")
 def working_dtype(tensor: Tensor) -> torch.dtype:
     """float64 for float64 input, float32 for everything narrower."""
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+def as_given(result: Tensor, image: Tensor) -> Tensor:
+    """A result (B, C, H, W) in the dtype of the image that it was computed from, and channels-last where that is."""
+    result = result.to(image.dtype)
+    if image.is_contiguous() or is_functorch_wrapped_tensor(image) or is_functorch_wrapped_tensor(result):
+        return result
+    channels_last = image.is_contiguous(memory_format=torch.channels_last)
+    return result.contiguous(memory_format=torch.channels_last) if channels_last else result
 
 
 @contextmanager
@@ -38,7 +48,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         devices = [a.device.type for a in args if isinstance(a, Tensor)]  # Dynamo of PyTorch 2.8 knows no `next`
-        device = devices[0] if devices else "cuda"
+        device = devices[0] if devices and devices[0] != "meta" else "cuda"
         with torch.autocast("cpu", enabled=False), torch.autocast(device, enabled=False):
             if torch.cuda.is_available() and not torch.compiler.is_compiling():
                 with _no_tf32():

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import fold_batch
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_dtype,
@@ -19,7 +20,7 @@ from nlfilter_torch.core.checks import (
     check_weight,
     checked_response,
 )
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.precision import as_given, full_precision
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, Spectrum
 
@@ -132,11 +133,11 @@ def polynomial_filter(
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
     alpha = alpha if alpha.ndim == 4 else operator.among.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
-    if residual is not None:
+    if residual is not None and len(filtered):
         captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
         weight = operator.among.copy_to_group(residual)
         filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
-    return filtered.to(image.dtype)
+    return as_given(filtered, image)
 
 
 def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, remainder: Tensor) -> Tensor:
@@ -200,6 +201,12 @@ def spectral_filter(
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     response = checked_response(response, spectrum.support)
     check_weight(residual, "residual", spectrum.factor.shape[0])
+    check_tensor(image, "image", "convert it with torch.as_tensor")
+    if image.ndim == 4 and len(image) == 0:
+        check_image(image, "image", empty=True)
+        check_same_size(image, spectrum.size, "image", "spectrum")
+        fold_batch(image, spectrum.factor.shape[0])  # checks the batch
+        return image.clone()
     if coefficients is None:
         coefficients = spectrum.coefficients(image)
     else:
@@ -209,11 +216,11 @@ def spectral_filter(
         shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
         check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
     if isinstance(residual, int | float) and residual == 0:
-        return spectrum.synthesize(response, coefficients).to(image.dtype)
+        return as_given(spectrum.synthesize(response, coefficients), image)
     rho = torch.as_tensor(spectrum.among.copy_to_group(residual)).to(spectrum.root).reshape(-1, 1)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
-    return (filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered)).to(image.dtype)
+    return as_given(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
 
 
 @full_precision

@@ -21,6 +21,7 @@ from nlfilter_torch.core.checks import (
     check_tensor,
     check_weight,
 )
+from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
@@ -46,6 +47,10 @@ class FittedFilter:
     balancing: PixelScaling
     moments: Tensor
     captured: Tensor
+
+    def to(self, target: Target, dtype: torch.dtype | None = None) -> "FittedFilter":
+        """The filter on another device, or in another precision; as :meth:`NonlocalOperator.to`."""
+        return moved(self, target, dtype)
 
     @full_precision
     def layers(
@@ -126,6 +131,9 @@ class FittedFilter:
             share = columns.remainder.unsqueeze(1).expand_as(pixels)
             planes = torch.cat([planes, torch.stack([pixels - captured, share], dim=1)], dim=1)
         return planes.unflatten(-1, (-1, size[1]))
+
+
+loadable(FittedFilter)
 
 
 def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:

@@ -4,9 +4,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED, block_length, weighted
-from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, is_hidden, warn
+from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, warn
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined
@@ -198,7 +199,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
             sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
             centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
-            if members.device.type != "cpu":  # comparing would synchronise with the device
+            if is_hidden(members):  # comparing would synchronise with the device
                 continue
             if not spectrum.among.max((previous != assignment).any().to(members)):
                 break

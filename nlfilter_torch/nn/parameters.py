@@ -26,7 +26,7 @@ class Learnable(nn.Module):
         if other is None or not isinstance(value, other):
             check_positive(value, name)
         self.register_parameter(
-            self.learnable[name], nn.Parameter(torch.tensor(math.log(value))) if name in learn else None
+            self.learnable[name], nn.Parameter(torch.tensor([math.log(value)])) if name in learn else None
         )
         setattr(self, f"_{name}", value)
 
@@ -45,15 +45,16 @@ class Learnable(nn.Module):
         unexpected_keys: list[str],
         error_msgs: list[str],
     ) -> None:
-        """Accept the names of earlier versions; report learned options that this layer does not learn."""
+        """Accept names and shapes of earlier versions; report learned options that this layer does not learn."""
         own = dict(self.named_parameters())
         for option, parameter in self.learnable.items():
             earlier = f"{prefix}{option}.logarithm"
             if earlier in state_dict:
                 state_dict[prefix + parameter] = state_dict.pop(earlier)
+            as_vectors(state_dict, [prefix + parameter])
             if parameter not in own and prefix + parameter in state_dict:
                 learned = state_dict.pop(prefix + parameter)
-                start = f" and pass {option}={learned.exp().item():.4g}" if learned.ndim == 0 else ""
+                start = f" and pass {option}={learned.exp().item():.4g}" if learned.ndim == 1 else ""
                 # An unexpected key like any other, so that strict=False ignores it.
                 unexpected_keys.append(
                     f"{prefix}{parameter}: {option} must be learned by the layer to load a learned one, got a fixed "
@@ -72,7 +73,7 @@ def positive_option(name: str, meaning: str) -> Any:
 
     def value(layer: Learnable) -> Any:
         logarithm = getattr(layer, f"log_{name}")
-        return getattr(layer, f"_{name}") if logarithm is None else logarithm.exp()
+        return getattr(layer, f"_{name}") if logarithm is None else logarithm.exp().squeeze(0)
 
     def assign(layer: Learnable, value: Any) -> None:
         logarithm = getattr(layer, f"log_{name}")
@@ -84,6 +85,13 @@ def positive_option(name: str, meaning: str) -> Any:
         setattr(layer, f"_{name}", value)
 
     return property(value, assign, doc=meaning)
+
+
+def as_vectors(state_dict: dict[str, Tensor], names: Collection[str]) -> None:
+    """Give numbers in a state_dict the shape (1,) of the parameters: FSDP shards no parameters of shape ()."""
+    for name in names:
+        if name in state_dict and state_dict[name].ndim == 0:
+            state_dict[name] = state_dict[name].reshape(1)
 
 
 class UnitWindow(nn.Module):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from nlfilter_torch.core.checks import check_alpha, check_image, check_same_size, check_tensor, check_weight, described
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
 from nlfilter_torch.nn.affinity import NonlocalAffinity
-from nlfilter_torch.nn.parameters import check_learn
+from nlfilter_torch.nn.parameters import as_vectors, check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 LEARNABLE = ("alpha", "residual")
@@ -28,7 +28,7 @@ class PolynomialSliders(nn.Module):
 
     Attributes:
         alpha: (k+1,) or (K, k+1), parameter or buffer.
-        residual: (), parameter or buffer, or None.
+        residual: (1,), parameter or buffer, or None.
 
     Raises:
         TypeError, ValueError: if ``alpha`` has fewer than two finite entries, or ``learn`` another name.
@@ -51,8 +51,9 @@ class PolynomialSliders(nn.Module):
         if residual is not None:
             check_weight(residual, "residual")
         if residual is None and "residual" in names:
-            residual = float(start[..., 0].mean())
-        weight = None if residual is None else torch.tensor(float(residual))
+            weight: Tensor | None = start[..., 0].mean().reshape(1)
+        else:
+            weight = None if residual is None else torch.tensor([float(residual)])
         for name, value in (("alpha", start), ("residual", weight)):
             if value is not None and name in names:
                 self.register_parameter(name, nn.Parameter(value))
@@ -78,6 +79,11 @@ class PolynomialSliders(nn.Module):
                 f"layers must have shape (B, k+1, C, H, W), got {tuple(layers.shape)}; take them from detail_layers"
             )
         return weigh_layers(layers, self.alpha if alpha is None else alpha)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
+        """Accept the residual of earlier versions, which was of shape ()."""
+        as_vectors(state_dict, [f"{prefix}residual"])
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def extra_repr(self) -> str:
         """The current sliders."""
@@ -133,7 +139,7 @@ class NonlocalFilter(nn.Module):
 
     @property
     def residual(self) -> Tensor | None:
-        """Weight of what the eigenvectors do not capture, (), or None for alpha_1."""
+        """Weight of what the eigenvectors do not capture, (1,), or None for alpha_1."""
         return self.sliders.residual
 
     @property
@@ -165,22 +171,26 @@ class NonlocalFilter(nn.Module):
         """Filter an image.
 
         Args:
-            image: (B, C, H, W).
+            image: (B, C, H, W), or one image (C, H, W), with guide, mask and alpha of one image, too.
             guide: (B, C', H, W) from which the operator is built; None is the image itself.
             mask: (B, K, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
             alpha: sliders for this call instead of the layer's own, such as those computed by a network: (k+1,),
                 (B, k+1) per image or (B, k+1, H, W) per pixel; for K > 1 masks (K, k+1) or (B, K, k+1).
 
         Returns:
-            (B, C, H, W) in the image's dtype.
+            (B, C, H, W) in the image's dtype, or (C, H, W) for one image.
 
         Raises:
             TypeError, ValueError: if a tensor does not fit, or there are sliders for K regions but not K masks.
         """
-        check_image(image, "image")
+        if isinstance(image, Tensor) and image.ndim == 3:
+            guide, mask = _as_batch(guide), _as_batch(mask)
+            of_regions = mask is not None and mask.shape[1] > 1  # then three dimensions are (B, K, k+1)
+            return self(image.unsqueeze(0), guide, mask, alpha if of_regions else _as_batch(alpha)).squeeze(0)
+        check_image(image, "image", empty=True)
         operator = self.affinity(image if guide is None else guide)
         if mask is not None:
-            check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]))
+            check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]), empty=len(image) == 0)
             check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
         rows = self.sliders.alpha if alpha is None else alpha
         own_rows = alpha is None and rows.ndim == 2
@@ -193,3 +203,8 @@ class NonlocalFilter(nn.Module):
         if mask is None:
             return filtered
         return torch.lerp(image, filtered, mask.to(image))
+
+
+def _as_batch(tensor: Tensor | None) -> Tensor | None:
+    """Three dimensions, which belong to one image, as a batch of one; all else as it is."""
+    return tensor.unsqueeze(0) if isinstance(tensor, Tensor) and tensor.ndim == 3 else tensor

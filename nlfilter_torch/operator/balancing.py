@@ -21,6 +21,7 @@ from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
+from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator import newton
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, Solution
 
@@ -64,7 +65,7 @@ def balance(
 
 def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
     """Warn, on processors, of row sums that are off by more than was asked for and more than rounding."""
-    if residual.device.type == "cpu" and not bool((residual <= max(tolerance or 0.0, ALARM[dtype])).all()):
+    if not is_hidden(residual) and not bool((residual <= max(tolerance or 0.0, ALARM[dtype])).all()):
         remedy = "raise photometric_bandwidth or num_landmarks" + (
             ", or use completion='diagonal'" if not completed else ""
         )
@@ -103,7 +104,7 @@ class _Balance(torch.autograd.Function):
         matrix = KernelMatrix(factor, diagonal, weights, among)
         found = newton.solve(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
         goal = attainable(factor, tolerance, among)
-        if factor.device.type == "cpu" and not bool((found.residual <= goal).all()):
+        if not is_hidden(factor) and not bool((found.residual <= goal).all()):
             found = newton.damped(matrix, found, goal)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
         ctx.among, ctx.completed = among, completed
@@ -147,7 +148,7 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
     scaling = sums.clamp(min=SMALLEST_SUM).rsqrt()  # a first guess: (K 1)^(-1/2)
     total = matrix.moment(scaling)
     move = torch.zeros_like(scaling)
-    watched = factor.device.type == "cpu"
+    watched = not is_hidden(factor)
     worst, slow = float("inf"), 0
     for sweeps, (momentum, gain) in enumerate(_chebyshev_weights(1.0, 2.0), start=1):
         current, following = total.to(factor).mT, torch.empty_like(scaling)

@@ -20,12 +20,12 @@ from nlfilter_torch.core.checks import (
     check_size,
     check_weights,
     described,
-    is_hidden,
     warn,
     warn_of_scale,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, uncompiled, working_dtype
+from nlfilter_torch.core.values import is_hidden, refuse_transforms
 from nlfilter_torch.operator.balancing import balance, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
@@ -66,6 +66,13 @@ def _is_small(bandwidth: float | Tensor | str) -> bool:
     if isinstance(bandwidth, Tensor):
         return not is_hidden(bandwidth) and bool((bandwidth.detach() < 1).all())
     return isinstance(bandwidth, str) or bandwidth < 1
+
+
+def _largest(guide: Tensor) -> Tensor:
+    """The largest magnitude of each image, (B,)."""
+    if is_hidden(guide) or len(guide) == 0:
+        return guide.abs().amax((1, 2, 3))
+    return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # quicker on processors
 
 
 @uncompiled
@@ -129,7 +136,8 @@ def nonlocal_operator(
         >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
         True
     """
-    check_image(guide, "guide")
+    refuse_transforms("guide", guide, photometric_bandwidth, spatial_bandwidth, patch_weights)
+    check_image(guide, "guide", empty=True)
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
     if isinstance(photometric_bandwidth, str):
@@ -150,7 +158,7 @@ def nonlocal_operator(
         bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, among)
     else:
         bandwidth = among.copy_to_group(photometric_bandwidth)
-    largest = torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide.detach()])  # (B,)
+    largest = _largest(guide.detach())
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
         farthest = torch.full_like(largest, max(height, width))
@@ -206,7 +214,8 @@ def operator_from_features(
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
-    check_features(features, "features")
+    refuse_transforms("features", features)
+    check_features(features, "features", empty=True)
     method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
     shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
@@ -231,10 +240,12 @@ def _assemble(
     if count > points:
         warn(f"num_landmarks must be at most the number of pixels, {points}, got {described(count)}; using every pixel")
         count = points
+    if len(features) == 0:
+        return _empty(features, size, count, method.completion, recipe)
     chosen = choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
     kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
-    completed, watched = method.completion == "diagonal", factor.device.type == "cpu"
+    completed, watched = method.completion == "diagonal", not is_hidden(factor)
 
     def balanced() -> tuple[Balancing, float]:
         found = balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
@@ -273,4 +284,23 @@ def _assemble(
         balancing_steps=balancing.steps,
         weights=weights,
         among=among,
+    )
+
+
+def _empty(
+    features: Tensor, size: tuple[int, int], count: int, completion: Completion, recipe: GuideFeatures | None
+) -> NonlocalOperator:
+    """The operator of an empty batch of features (0, D, N)."""
+    each, total = features.new_empty(0, features.shape[2]), features.new_empty(0, count, 1, dtype=torch.float64)
+    kernel = Kernel(features[:, :, :count], features.new_empty(0, count, count), completion, features=recipe)
+    return NonlocalOperator(
+        factor=features.new_empty(0, count, features.shape[2]),
+        diagonal=each,
+        scaling=each,
+        size=size,
+        kernel=kernel,
+        remainder=each,
+        balancing=PixelScaling(total, completion == "diagonal"),
+        residual=features.new_empty(0),
+        balancing_steps=0,
     )

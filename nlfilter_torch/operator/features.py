@@ -22,6 +22,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.values import is_hidden
 
 GuideChannels = Literal["luminance", "all"]
 Bandwidth = float | Tensor | None
@@ -54,7 +55,7 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
             f"patch_weights must have at most {LARGEST_PATCH} rows, got {len(patch_weights)}; reduce the image instead"
         )
     check_finite(patch_weights, "patch_weights")
-    if patch_weights.device.type == "cpu" and not bool((patch_weights >= 0).all() & (patch_weights.sum() > 0)):
+    if not is_hidden(patch_weights) and not bool((patch_weights >= 0).all() & (patch_weights.sum() > 0)):
         raise ValueError(
             "patch_weights must be non-negative with a positive sum, got others; take their softmax or square"
         )
@@ -196,7 +197,7 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
         >>> estimate_bandwidth(torch.linspace(0, 1, 101).expand(1, 1, 8, 101)) * 255  # a slope of 0.01 a pixel
         tensor([6.3119])
     """
-    check_image(guide, "guide")
+    check_image(guide, "guide", empty=True)
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
@@ -208,7 +209,7 @@ def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], among: Communicator)
     """:func:`estimate_bandwidth` from some rows of an image with a halo of neighbouring rows."""
     with torch.no_grad():
         magnitude = gradients(guide, halo)
-        count = magnitude.shape[1] * among.pixels(magnitude[0, 0].numel())
+        count = magnitude.shape[1] * among.pixels(magnitude.shape[2] * magnitude.shape[3])
         mean = among.sum(magnitude.sum((1, 2, 3), dtype=torch.float64)) / count
         return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
@@ -220,7 +221,7 @@ def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
     down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
     magnitude = (down.square() + right.square()).sqrt()
-    if magnitude.device.type != "cpu" or not bool(magnitude.sum().isfinite()):
+    if is_hidden(magnitude) or not bool(magnitude.sum().isfinite()):
         # hypot cannot overflow, but on processors its last digit depends on the position in memory, and so on tiles.
         magnitude = torch.hypot(down, right)
     return magnitude[:, :, halo[0] : guide.shape[2] - halo[1]]

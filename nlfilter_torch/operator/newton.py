@@ -20,6 +20,7 @@ from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.kernels.grams import gram, sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread, sweep, weigh
+from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import KernelMatrix, Solution, scaling_from_moment
 
@@ -116,13 +117,13 @@ def solve(matrix: KernelMatrix, tolerance: float) -> Solution:
 
     On an accelerator the number of sweeps is fixed, as reading a residual would stall its queue.
     """
-    refined = matrix.factor.dtype == torch.float64 and matrix.factor.device.type == "cpu"
+    refined = matrix.factor.dtype == torch.float64 and not is_hidden(matrix.factor)
     return _refined(matrix, tolerance) if refined else _quasi_newton(matrix, tolerance)
 
 
 def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Newton's method with the Jacobian of a sample, corrected by BFGS updates from the sweeps over all pixels."""
-    watched, ranks = matrix.factor.device.type == "cpu", matrix.among.size
+    watched, ranks = not is_hidden(matrix.factor), matrix.among.size
     landmarks, pixels = matrix.factor.shape[1:]
     least, usual, most = (bound * landmarks // ranks for bound in PER_LANDMARK)
     count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
@@ -273,7 +274,7 @@ def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: 
         solution, residual = solution + step * direction, residual - step * image
         preconditioned = inverse @ residual
         before, size = size, (residual * preconditioned).sum(1, keepdim=True)
-        if factor.device.type == "cpu" and bool((size <= goal).all()):
+        if not is_hidden(factor) and bool((size <= goal).all()):
             break
         direction = preconditioned + size / before.clamp(min=tiny) * direction
     return solution

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import factors_of, once_differentiable
-from nlfilter_torch.core.checks import is_hidden
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
+from nlfilter_torch.core.values import is_hidden
 
 Completion = Literal["diagonal", "none"]
 

@@ -14,9 +14,10 @@ from nlfilter_torch.core.checks import (
     check_same_size,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.precision import full_precision, uncompiled
+from nlfilter_torch.core.containers import Target, loadable, moved
+from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
-from nlfilter_torch.operator.kernel import Kernel
+from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.products import apply_powers
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
@@ -123,6 +124,18 @@ class NonlocalOperator:
     weights: Tensor | None = None
     among: Communicator = ALONE
 
+    def to(self, target: Target, dtype: torch.dtype | None = None) -> "NonlocalOperator":
+        """The operator on another device, or in another precision.
+
+        Args:
+            target: a device, or a dtype, float32 or float64; or a tensor that has both.
+            dtype: beside a device.
+
+        Raises:
+            TypeError: if the dtype is another one.
+        """
+        return moved(self, target, dtype)
+
     def at(self, features: Tensor) -> Columns:
         """The columns of any points, computed from their own features and from sums over the image.
 
@@ -150,7 +163,7 @@ class NonlocalOperator:
         Raises:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of that size.
         """
-        return self.powers(image, 1)[:, 0].to(image.dtype)
+        return as_given(self.powers(image, 1)[:, 0], image)
 
     def __matmul__(self, image: Tensor) -> Tensor:
         return self.matmul(image)
@@ -159,9 +172,11 @@ class NonlocalOperator:
     def powers(self, image: Tensor, order: int) -> Tensor:
         """``W y, ..., W^k y`` as (B, k, C, H, W) in the operator's dtype; arguments and errors as :meth:`matmul`."""
         check_order(order)
-        check_image(image, "image")
+        check_image(image, "image", empty=True)
         check_same_size(image, self.size, "image", "operator")
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
+        if folded.numel() == 0:  # an empty batch
+            return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, -1, -1, -1)
         planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.among, self.weights)
         return unfold_batch(planes, image.shape[0], self.size)
 
@@ -268,3 +283,6 @@ class NonlocalOperator:
             orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
             diagonal_share=(self.among.sum(weighted(self.remainder, self.weights).sum(1)) / spectrum.pixels).tolist(),
         )
+
+
+loadable(NonlocalOperator, Kernel, GuideFeatures, PixelScaling, Communicator, Columns)

@@ -25,10 +25,12 @@ from nlfilter_torch.core.blocks import (
 )
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
+from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.values import is_hidden
 
 # Eigenvalues of G below this, relative to the largest, are rounding.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -98,8 +100,9 @@ class Spectrum(RitzPairs):
     them, since :meth:`gain` applies any f(W) through m x m matrices.
 
     Attributes:
-        eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank. Their
-            gradient is exact, also for repeated eigenvalues.
+        eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank, and on
+            accelerators to M, as reading the rank would stall them. Their gradient is exact, also for repeated
+            eigenvalues.
         ritz: T, (B, M, M), float64.
         root: G^(-1/2), (B, M, M), float64.
         support: (B, M) bool, which eigenvalues of T are above rounding.
@@ -119,6 +122,10 @@ class Spectrum(RitzPairs):
     largest: Tensor
     weights: Tensor | None = None
     among: Communicator = ALONE
+
+    def to(self, target: Target, dtype: torch.dtype | None = None) -> "Spectrum":
+        """The spectrum on another device, or in another precision; as :meth:`NonlocalOperator.to`."""
+        return moved(self, target, dtype)
 
     @property
     def pixels(self) -> int:
@@ -208,6 +215,9 @@ class Spectrum(RitzPairs):
         return vectors - vectors @ reflection
 
 
+loadable(Spectrum, SymmetricMatrix, Communicator)
+
+
 def compute_spectrum(
     factor: Tensor,
     scaling: Tensor,
@@ -222,11 +232,11 @@ def compute_spectrum(
     count = 1 if remainder is None else 2
     each = root_weighted(scaling, weights)
     pairs = RitzPairs.of_sums(among.sum(compute_grams(factor, each, remainder, count)), factor.dtype)
-    checked = factor.dtype == torch.float32 and factor.device.type == "cpu"
+    checked = factor.dtype == torch.float32 and not is_hidden(factor)
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
         grams = compute_grams(factor, each, remainder, count, exact=True)
         pairs = RitzPairs.of_sums(among.sum(grams), factor.dtype)
-    shown = int(pairs.support.sum(1).max())
+    shown = factor.shape[1] if is_hidden(factor) else int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
     # First-order perturbation: the derivative of an eigenvalue is v^T dT v, repeated or not.

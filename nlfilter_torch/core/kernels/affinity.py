@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.values import is_hidden
+
 # Beside a completed diagonal exp(-40) is nothing; smaller affinities become denormal floats, six times slower, and
 # their squares vanish in float32, which would leave pixels that resemble no landmark without a single eigenvector.
 SMALLEST_EXPONENT = -40.0
@@ -24,7 +26,7 @@ def cancels(landmarks: Tensor) -> bool:
 
     False on accelerators, which would have to wait for the answer.
     """
-    if landmarks.dtype != torch.float32 or landmarks.device.type != "cpu":
+    if landmarks.dtype != torch.float32 or is_hidden(landmarks):
         return False
     largest = (landmarks - landmarks.mean(dim=2, keepdim=True)).square().sum(1).max()
     return not float(largest) * torch.finfo(torch.float32).eps < CANCELLATION

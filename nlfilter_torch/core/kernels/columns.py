@@ -8,6 +8,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import buffered_blocks, large_empty, strip_count, strips
 from nlfilter_torch.core.kernels.affinity import Affinity
 from nlfilter_torch.core.kernels.library import by_rows, contiguous, place, pointer, register, run, threads
+from nlfilter_torch.core.values import is_hidden
 
 
 def _empty(features: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,7 +62,7 @@ def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limit
         if limited:
             norm = torch.sum(torch.square(found, out=first), 1, out=norms_of[:, block])
             # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
-            if features.device.type != "cpu" or norm.max().item() > 1.0:
+            if is_hidden(features) or norm.max().item() > 1.0:
                 found.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
         columns_of[:, :, block] = found
     return factor, norms
