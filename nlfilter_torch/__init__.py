@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from nlfilter_torch.edits.denoise import denoise as denoise
     from nlfilter_torch.edits.denoise import estimate_noise as estimate_noise
     from nlfilter_torch.edits.detail import enhance as enhance
+    from nlfilter_torch.edits.fit_look import FittedLook as FittedLook
+    from nlfilter_torch.edits.fit_look import fit_look as fit_look
     from nlfilter_torch.edits.frames import filter_frames as filter_frames
+    from nlfilter_torch.edits.look import apply_look as apply_look
     from nlfilter_torch.edits.mask import region_mask as region_mask
     from nlfilter_torch.edits.recolor import recolor as recolor
     from nlfilter_torch.edits.sharpen import sharpen as sharpen
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.filtering.masks import segment_mask as segment_mask
     from nlfilter_torch.filtering.scribbles import propagate_strokes as propagate_strokes
     from nlfilter_torch.nn import DiffusionMask as DiffusionMask
+    from nlfilter_torch.nn import Look as Look
     from nlfilter_torch.nn import NonlocalAffinity as NonlocalAffinity
     from nlfilter_torch.nn import NonlocalFilter as NonlocalFilter
     from nlfilter_torch.nn import PolynomialSliders as PolynomialSliders
@@ -57,7 +61,9 @@ _DEFINES: dict[str, tuple[str, ...]] = {
     "edits.defocus": ("defocus",),
     "edits.denoise": ("denoise", "estimate_noise"),
     "edits.detail": ("enhance",),
+    "edits.fit_look": ("FittedLook", "fit_look"),
     "edits.frames": ("filter_frames",),
+    "edits.look": ("apply_look",),
     "edits.mask": ("region_mask",),
     "edits.recolor": ("recolor",),
     "edits.sharpen": ("sharpen",),
@@ -75,7 +81,7 @@ _DEFINES: dict[str, tuple[str, ...]] = {
     "filtering.fitted": ("FittedFilter", "fit_filter"),
     "filtering.masks": ("diffusion_map", "diffusion_mask", "segment_mask"),
     "filtering.scribbles": ("propagate_strokes",),
-    "nn": ("DiffusionMask", "NonlocalAffinity", "NonlocalFilter", "PolynomialSliders", "SegmentMask"),
+    "nn": ("DiffusionMask", "Look", "NonlocalAffinity", "NonlocalFilter", "PolynomialSliders", "SegmentMask"),
     "operator.build": ("nonlocal_operator", "operator_from_features"),
     "operator.features": ("estimate_bandwidth",),
     "operator.operator": ("Certificate", "Diagnostics", "NonlocalOperator"),

@@ -135,7 +135,7 @@ def test_a_preset_is_written_over(before: Path) -> None:
 def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small, clipped, preset = (before.with_name(name) for name in ("small.png", "clipped.png", "look.json"))
     pixels = read_photograph(before).pixels
-    write_photograph(Photograph(pixels[..., :50, :60]), small)
+    write_photograph(Photograph(pixels[..., :50, :60].flip(1, 2, 3)), small)
     write_photograph(Photograph((pixels > 0.5).float()), clipped)
     folder = before.with_name("nowhere") / "look.json"
     cases = {

@@ -43,7 +43,7 @@ def test_defaults_are_valid(edit: Edit, parameter: Parameter) -> None:
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
 def test_functions_have_the_declared_defaults(edit: Edit) -> None:
-    public = {"detail": "enhance", "tone": "adjust_tone"}.get(edit.name, edit.name)
+    public = {"detail": "enhance", "tone": "adjust_tone", "look": "apply_look"}.get(edit.name, edit.name)
     function = inspect.signature(getattr(nlfilter_torch, public)).parameters
     for parameter in edit:
         name = parameter.keyword

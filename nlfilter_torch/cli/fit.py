@@ -1,5 +1,6 @@
-"""``nlfilter-torch fit``: find the sliders that turn one photograph into another, and save them as a preset."""
+"""``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,111 +9,218 @@ import typer
 from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import Preset
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.edits.fit_look import FittedLook
 
-Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit.")]
-After = Annotated[str, typer.Argument(metavar="AFTER", help="The same photograph after the edit, of the same size.")]
-Result = Annotated[Path, typer.Argument(metavar="PRESET", help="The JSON file in which the result is saved.")]
+Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit, or a folder of them.")]
+After = Annotated[
+    str, typer.Argument(metavar="AFTER", help="The same after the edit; in a folder, under the same names.")
+]
+Result = Annotated[Path, typer.Argument(metavar="PRESET", help="The JSON file in which the look is saved.")]
 Order = Annotated[
     int,
     typer.Option("--layers", min=2, max=10, metavar="N", help="Number of sliders, from the finest to the coarsest."),
 ]
+Masks = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--mask",
+        metavar="FILE",
+        help="A grey picture, white in a region that has a look of its own; as often as there are regions. The files "
+        "are numbered then. For one pair.",
+    ),
+]
+Preview = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="A picture of the first pair: before, after, the look, and what is left, amplified, around grey.",
+    ),
+]
+Map = Annotated[
+    Path | None,
+    typer.Option("--map", metavar="FILE", help="A grey picture of what the look leaves of the first pair's edit."),
+]
+ENOUGH = 0.8  # share that is to be explained
+AMPLIFIED = 4  # what is left, in the preview
+SQUARE = 16  # pixels, of places that an edit is looked for in
+FEW, MOST = 0.1, 0.5  # of these places, and of what is left, for an edit to be called local
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+CALLED = {
+    "alpha": "sliders",
+    "bands": "gains of blurs",
+    "tone": "a tone curve",
+    "curves": "a tone curve for each channel",
+    "matrix": "colours",
+}
 
 
 @with_options("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
-def fit(before: Before, after: After, preset: Result = Path("preset.json"), layers: Order = 4, **given: Any) -> None:
-    """Find the sliders that turn one photograph into another, whatever program made the edit.
+def fit(
+    before: Before,
+    after: After,
+    preset: Result = Path("preset.json"),
+    layers: Order = 4,
+    mask: Masks = None,
+    preview: Preview = None,
+    left: Map = None,
+    **given: Any,
+) -> None:
+    """Find the look that turns one photograph into another, or a folder of them, whatever program made the edit.
 
-    Prints them and how much of the edit they explain, and saves them in a file for other photographs:
+    A look has sliders, tone curves, colours and sharpness, as far as they explain the edit of photographs left out of
+    the fit, too. Prints how much that is, and saves the look in a file for other photographs:
 
-    `nlfilter-torch fit before.jpg after.jpg look.json`
+    `nlfilter-torch fit before.jpg after.jpg look.json --preview seen.png`
 
-    `nlfilter-torch detail other.jpg out.jpg --preset look.json`
+    `nlfilter-torch apply other.jpg out.jpg --preset look.json`
     """
-    step = step_of(EDITS["detail"], given)
+    step = step_of(EDITS["look"], given)
 
-    from nlfilter_torch.cli.inspect import build_operator
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.edits.colour import edit_luminance
-    from nlfilter_torch.edits.resizing import resize
-    from nlfilter_torch.edits.viewing import viewed_size
-    from nlfilter_torch.filtering.filters import polynomial_filter
-    from nlfilter_torch.filtering.fit import fit_alpha
-    from nlfilter_torch.io.photographs import check_file, open_beside, read_photograph
+    from nlfilter_torch.edits.fit_look import fit_look
+    from nlfilter_torch.io.photographs import check_file, open_beside
+
+    paths = _paths(before, after)
+    if mask and len(paths) > 1:
+        raise ValueError(f"--mask is for one pair of photographs, got {len(paths)}; fit them one by one")
+    results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
+    for path in (*results, *(path for path in (preview, left) if path is not None)):
+        check_file(path)
+    memory = working_bytes(step["landmarks"], step["patch_size"])
+    with steps(len(paths) + 1) as begin:
+
+        def pairs() -> "Iterator[tuple[Tensor, ...]]":
+            for pair in paths:
+                begin(f"Comparing {pair[1].name}")
+                yield (*_read(*pair, memory), *([] if not mask else [_masks(mask, pair[0])]))
+
+        found = fit_look(pairs(), order=layers - 1, step=step)
+        begin("Judging")
+        looks = found if isinstance(found, tuple) else (found,)
+        seen = None if mask or (len(paths) > 1 and preview is None and left is None) else _read(*paths[0], memory)
+        result = None if seen is None else looks[0].apply(seen[0]).clamp(0, 1)
+        if seen is not None and result is not None:
+            _draw(*seen, result, preview, left)
+        for look, path in zip(looks, results, strict=True):
+            with open_beside(path) as stream:
+                stream.write(look.to_json().encode())
+    for look, path in zip(looks, results, strict=True):
+        share = look.fitted
+        if len(paths) == 1 and seen is not None and result is not None:
+            share = _explained(*seen, result)
+        _report(look, share, path, "other photographs" if len(paths) > 1 else "other parts of it")
+    if len(paths) == 1 and seen is not None and result is not None:
+        _tell_where(*seen, result)
+
+
+def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
+    """The files of the pairs."""
+    first, second = Path(before), Path(after)
+    if not first.is_dir() and not second.is_dir():
+        return [(first, second)]
+    if not (first.is_dir() and second.is_dir()):
+        raise ValueError(
+            f"BEFORE and AFTER must be two photographs or two folders, got {before} and {after}; pass both"
+        )
+    edited = {path.stem: path for path in sorted(second.iterdir()) if path.suffix.lower() in PHOTOGRAPHS}
+    found = [(path, edited[path.stem]) for path in sorted(first.iterdir()) if _is_of(path, edited)]
+    if not found:
+        raise ValueError(f"{after} must hold photographs of the names of those in {before}, got none; rename them")
+    return found
+
+
+def _is_of(path: Path, edited: dict[str, Path]) -> bool:
+    return path.suffix.lower() in PHOTOGRAPHS and path.stem in edited
+
+
+def _read(before: Path, after: Path, memory: int) -> "tuple[Tensor, Tensor]":
+    """A pair on the same pixels, in colour if one of them is."""
+    from nlfilter_torch.edits.alignment import align
+    from nlfilter_torch.edits.fit_look import check_belong
+    from nlfilter_torch.io.photographs import read_photograph
+
+    images = [read_photograph(path, bytes_per_pixel=memory).pixels for path in (before, after)]
+    channels = max(image.shape[1] for image in images)
+    first, second = (image.expand(-1, channels, -1, -1) for image in images)
+    image, edited, done = align(first, second, str(before), str(after))
+    if done:
+        _tell(done)
+    if bool((image == edited).all()):
+        raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
+    check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
+    return image, edited
+
+
+def _masks(paths: Sequence[Path], of: Path) -> "Tensor":
+    """Masks (1, K, H, W) from files."""
+    import torch
+
+    from nlfilter_torch.io.photographs import read_photograph
     from nlfilter_torch.operator.features import reduce_channels
 
-    check_file(preset)
-    with steps(3) as begin:
-        begin("Reading")
-        memory = working_bytes(step["landmarks"], step["patch_size"])
-        source, target = (read_photograph(path, bytes_per_pixel=memory) for path in (before, after))
-        image, edited = (reduce_channels(photograph.pixels, "luminance") for photograph in (source, target))
-        free = unclipped(target, after)
-        if image.shape != edited.shape:
-            height, width = image.shape[2:]
-            raise ValueError(
-                f"{after} must have the size of {before}, {width}x{height}, got {edited.shape[3]}x{edited.shape[2]}; "
-                "an edit that crops or scales cannot be fitted"
-            )
-        if bool((image == edited).all()):
-            raise ValueError(
-                f"{after} must differ from {before}, but is as bright everywhere; give an edited photograph"
-            )
-
-        begin("Comparing patches")
-        size = (image.shape[-2], image.shape[-1])
-        viewed = viewed_size(size, step["viewing_size"])  # at which detail applies the preset
-        before_edit = source.pixels
-        if viewed != size:
-            image, edited, free, before_edit = (resize(planes, viewed) for planes in (image, edited, free, before_edit))
-            free = (free > 0.99).to(image)
-        rounding = 0.5 * spacing(target) if viewed == size else 0.0
-        operator = build_operator(image, step)
-
-        begin("Fitting")
-        alpha = fit_alpha(operator, image, edited, order=layers - 1, mask=free, rounding=rounding)[0]
-        filtered = edit_luminance(before_edit, lambda planes: polynomial_filter(operator, planes, alpha))
-        fitted = reduce_channels(stored(filtered, target) if viewed == size else filtered.clamp(0, 1), "luminance")
-        sliders = tuple(round(a, 6) for a in alpha.tolist())
-        # What was fitted is linear: no limits, and all detail alike.
-        found = Preset(**{**dict(step.values), "alpha": sliders, "threshold": 0.0, "limits": "none"})
-        with open_beside(preset) as stream:
-            stream.write(found.to_json().encode())
-    typer.echo("alpha: " + ", ".join(f"{a:.3f}" for a in found.alpha))
-    typer.echo(f"explained: {100 * explained(image, edited, fitted):.1f} % of the change in brightness")
-    typer.echo(f"preset: {preset}")
+    found = [reduce_channels(read_photograph(path).pixels, "luminance") for path in paths]
+    for path, one in zip(paths, found, strict=True):
+        if one.shape != found[0].shape:
+            raise ValueError(f"{path} must have the size of {paths[0]}; resize it to that of {of}")
+    return torch.cat(found, dim=1)
 
 
-def spacing(photograph: "Photograph") -> float:
-    """Difference of neighbouring values in the file; 0 for floats."""
-    from nlfilter_torch.tiled.sources import WHITE
-
-    return 1 / WHITE[photograph.depth] if photograph.depth in WHITE else 0.0
-
-
-def unclipped(photograph: "Photograph", name: str) -> "Tensor":
-    """Mask (1, 1, H, W) of the pixels of an edited file that are not clipped to black or white."""
-    values = photograph.pixels
-    inside = ((values > 0) & (values < 1)) | (spacing(photograph) == 0)  # floats are not clipped
-    if not bool(inside.all(1).any()):
-        raise ValueError(
-            f"{name} must have pixels that are not clipped to black or white, got none; edit less strongly"
-        )
-    return inside.all(1, keepdim=True).float()
+def _explained(before: "Tensor", after: "Tensor", found: "Tensor") -> float:
+    """Share of the change's energy, 1 at best."""
+    rest, change = ((after.double() - image.double()).square().sum() for image in (found, before))
+    return 1.0 - float(rest / change)
 
 
-def stored(pixels: "Tensor", photograph: "Photograph") -> "Tensor":
-    """Pixels clipped and rounded as a file like ``photograph`` stores them."""
-    step = spacing(photograph)
-    return (pixels.clamp(0, 1) / step).round() * step if step else pixels
+def _report(look: "FittedLook", share: float, path: Path, others: str) -> None:
+    """Print what a look is and what it is worth."""
+    typer.echo(f"{'explained of the change by':40}{'fitted':>8}{'left out':>10}")
+    for parts, (fitted, left_out) in look.explained.items():
+        if len(parts) == 1 or parts == look.parts:
+            name = " + ".join(CALLED[part] for part in parts)
+            typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
+    typer.echo("alpha: " + ", ".join(f"{slider:.3f}" for slider in look.step["alpha"]))
+    typer.echo(f"explained: {100 * share:.1f} % of the change, {100 * look.left_out:.1f} % in {others}")
+    if min(share, look.left_out) < ENOUGH:
+        _tell(f"the look explains less than {100 * ENOUGH:.0f} % of the edit; --preview shows what is missing")
+    typer.echo(f"preset: {path}")
 
 
-def explained(before: "Tensor", after: "Tensor", fitted: "Tensor") -> float:
-    """Coefficient of determination (R squared) of the fitted change, 1 at best."""
-    left, change = ((after.double() - x.double()).square().sum() for x in (fitted, before))
-    return 1.0 - float(left / change)
+def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor") -> None:
+    """Say where what is left is, if it is in a few places."""
+    from torch.nn.functional import avg_pool2d
+
+    rest = avg_pool2d((after - found).square().mean(1, keepdim=True), SQUARE, ceil_mode=True)[0, 0]
+    if _explained(before, after, found) > ENOUGH or rest.numel() < 1 / FEW:
+        return
+    some = max(1, int(FEW * rest.numel()))
+    largest = rest.flatten().topk(some)
+    if float(largest.values.sum() / rest.sum()) < MOST:
+        return
+    place = int(largest.indices[0])
+    row, column = (SQUARE * number for number in divmod(place, rest.shape[1]))
+    _tell(
+        f"most of what is left is in a tenth of the picture, around row {row}, column {column}: an edit of a part; "
+        "--map shows where, and --mask fits parts by themselves"
+    )
+
+
+def _draw(before: "Tensor", after: "Tensor", found: "Tensor", preview: Path | None, left: Path | None) -> None:
+    """Write the preview and the map of what is left."""
+    import torch
+
+    from nlfilter_torch.io.photographs import Photograph, write_photograph
+
+    if preview is not None:
+        rest = (0.5 + AMPLIFIED * (after - found)).clamp(0, 1)
+        write_photograph(Photograph(torch.cat([before, after, found, rest], dim=3)), preview)
+    if left is not None:
+        rest = (after - found).abs().amax(1, keepdim=True)
+        write_photograph(Photograph(rest / rest.amax().clamp(min=1e-6)), left)
+
+
+def _tell(sentence: str) -> None:
+    typer.echo(f"nlfilter-torch: note: {sentence}", err=True)

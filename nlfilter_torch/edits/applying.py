@@ -14,6 +14,7 @@ from nlfilter_torch.edits.colorize import fit_colorize
 from nlfilter_torch.edits.defocus import fit_defocus
 from nlfilter_torch.edits.denoise import fit_denoise
 from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.look import fit_look_edit
 from nlfilter_torch.edits.parameters import FILTER
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
@@ -33,6 +34,7 @@ FITS: dict[str, Callable[..., Fitted]] = {
     "recolor": fit_recolor,
     "defocus": fit_defocus,
     "abstract": fit_abstract,
+    "look": fit_look_edit,
 }
 
 

@@ -83,6 +83,7 @@ class Parameter:
         metavar: stands for a value in the help, where it is not that of the unit.
         slider: of the editor.
         is_option: whether the command takes it, beside files.
+        length: of a list; 0 is any.
     """
 
     name: str
@@ -105,6 +106,7 @@ class Parameter:
     metavar: str | None = None
     slider: Slider | None = None
     is_option: bool = True
+    length: int = 0
 
     @property
     def keyword(self) -> str:
@@ -128,7 +130,7 @@ class Parameter:
             "count": f"a whole number {span}",
             "odd": f"an odd number {span}",
             "choice": f"{', '.join(named[:-1])} or {''.join(named[-1:])}",
-            "sliders": f"a list of 2 to {MAX_SLIDERS} numbers, none beyond {GAINS[1]:.0f}",
+            "sliders": f"a list of {self.length or f'2 to {MAX_SLIDERS}'} numbers, none beyond {GAINS[1]:.0f}",
         }[self.kind]
         alternatives = [f'"{word}"' for word in self.words] + ["null"] * self.optional
         return ", or ".join([text, *alternatives])
@@ -142,7 +144,7 @@ class Parameter:
         if self.kind == "sliders":
             return (
                 isinstance(value, list | tuple)
-                and 2 <= len(value) <= MAX_SLIDERS
+                and (len(value) == self.length or (not self.length and 2 <= len(value) <= MAX_SLIDERS))
                 and all(is_within(v, *GAINS) for v in value)
             )
         if self.kind == "number":
@@ -153,6 +155,8 @@ class Parameter:
 
     def is_idle(self, value: Any) -> bool:
         """Whether the edit changes nothing as far as this value goes; False for parameters without an idle value."""
+        if isinstance(self.idle, tuple):
+            return bool(value == self.idle)
         return all(v == self.idle for v in value) if isinstance(value, tuple) else bool(value == self.idle)
 
     def argument_of(self, value: Any, size: tuple[int, int], stride: float = 1) -> Any:

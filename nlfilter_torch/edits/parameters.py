@@ -519,7 +519,83 @@ ABSTRACT = Edit(
     hint="A painting of the photograph: flat areas with clear outlines.",
 )
 
+KNOTS = 17  # of a tone curve
+STRAIGHT = tuple(i / (KNOTS - 1) for i in range(KNOTS))
+
+
+def _curve(channel: str) -> Parameter:
+    return Parameter(
+        channel,
+        "sliders",
+        STRAIGHT,
+        f"Tone curve of {channel}: what it becomes at equal steps from black to white, with commas between.",
+        *GAINS,
+        idle=STRAIGHT,
+        metavar="V,V,...,V",
+    )
+
+
+LOOK = Edit(
+    "look",
+    """Put a photograph under a look: tone curves, colours, contrast and details, as another edit had them.
+
+    `nlfilter-torch fit` finds looks from photographs before and after an edit, and `nlfilter-torch apply` takes them.
+
+    Sepia: `nlfilter-torch look in.jpg out.jpg --matrix .39,.77,.19,.35,.69,.17,.27,.53,.13`
+    """,
+    (
+        Parameter(
+            "alpha",
+            "sliders",
+            (1.0, 1.0, 1.0, 1.0),
+            "One slider for each layer of detail, as those of `nlfilter-torch detail`. 1 leaves a layer as it is.",
+            *GAINS,
+            "gain",
+            idle=1.0,
+            metavar="A,B,...,Z",
+        ),
+        Parameter(
+            "bands",
+            "sliders",
+            (1.0,) * 7,
+            "Strength of what is finer than 1, 2, 5, 9, 18 and 37 pixels, edges too, and of the rest, around the mean "
+            "brightness. 1 leaves it as it is.",
+            *GAINS,
+            "gain",
+            idle=(1.0,) * 7,
+            metavar="A,B,...,G",
+            length=7,
+        ),
+        _curve("red"),
+        _curve("green"),
+        _curve("blue"),
+        Parameter(
+            "matrix",
+            "sliders",
+            (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            "Three rows of three numbers: how much red, green and blue of the photograph goes into each.",
+            *GAINS,
+            idle=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            metavar="RR,RG,...,BB",
+            length=9,
+        ),
+        Parameter(
+            "amount",
+            "number",
+            1.0,
+            "How much of the look: 0 none, 1 all of it, 2 twice as much.",
+            *GAINS,
+            "gain",
+            domain="finite",
+            slider=Slider("Amount", 0, 2, 0.05, live=False),
+        ),
+        VIEWING_SIZE,
+        *_filter(bandwidth=20.0, share=NEAR, landmarks=300, auto=True, far=True),
+    ),
+    hint="A look that was found by `nlfilter-torch fit`; load its file, and choose how much of it.",
+)
+
 #: All edits, in the order in which the editor adds them to one another.
 EDITS: dict[str, Edit] = {
-    edit.name: edit for edit in (DENOISE, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT)
+    edit.name: edit for edit in (DENOISE, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT, LOOK)
 }

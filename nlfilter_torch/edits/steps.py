@@ -53,7 +53,7 @@ class Step:
     def idle(edit: str) -> "Step":
         """The step that changes nothing, from which the editor starts."""
         values: dict[str, Any] = {
-            p.name: NONE if p.kind == "sliders" else p.idle for p in EDITS[edit] if p.idle is not ...
+            p.name: NONE if p.kind == "sliders" and p.idle == 1 else p.idle for p in EDITS[edit] if p.idle is not ...
         }
         return Step(edit, **values)
 

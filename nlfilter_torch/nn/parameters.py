@@ -116,16 +116,16 @@ class UnitWindow(nn.Module):
         return "x".join(map(str, self.logits.shape))
 
 
-def check_learn(learn: Collection[str], choices: Sequence[str]) -> frozenset[str]:
-    """The names in ``learn``; raise ValueError if one of them is not among ``choices``."""
+def check_learn(learn: Collection[str], choices: Sequence[str], called: str = "learn") -> frozenset[str]:
+    """The names in ``learn``, which errors call ``called``; raise ValueError if one is not among ``choices``."""
     is_collection = isinstance(learn, Collection) and not isinstance(learn, Tensor)
     if not is_collection or any(not isinstance(name, str) for name in learn):
-        raise TypeError(f"learn must be a list of names, got {described(learn)}; choose from {', '.join(choices)}")
+        raise TypeError(f"{called} must be a list of names, got {described(learn)}; choose from {', '.join(choices)}")
     names = frozenset([learn] if isinstance(learn, str) else learn)
     unknown = sorted(map(repr, names.difference(choices)))
     if unknown:
         raise ValueError(
-            f"learn must name {', '.join(map(repr, choices))} or none of them, got {', '.join(unknown)}; "
+            f"{called} must name {', '.join(map(repr, choices))} or none of them, got {', '.join(unknown)}; "
             "choose from these"
         )
     return names

@@ -1,0 +1,113 @@
+"""Bring a photograph before an edit and one after it onto the same pixels."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.operator.features import reduce_channels
+
+SAME_SHAPE = 0.02  # difference of the ratios of sides up to which an edited picture is taken for a resized one
+LIKE = 0.6  # correlation that a crop must have with its place
+SEARCHED = 400  # pixels of the short side in which the place of a crop is first looked for
+FAR = 0.1  # share of the short side by which a picture may be shifted
+
+
+def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:
+    """The same part of two photographs (1, C, H, W), before and after an edit, at the same size.
+
+    An edited picture of another size is resized if it has the same shape, or looked for in the other one; a shift of a
+    few pixels is taken back.
+
+    Returns:
+        Both, and what was done, in words for the user; empty for nothing.
+
+    Raises:
+        ValueError: if the edited picture is not found in the other one. ``name`` and ``edited`` are theirs in it.
+    """
+    size, other = before.shape[-2:], after.shape[-2:]
+    if size == other:
+        down, right = _shift(before, after)
+        if (down, right) == (0, 0):
+            return before, after, ""
+        rows, columns = (slice(max(0, -n), length - max(0, n)) for n, length in zip((down, right), size, strict=True))
+        moved, kept = (slice(max(0, n), length - max(0, -n)) for n, length in zip((down, right), size, strict=True))
+        return (
+            before[..., rows, columns],
+            after[..., moved, kept],
+            f"{edited} is shifted by {down} pixels down and {right} to the right",
+        )
+    ratio = (other[1] / other[0]) / (size[1] / size[0])
+    resized = resize(after, (size[0], size[1])).clamp(0, 1) if abs(math.log(ratio)) < SAME_SHAPE else None
+    place, likeness = (0, 0), -1.0
+    if other[0] <= size[0] and other[1] <= size[1]:
+        place, likeness = _place(before, after)
+    if resized is not None and _correlation(_grey(before), _grey(resized)) >= likeness:
+        return before, resized, f"{edited} is resized from {other[1]}x{other[0]} to {size[1]}x{size[0]}"
+    if likeness < LIKE:
+        raise ValueError(
+            f"{edited} must have the size of {name}, {size[1]}x{size[0]}, or be that picture resized or a part of it, "
+            f"got {other[1]}x{other[0]}; crop both alike"
+        )
+    part = before[..., place[0] : place[0] + other[0], place[1] : place[1] + other[1]]
+    return part, after, f"{edited} is the part of {name} from row {place[0]}, column {place[1]}"
+
+
+def _grey(image: Tensor) -> Tensor:
+    """Luminance (H, W)."""
+    return reduce_channels(image, "luminance").mean((0, 1)).double()
+
+
+def _correlation(first: Tensor, second: Tensor) -> float:
+    pair = torch.stack([first.flatten(), second.flatten()])
+    found = float(pair.corrcoef()[0, 1])
+    return found if math.isfinite(found) else 0.0
+
+
+def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
+    """By how many pixels (down, right) a picture is shifted; 0 unless that makes the two more alike."""
+    from skimage.registration import phase_cross_correlation
+
+    first, second = _grey(before), _grey(after)
+    found = phase_cross_correlation(second.numpy(), first.numpy(), normalization=None)[0]
+    down, right = (round(float(shift)) for shift in found)
+    limit = FAR * min(first.shape)
+    if (down, right) == (0, 0) or max(abs(down), abs(right)) > limit:
+        return 0, 0
+    height, width = first.shape
+    moved = first[max(0, -down) : height - max(0, down), max(0, -right) : width - max(0, right)]
+    kept = second[max(0, down) : height - max(0, -down), max(0, right) : width - max(0, -right)]
+    return (down, right) if _correlation(moved, kept) > _correlation(first, second) + 0.01 else (0, 0)
+
+
+def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
+    """Where a smaller picture is in a larger one, (row, column), and how well it fits there."""
+    from skimage.feature import match_template
+
+    whole, part = _grey(before), _grey(after)
+    scale = max(1.0, min(whole.shape) / SEARCHED)
+    small, piece = whole, part
+    if scale > 1:
+        small, piece = (
+            resize(grey[None, None], (max(1, round(grey.shape[0] / scale)), max(1, round(grey.shape[1] / scale))))[0, 0]
+            for grey in (whole, part)
+        )
+    if min(piece.shape) < 4 or float(piece.std()) == 0:
+        return (0, 0), -1.0
+    found = match_template(small.numpy(), piece.numpy()[: small.shape[0], : small.shape[1]])
+    row, column = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
+    if scale == 1:
+        return (row, column), float(found.max())
+    reach = math.ceil(2 * scale)  # the place is exact to a few pixels; it is looked for again around there
+    top, left = (
+        min(max(0, round(place * scale) - reach), room)
+        for place, room in zip(
+            (row, column), (whole.shape[0] - part.shape[0], whole.shape[1] - part.shape[1]), strict=True
+        )
+    )
+    near = whole[top : top + part.shape[0] + 2 * reach, left : left + part.shape[1] + 2 * reach]
+    found = match_template(near.numpy(), part.numpy())
+    down, right = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
+    return (top + down, left + right), float(found.max())

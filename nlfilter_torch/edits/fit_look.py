@@ -1,0 +1,324 @@
+"""Looks from pairs of photographs before and after an edit."""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_image, check_order, check_photograph, check_same_size
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.applying import apply_step, seeded
+from nlfilter_torch.edits.detail import options_of
+from nlfilter_torch.edits.parameters import KNOTS, STRAIGHT
+from nlfilter_torch.edits.recipe import in_file
+from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.viewing import viewed_size
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL, fit_alpha
+from nlfilter_torch.filtering.look_fit import (
+    CHOICES,
+    RIDGES,
+    Found,
+    Layout,
+    Parts,
+    Sums,
+    choose,
+    fit_parts,
+    simplest,
+    sums_of,
+)
+from nlfilter_torch.nn.parameters import check_learn
+from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.features import reduce_channels
+
+Pair = tuple[Tensor, ...]
+FOLDS = 5  # into which pairs are put, or parts of pictures
+SQUARES = 8  # along each side of a picture, that go to the folds in turn
+INSIDE = 0.9  # of a mask, from where on a pixel counts for its region
+SLIDERS_ONLY = 0.98  # share that sliders explain of a pair for which they are found to the last digit
+PARTS = ("alpha", "bands", "curves", "matrix")
+ALIKE = (
+    0.5  # correlation of the luminance of a picture before and after an edit, below which they do not belong together
+)
+SHADES = 256
+
+
+@dataclass(frozen=True)
+class FittedLook:
+    """A look that was found, and how much of the edits it explains.
+
+    Attributes:
+        step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
+        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, and ``matrix``.
+        fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
+        left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
+        explained: the same two for every choice of parts that was tried.
+    """
+
+    step: Step
+    parts: Parts
+    fitted: float
+    left_out: float
+    explained: dict[Parts, tuple[float, float]]
+
+    def apply(self, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+        """An image (B, C, H, W) in [0, 1] under the look; values may leave [0, 1]. Differentiable in the image."""
+        return apply_step(self.step, image, generator=generator)
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """Its parts by name, for :class:`Look`: those of a step of ``detail`` are sliders only."""
+        if self.step.edit == "detail":
+            return {"alpha": torch.tensor(self.step["alpha"])}
+        curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
+        matrix = torch.tensor(self.step["matrix"]).view(3, 3)
+        named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands")}
+        return {**named, "curves": curves, "matrix": matrix}
+
+    def to_json(self) -> str:
+        """A file for ``nlfilter-torch apply``: a recipe of one step."""
+        return in_file([self.step.to_json("    ", complete=True)])
+
+
+@torch.no_grad()
+@full_precision
+def fit_look(
+    pairs: Iterable[Pair],
+    *,
+    parts: Collection[str] = PARTS,
+    order: int = 3,
+    step: Step | None = None,
+    generator: torch.Generator | None = None,
+) -> FittedLook | tuple[FittedLook, ...]:
+    """Find the look that turns photographs into edited ones, whatever program edited them.
+
+    In closed form, from small sums; one pair is in memory at a time. Parts and ridge are chosen by leaving out pairs,
+    or squares of the picture if there is one pair only.
+
+    Args:
+        pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
+            or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own. Read once.
+        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``curves`` and
+            ``matrix``.
+        order: k; k + 1 sliders.
+        step: ``look`` with the parameters of the filter; None has the defaults.
+        generator: source of randomness for the landmarks; None draws the same for every call.
+
+    Returns:
+        The look, or with masks one for each region.
+
+    Raises:
+        TypeError, ValueError: if there is no pair, or the pictures of one do not belong together, are the same, or are
+            black or white all over after the edit.
+
+    Example:
+        >>> before = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+        >>> look = fit_look([(before, before**1.5)])
+        >>> look.parts, look.fitted > 0.99
+        (('tone',), True)
+    """
+    check_order(order)
+    step = Step("look") if step is None else step
+    names = check_learn(parts, PARTS, "parts")
+    choices = [choice for choice in CHOICES if names >= {"curves" if name == "tone" else name for name in choice}]
+    if not choices:
+        raise ValueError(f"parts must name one of {', '.join(PARTS)}, got none; leave them out for all")
+    layout = Layout(KNOTS, order + 1)
+    regions: list[_Region] = []
+    number = 0
+    for pair in pairs:
+        for before, after, masks in _images(pair, number):
+            count = 1 if masks is None else len(masks)
+            if number and count != len(regions):
+                raise ValueError(
+                    f"masks must be as many for every pair, got {count} after {len(regions)}; pass one for each region"
+                )
+            regions = regions or [_Region(layout, []) for _ in range(count)]
+            _add(regions, before, after, masks, step, number, generator)
+            number += 1
+    if number == 0:
+        raise ValueError("pairs must hold a pair of photographs, got none; pass (before, after)")
+    if not any(bool((sums.power > 0).any()) for region in regions for sums in region.folds):
+        raise ValueError("pairs must hold an edited photograph, but each is the same before and after; edit one")
+    found = tuple(region.look(step, choices) for region in regions)
+    return found[0] if len(found) == 1 else found
+
+
+@dataclass
+class _Region:
+    """What is known of the edits of a region.
+
+    Attributes:
+        layout: of the sums.
+        folds: by pair, and by squares of the first.
+        sliders: sums of the Gram matrix of layers, and of it times sliders, of pairs that these explain; None if one
+            of the pairs is none of these.
+    """
+
+    layout: Layout
+    folds: list[Sums]
+    squares: list[Sums] | None = None
+    sliders: tuple[Tensor, Tensor] | None = (torch.zeros(1), torch.zeros(1))
+
+    def look(self, step: Step, choices: Sequence[Parts]) -> FittedLook:
+        """The look, of one of these choices of parts."""
+        folds = self.squares if len(self.folds) == 1 and self.squares else self.folds
+        found = choose(folds, self.layout, choices)
+        best = simplest(found)
+        return FittedLook(
+            self._step(best, step),
+            best.parts,
+            best.fitted,
+            best.left_out,
+            {parts: (look.fitted, look.left_out) for parts, look in found.items()},
+        )
+
+    def _step(self, found: Found, step: Step) -> Step:
+        """Of the edit whose parameters these are."""
+        values = {name: found.coefficients[:, self.layout.place(name)] for name in self.layout.lengths}
+        alpha = 1 + values["alpha"][0]
+        if found.parts == ("alpha",):
+            if self.sliders is not None:
+                alpha = torch.linalg.solve(*self.sliders)
+            plain = {name: step[name] for name in FILTER_NAMES}
+            return Step("detail", alpha=_rounded(alpha), threshold=0.0, limits="none", **plain)
+        curves = torch.tensor(STRAIGHT, dtype=torch.float64) + values["curves"]
+        matrix = torch.eye(3, dtype=torch.float64) + values["matrix"]
+        red, green, blue = map(_rounded, curves)
+        return step.changed(
+            alpha=_rounded(alpha),
+            bands=_rounded(1 + values["bands"][0]),
+            red=red,
+            green=green,
+            blue=blue,
+            matrix=_rounded(matrix.flatten()),
+        )
+
+
+FILTER_NAMES = ("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
+
+
+def _rounded(values: Tensor) -> tuple[float, ...]:
+    return tuple(round(value, 6) for value in values.tolist())
+
+
+def _images(pair: Pair, number: int) -> Iterable[tuple[Tensor, Tensor, Tensor | None]]:
+    """Each image of a pair, in colour: (3, H, W) before and after the edit, and masks (K, H, W)."""
+    if not isinstance(pair, tuple | list) or len(pair) not in (2, 3):
+        raise TypeError(
+            f"pairs must hold tuples of two photographs, or these and masks, got {type(pair).__name__}; "
+            "pass [(before, after)]"
+        )
+    before, after = pair[:2]
+    names = (f"before of pair {number + 1}", f"after of pair {number + 1}")
+    check_photograph(before, names[0])
+    check_photograph(after, names[1], channels=before.shape[1], batch=before.shape[0])
+    check_same_size(after, (before.shape[-2], before.shape[-1]), names[1], names[0])
+    if before.shape[1] not in (1, 3):
+        raise ValueError(f"{names[0]} must have 1 or 3 channels, got {before.shape[1]}; pass grey or RGB")
+    masks = pair[2] if len(pair) == 3 else None
+    if masks is not None:
+        check_image(masks, "masks", batch=before.shape[0])
+        check_same_size(masks, (before.shape[-2], before.shape[-1]), "masks", names[0])
+    for i in range(before.shape[0]):
+        one, other = before[i].expand(3, -1, -1), after[i % after.shape[0]].expand(3, -1, -1)
+        check_belong(one, other, *names)
+        yield one, other, None if masks is None else masks[i % masks.shape[0]]
+
+
+def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None:
+    """Raise unless an image (3, H, W) can be an edit of another one.
+
+    Edits keep most of what is dark and light, or at least (negatives, false colours) most of what luminance says: its
+    correlation with the means of the edited luminance of every shade, and the other way round.
+    """
+    if bool((before == after).all()):
+        return  # says that the look leaves it as it is
+    if not bool(((after > 0) & (after < 1)).any()):
+        raise ValueError(f"{second} must have pixels that are not clipped to black or white, got none; edit it less")
+    grey, edited = (reduce_channels(image[None], "luminance").flatten().double() for image in (before, after))
+    if min(float(grey.std()), float(edited.std())) < 1 / 255:
+        return  # nothing to compare
+    shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
+    counts = torch.zeros(SHADES, dtype=torch.float64).index_add(0, shades, torch.ones_like(grey)).clamp(min=1)
+    means = torch.zeros(SHADES, dtype=torch.float64).index_add(0, shades, edited) / counts
+    shared = float(((means[shades] - edited.mean()).square().mean() / edited.var(correction=0)).sqrt())
+    if len(grey) >= 4 * SHADES and shared < ALIKE:
+        raise ValueError(
+            f"{second} must be an edit of {first}, but their brightness agrees only to {100 * shared:.0f} % "
+            f"(at least {100 * ALIKE:.0f} % is needed); check that they show the same picture"
+        )
+
+
+def _add(
+    regions: list[_Region],
+    before: Tensor,
+    after: Tensor,
+    masks: Tensor | None,
+    step: Step,
+    number: int,
+    generator: torch.Generator | None,
+) -> None:
+    """Add the sums of an image (3, H, W) before and after an edit."""
+    dtype = torch.float64 if before.dtype == torch.float64 else torch.float32
+    before, after = before.to(dtype), after.to(dtype)
+    free = ((after > 0) & (after < 1)).to(dtype)
+    size = (before.shape[-2], before.shape[-1])
+    viewed = viewed_size(size, step["viewing_size"])
+    levels = after * 255
+    rounding = HALF_LEVEL if bool(((levels - levels.round()).abs() < OFF_LEVEL).all()) else 0.0
+    if viewed != size:
+        before, after, free = (resize(planes[None], viewed)[0] for planes in (before, after, free))
+        masks = None if masks is None else resize(masks[None].to(before), viewed)[0]
+        free, rounding = (free > 0.99).to(dtype), 0.0
+    luminance = reduce_channels(before[None], "luminance")
+    operator = nonlocal_operator(luminance, **options_of(step, viewed), generator=generator or seeded())
+    layout = regions[0].layout
+    layers = detail_layers(operator, luminance, order=layout.sliders - 1)[0, :, 0]
+    folds = torch.zeros(viewed, dtype=torch.long)
+    if number == 0:
+        places = [torch.arange(n) * SQUARES // n for n in viewed]
+        folds = (places[0][:, None] + 2 * places[1]) % FOLDS
+    for region, inside in zip(regions, [None] if masks is None else masks, strict=True):
+        weights = free if inside is None else free * ((inside.to(dtype) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
+        if not bool((weights > 0).any()):
+            raise ValueError("masks must hold a pixel that is not clipped in every region, got none; select some")
+        parts = sums_of(before, layers, after - before, weights, folds, layout)
+        whole = parts[0]
+        for part in parts[1:]:
+            whole = whole + part
+        if number == 0:
+            region.squares = [part for part in parts if float(part.count.sum()) > 0]
+        if len(region.folds) < FOLDS:
+            region.folds.append(whole)
+        else:
+            region.folds[number % FOLDS] = region.folds[number % FOLDS] + whole
+        _add_sliders(region, operator, luminance, after, weights, whole, rounding)
+
+
+def _add_sliders(
+    region: _Region,
+    operator: Any,
+    luminance: Tensor,
+    after: Tensor,
+    weights: Tensor,
+    sums: Sums,
+    rounding: float,
+) -> None:
+    """Add sliders that :func:`fit_alpha` finds, to which rounding of the edited picture is no error."""
+    if region.sliders is None:
+        return
+    if sums.explained(fit_parts(sums, ("alpha",), region.layout, RIDGES[0])) < SLIDERS_ONLY:
+        region.sliders = None
+        return
+    edited = reduce_channels(after[None], "luminance")
+    mask = (weights.amin(0) > 0)[None, None].to(luminance)
+    alpha = fit_alpha(operator, luminance, edited, order=region.layout.sliders - 1, mask=mask, rounding=rounding)[0]
+    place = region.layout.place("alpha")
+    gram = sums.gram[:, place, place].sum(0)
+    gram = gram + 1e-9 * gram.diagonal().max() * torch.eye(len(gram), dtype=gram.dtype)
+    old = region.sliders
+    region.sliders = (old[0].double() + gram, old[1].double() + gram @ alpha.double())

@@ -1,0 +1,168 @@
+"""A look: detail sliders, gains of blurs, tone curves and a colour matrix, as found by :func:`fit_look`."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.parameters import LOOK
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.viewing import fit_change
+from nlfilter_torch.filtering.look import BAND_MARGIN, band_change, check_part, pointwise
+from nlfilter_torch.operator.features import reduce_channels
+
+Numbers = Tensor | Sequence[float]
+
+
+@full_precision
+def apply_look(
+    image: Tensor,
+    *,
+    alpha: Numbers = LOOK.defaults["alpha"],
+    bands: Numbers = LOOK.defaults["bands"],
+    red: Numbers = LOOK.defaults["red"],
+    green: Numbers = LOOK.defaults["green"],
+    blue: Numbers = LOOK.defaults["blue"],
+    matrix: Numbers = LOOK.defaults["matrix"],
+    amount: float | Tensor = LOOK.defaults["amount"],
+    viewing_size: float = LOOK.defaults["viewing_size"],
+    photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = LOOK.defaults["spatial_bandwidth"],
+    num_landmarks: int = LOOK.defaults["num_landmarks"],
+    **options: Any,
+) -> Tensor:
+    """Put a photograph under a look: the image plus what each part changes.
+
+    Args:
+        image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and a grey one stays grey.
+        alpha: sliders of the detail layers of luminance, (k+1,) or (B, k+1).
+        bands: gains of six bands of detail that blurs find, each twice as wide, and of the rest around its mean, (7,)
+            or (B, 7).
+        red: what red becomes at equal steps from 0 to 1, (K,) or (B, K), in straight lines between.
+        green: likewise, as many.
+        blue: likewise.
+        matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
+        amount: a number or a tensor of shape () or (B,); 1 is the look, 0 the image.
+        viewing_size: in megapixels; the details of a larger image are those of its reduction to this size; 0 is the
+            size of the image.
+        photometric_bandwidth: h_y, or ``"auto"``.
+        spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
+            apart they are.
+        num_landmarks: M.
+        **options: further ones of :func:`nonlocal_operator`.
+
+    Returns:
+        (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image and look.
+
+    Raises:
+        TypeError, ValueError: if a part has another shape, or an option leaves its range.
+
+    Example:
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> sepia = (0.393, 0.769, 0.189, 0.349, 0.686, 0.168, 0.272, 0.534, 0.131)
+        >>> apply_look(image, matrix=sepia).shape
+        torch.Size([1, 3, 24, 24])
+    """
+    check_photograph(image, "image")
+    return edited(
+        image,
+        fit_look_edit,
+        alpha=alpha,
+        bands=bands,
+        red=red,
+        green=green,
+        blue=blue,
+        matrix=matrix,
+        amount=amount,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=num_landmarks,
+        **options,
+    )
+
+
+def fit_look_edit(
+    source: Source,
+    *,
+    alpha: Numbers = LOOK.defaults["alpha"],
+    bands: Numbers = LOOK.defaults["bands"],
+    red: Numbers = LOOK.defaults["red"],
+    green: Numbers = LOOK.defaults["green"],
+    blue: Numbers = LOOK.defaults["blue"],
+    matrix: Numbers = LOOK.defaults["matrix"],
+    amount: float | Tensor = LOOK.defaults["amount"],
+    viewing_size: float = LOOK.defaults["viewing_size"],
+    photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | str | None = LOOK.defaults["spatial_bandwidth"],
+    num_landmarks: int = LOOK.defaults["num_landmarks"],
+    **options: Any,
+) -> Fitted:
+    """:func:`apply_look` for any source."""
+    if source.channels not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
+    LOOK["amount"].check_argument(amount, source.batch)
+    LOOK["viewing_size"].check_argument(viewing_size)
+    sliders, gains = (_numbers(value, source) for value in (alpha, bands))
+    channels = [_numbers(value, source) for value in (red, green, blue)]
+    if len({channel.shape[-1] for channel in channels}) > 1:
+        lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
+        raise ValueError(f"red, green and blue must be equally many numbers, got {lengths}; add or drop some")
+    batch = max(channel.shape[0] if channel.ndim == 2 else 1 for channel in channels)
+    curves = torch.stack([channel.expand(batch, -1) for channel in channels], dim=1)
+    colours = _numbers(matrix, source)
+    if colours.shape[-1] != 9:
+        raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
+    colours = colours.unflatten(-1, (3, 3))
+    for name, value in (("alpha", sliders), ("bands", gains), ("curves", curves), ("matrix", colours)):
+        check_part(value, name, source.batch)
+    strength = torch.as_tensor(amount).to(source.dtype).reshape(-1, 1, 1, 1)
+
+    def change(viewed: Source) -> Fitted:
+        moved: Planes | None = None
+        if _acts(sliders):
+            filter_options = options | {
+                "photometric_bandwidth": photometric_bandwidth,
+                "spatial_bandwidth": nearby_or_far(spatial_bandwidth, LOOK["spatial_bandwidth"].share, viewed.size),
+                "num_landmarks": num_landmarks,
+            }
+            filtered = polynomial(viewed.operator(Guide(filter_options)), luminance, sliders.shape[-1] - 1, None)
+
+            moved = partial(filtered, alpha=sliders - 1)
+
+        def pixels(some: Pixels) -> Tensor:
+            return torch.zeros_like(some.image) if moved is None else moved(some).expand_as(some.image)
+
+        if not _acts(gains):
+            return Fitted(pixels)
+        mean = viewed.mean(luminance)
+        return Fitted(pixels, lambda image, found: found + band_change(image, gains, mean), BAND_MARGIN)
+
+    fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
+
+    def result(image: Tensor, moved: Tensor) -> Tensor:
+        coloured = image.expand(-1, 3, -1, -1)
+        shown = pointwise(coloured, curves, colours) - coloured
+        shown = reduce_channels(shown, "luminance") if image.shape[1] == 1 else shown
+        return image + strength * (moved - image + shown)
+
+    if fitted.finish is None:
+        return Fitted(lambda pixels: result(pixels.image, fitted.pixels(pixels)))
+    finish = fitted.finish
+    return Fitted(fitted.pixels, lambda image, found: result(image, finish(image, found)), fitted.margin, fitted.step)
+
+
+def _numbers(value: Numbers, source: Source) -> Tensor:
+    return (
+        torch.as_tensor(value).to(source.dtype) if isinstance(value, Tensor) else torch.tensor(value).to(source.dtype)
+    )
+
+
+def _acts(gains: Tensor) -> bool:
+    """Whether gains change anything, or may once they are learned."""
+    return gains.requires_grad or bool((gains != 1).any())

@@ -1,0 +1,136 @@
+"""A look: sliders of the filter and of blurs, a tone curve for each channel, and a colour matrix, added up.
+
+Each part gives a change of the image, and the result is the image plus all changes, so that it is linear in every
+parameter but the image: looks are fitted to edits by least squares.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_image, check_tensor
+from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.operator.features import pad_border, reduce_channels
+from nlfilter_torch.operator.operator import NonlocalOperator
+
+BLURS = 6  # each twice as wide as the one before
+BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
+NAMES = ("alpha", "bands", "curves", "matrix")
+DIMENSIONS = {"alpha": 1, "bands": 1, "curves": 2, "matrix": 2}  # of one image
+
+
+def filter_look(
+    image: Tensor,
+    *,
+    alpha: Tensor | None = None,
+    bands: Tensor | None = None,
+    curves: Tensor | None = None,
+    matrix: Tensor | None = None,
+    operator: NonlocalOperator | None = None,
+) -> Tensor:
+    """An image under a look, each part of which may be left out.
+
+    Args:
+        image: (B, 3, H, W) in [0, 1].
+        alpha: sliders (k+1,) or (B, k+1) of the filter's layers of luminance. Paper: eq. (12).
+        bands: gains (7,) or (B, 7) of what six blurs, each twice as wide, take away one after the other, fine to
+            coarse, and last of what they leave, around the picture's mean luminance: 1 changes nothing.
+        curves: (3, K) or (B, 3, K), what red, green and blue become at K equal steps from 0 to 1.
+        matrix: (3, 3) or (B, 3, 3) that colours are multiplied by; its change, like that of the curves, is that of the
+            image itself.
+        operator: W, which ``alpha`` needs.
+
+    Returns:
+        (B, 3, H, W); values may leave [0, 1]. Differentiable in everything.
+
+    Raises:
+        TypeError, ValueError: if a part does not have its shape, or ``alpha`` comes without an operator.
+
+    Example:
+        >>> image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+        >>> darker = filter_look(image, curves=torch.tensor([0.0, 0.4, 1.0]).expand(3, 3))
+        >>> bool(darker.mean() < image.mean())
+        True
+    """
+    check_image(image, "image", channels=3)
+    parts = {"alpha": alpha, "bands": bands, "curves": curves, "matrix": matrix}
+    given = {name: value for name, value in parts.items() if value is not None}
+    for name, value in given.items():
+        check_part(value, name, image.shape[0])
+    result = pointwise(image, curves, matrix)
+    if bands is not None:
+        mean = reduce_channels(image, "luminance").mean((2, 3), keepdim=True)
+        result = result + band_change(image, bands, mean)
+    if alpha is not None:
+        if operator is None:
+            raise ValueError("operator must be given where alpha is, got None; make it with nonlocal_operator")
+        result = result + polynomial_filter(operator, reduce_channels(image, "luminance"), alpha - 1)
+    return result
+
+
+def check_part(value: Tensor, name: str, batch: int) -> None:
+    """Raise unless a part of a look has its shape."""
+    check_tensor(value, name)
+    shapes = {"alpha": "(k+1,)", "bands": f"({BLURS + 1},)", "curves": "(3, K)", "matrix": "(3, 3)"}
+    shape, one = tuple(value.shape), DIMENSIONS[name]
+    last = shape[-one:]
+    fits = {
+        "alpha": lambda: last[0] >= 2,
+        "bands": lambda: last == (BLURS + 1,),
+        "curves": lambda: last[0] == 3 and last[1] >= 2,
+        "matrix": lambda: last == (3, 3),
+    }
+    if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
+        raise ValueError(
+            f"{name} must have the shape {shapes[name]}, or that for each of {batch} images, got {shape}; reshape it"
+        )
+
+
+def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None) -> Tensor:
+    """The image (B, 3, H, W) plus what tone curves and matrix change."""
+    result = image
+    if curves is not None:
+        result = tone_curve(image, curves)
+    if matrix is not None:
+        change = matrix - torch.eye(3).to(matrix)
+        result = result + (change.to(image) @ image.flatten(2)).view_as(image)
+    return result
+
+
+def tone_curve(image: Tensor, curves: Tensor) -> Tensor:
+    """Piecewise linear curves (3, K) or (B, 3, K) of an image (B, 3, H, W), continued beyond [0, 1]."""
+    place = image.flatten(2) * (curves.shape[-1] - 1)
+    below = place.detach().floor().clamp(0, curves.shape[-1] - 2)
+    values = curves.to(image).expand(image.shape[0], -1, -1)
+    low, high = (values.gather(2, below.long() + step) for step in (0, 1))
+    return (low + (high - low) * (place - below)).view_as(image)
+
+
+def bands_of(image: Tensor) -> Iterator[Tensor]:
+    """What each of the blurs takes away from an image (B, C, H, W), and last what they leave."""
+    height, width = image.shape[-2:]
+    left, margin = pad_border(image, BAND_MARGIN), BAND_MARGIN
+    for level in range(BLURS):
+        reach = 2 * 2**level
+        blurred = _blur(_blur(left, 2, 2**level), 3, 2**level)
+        inner = left[..., reach : left.shape[2] - reach, reach : left.shape[3] - reach]
+        margin -= reach
+        yield (inner - blurred)[..., margin : margin + height, margin : margin + width]
+        left = blurred
+    yield left
+
+
+def _blur(image: Tensor, dim: int, step: int) -> Tensor:
+    """Along one axis by the weights 1, 4, 6, 4, 1 of pixels ``step`` apart, which ends 2 steps inside the borders."""
+    a, b, c, d, e = (image.narrow(dim, i * step, image.shape[dim] - 4 * step) for i in range(5))
+    return (a + e) / 16 + (b + d) / 4 + c * 0.375
+
+
+def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:
+    """What gains (7,) or (B, 7) of the bands change of an image, around the mean (B, 1, 1, 1) of its luminance."""
+    change = torch.zeros_like(image)
+    for number, band in enumerate(bands_of(image)):
+        gain = (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1)
+        change = change + gain * (band - mean if number == BLURS else band)
+    return change

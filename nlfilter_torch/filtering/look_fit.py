@@ -1,0 +1,310 @@
+"""The look that explains edits best, from small sums over pixels. See :mod:`nlfilter_torch.filtering.look`.
+
+A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
+channel a tone curve's hat functions, the three colours, the bands of blurs and the layers of the filter. Which parts a
+look has, and how strong a ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the
+picture if there are few. A curve is kept from falling by a least-squares problem with bounds.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.filtering.look import BLURS, bands_of
+from nlfilter_torch.operator.features import reduce_channels
+
+Parts = tuple[str, ...]
+
+#: What a look may consist of, the simplest first. ``tone`` is one curve for all channels, ``curves`` one for each.
+CHOICES: tuple[Parts, ...] = (
+    ("alpha",),
+    ("matrix",),
+    ("tone",),
+    ("bands",),
+    ("tone", "matrix"),
+    ("bands", "matrix"),
+    ("curves",),
+    ("curves", "matrix"),
+    ("tone", "bands"),
+    ("alpha", "bands"),
+    ("tone", "matrix", "bands"),
+    ("alpha", "tone", "matrix"),
+    ("alpha", "tone", "matrix", "bands"),
+    ("curves", "matrix", "bands"),
+    ("alpha", "curves", "matrix", "bands"),
+)
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+ROUGH = 10.0  # weight of a curve's bends beside that of its distance from the identity
+SLACK, FAINT = 1.1, 0.002  # a simpler look may leave so many times as much, and so much of the change more
+SMALL = 1.0  # weight of the mean change of pairs beside that of one, whose share it is divided by
+BLOCK = 1 << 14  # pixels whose products are summed up at once
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which column of each channel is what.
+
+    Attributes:
+        knots: K of a tone curve.
+        sliders: of the filter.
+    """
+
+    knots: int
+    sliders: int
+
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Columns of each kind, in their order."""
+        return {"curves": self.knots, "matrix": 3, "bands": BLURS + 1, "alpha": self.sliders}
+
+    @property
+    def columns(self) -> int:
+        """How many there are for a channel."""
+        return sum(self.lengths.values())
+
+    def place(self, part: str) -> slice:
+        """The columns of a part."""
+        names = list(self.lengths)
+        start = sum(list(self.lengths.values())[: names.index(part)])
+        return slice(start, start + self.lengths[part])
+
+    def spread(self, parts: Parts) -> Tensor:
+        """From the parameters of some parts to the coefficients (3, F, P) of the columns of every channel."""
+        found = []
+        for part in parts:
+            place = self.place("curves" if part == "tone" else part)
+            count, own = place.stop - place.start, part in ("curves", "matrix")
+            ones = torch.zeros(3, self.columns, count * (3 if own else 1), dtype=torch.float64)
+            for channel in range(3):
+                first = channel * count if own else 0
+                ones[channel, place, first : first + count] = torch.eye(count, dtype=torch.float64)
+            found.append(ones)
+        return torch.cat(found, dim=2)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over pixels, of each channel: all that is known of pairs.
+
+    Attributes:
+        gram: of the columns, (3, F, F), in float64.
+        cross: of columns and change, (3, F).
+        power: of the change, (3,).
+        count: of the pixels, (3,).
+    """
+
+    gram: Tensor
+    cross: Tensor
+    power: Tensor
+    count: Tensor
+
+    def __add__(self, other: "Sums") -> "Sums":
+        """Of both."""
+        return Sums(
+            self.gram + other.gram, self.cross + other.cross, self.power + other.power, self.count + other.count
+        )
+
+    def left(self, coefficients: Tensor) -> float:
+        """Squares of the change that coefficients (3, F) leave."""
+        explained = 2 * (coefficients * self.cross).sum()
+        explained = explained - torch.einsum("cf,cfg,cg->", coefficients, self.gram, coefficients)
+        return float(self.power.sum() - explained)
+
+    def explained(self, coefficients: Tensor) -> float:
+        """Share of the change that coefficients (3, F) explain, 1 at best."""
+        return 1.0 - self.left(coefficients) / max(float(self.power.sum()), 1e-30)
+
+
+def sums_of(image: Tensor, layers: Tensor, change: Tensor, weights: Tensor, fold: Tensor, layout: Layout) -> list[Sums]:
+    """The sums of a pair, one for each number in ``fold``.
+
+    Args:
+        image: (3, H, W), before the edit.
+        layers: of its luminance, (k+1, H, W).
+        change: (3, H, W).
+        weights: of each channel's pixels, (3, H, W).
+        fold: whole numbers (H, W).
+        layout: of the columns.
+    """
+    mean = reduce_channels(image[None], "luminance").mean()
+    bands = [band[0] for band in bands_of(image[None])]
+    bands[-1] = bands[-1] - mean
+    numbers = range(int(fold.max()) + 1)
+    found: list[Sums | None] = [None for _ in numbers]
+    columns, steps = image.shape[2], max(1, BLOCK // image.shape[2])
+    knots = torch.arange(layout.knots).to(image).view(-1, 1)
+    for start in range(0, image.shape[1], steps):
+        rows = slice(start, min(start + steps, image.shape[1]))
+        pixels = (rows.stop - rows.start) * columns
+        colours, parts = image[:, rows].reshape(3, pixels), layers[:, rows].reshape(-1, pixels)
+        for channel in range(3):
+            hats = (1 - (colours[channel].clamp(0, 1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
+            local = torch.stack([band[channel, rows].reshape(pixels) for band in bands])
+            design = torch.cat([hats, colours, local, parts]).double()  # its columns nearly depend on each other
+            weight, moved = weights[channel, rows].flatten().double(), change[channel, rows].flatten().double()
+            places = fold[rows].flatten()
+            for number in numbers:
+                some = slice(None) if len(numbers) == 1 else (places == number).nonzero().squeeze(1)
+                columns_here, moved_here = design[:, some], moved[some]
+                weighed = columns_here * weight[some]
+                total = _channel(
+                    channel,
+                    weighed @ columns_here.mT,
+                    weighed @ moved_here,
+                    (weight[some] * moved_here) @ moved_here,
+                    weight[some].sum(),
+                )
+                known = found[number]
+                found[number] = total if known is None else known + total
+    return [part for part in found if part is not None]
+
+
+def _channel(channel: int, *values: Tensor) -> Sums:
+    """Sums of one channel alone."""
+    spread = [torch.zeros(3, *value.shape, dtype=torch.float64) for value in values]
+    for whole, value in zip(spread, values, strict=True):
+        whole[channel] = value.double()
+    return Sums(*spread)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A look that was chosen.
+
+    Attributes:
+        parts: what it consists of.
+        coefficients: (3, F) of the columns.
+        fitted: share of the change that it explains.
+        left_out: share that looks fitted without them explain of the pairs or parts left out.
+        risk: mean over these of the share that is left, with small changes counted less.
+    """
+
+    parts: Parts
+    coefficients: Tensor
+    fitted: float
+    left_out: float
+    risk: float
+
+
+def choose(folds: Sequence[Sums], layout: Layout, choices: Iterable[Parts] = CHOICES) -> dict[Parts, Found]:
+    """The best ridge for each choice of parts, by leaving out each of the folds in turn."""
+    total = reduce(Sums.__add__, folds)
+    power = max(float(total.power.sum()), 1e-30)
+    found: dict[Parts, Found] = {}
+    powers = torch.stack([sums.power.sum() for sums in folds])
+    ridges = torch.tensor(RIDGES, dtype=torch.float64).view(-1, 1, 1, 1)
+    for parts in choices:
+        spread = layout.spread(parts)
+        products = [_products(sums, spread) for sums in folds]
+        grams, crosses = (torch.stack(values) for values in zip(*products, strict=True))
+        without, aims = grams.sum(0) - grams, crosses.sum(0) - crosses
+        weights = torch.stack([_penalty(gram, parts, layout) for gram in without])
+        solved = torch.linalg.solve(without + ridges * weights + _floor(without), aims.expand(len(ridges), -1, -1))
+        changes = torch.einsum("rfp,fpq,rfq->rf", solved, grams, solved)
+        changes = changes - 2 * torch.einsum("rfp,fp->rf", solved, crosses)
+        shares = ((changes + powers) / (powers + SMALL * powers.mean().clamp(min=1e-30))).mean(1)
+        best = int(shares.argmin())
+        coefficients = fit_parts(total, parts, layout, RIDGES[best])
+        found[parts] = Found(
+            parts, coefficients, total.explained(coefficients), -float(changes[best].sum()) / power, float(shares[best])
+        )
+    return found
+
+
+def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float) -> Tensor:
+    """Coefficients (3, F) of the look of some parts that explains most, under a ridge."""
+    spread = layout.spread(parts)
+    gram, cross = _products(sums, spread)
+    return spread @ _solve(gram + ridge * _penalty(gram, parts, layout) + _floor(gram), cross, parts, layout)
+
+
+def simplest(found: dict[Parts, Found]) -> Found:
+    """The first choice that leaves hardly more than the best one does."""
+    least = min(look.risk for look in found.values())
+    return next(look for look in found.values() if look.risk <= SLACK * least + FAINT)
+
+
+def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:
+    gram = torch.einsum("cfp,cfg,cgq->pq", spread, sums.gram, spread)
+    return gram, torch.einsum("cfp,cf->p", spread, sums.cross)
+
+
+def _penalty(gram: Tensor, parts: Parts, layout: Layout) -> Tensor:
+    """Weights (P, P) of the distance of parameters from the identity, relative to what the columns weigh."""
+    penalty = torch.diag(gram.diagonal())
+    start = 0
+    for part in parts:
+        curves = {"tone": 1, "curves": 3}.get(part, 0)
+        for _ in range(curves):
+            place = slice(start, start + layout.knots)
+            bends = torch.eye(layout.knots, dtype=gram.dtype).diff(n=2, dim=0)
+            level = gram.diagonal()[place].mean()
+            straight = torch.eye(layout.knots, dtype=gram.dtype)
+            penalty[place, place] = level * (ROUGH * bends.mT @ bends + straight)
+            start += layout.knots
+        if not curves:
+            start += layout.lengths[part] * (3 if part == "matrix" else 1)
+    return penalty
+
+
+def _floor(gram: Tensor) -> Tensor:
+    """A ridge for parameters that no pixel depends on."""
+    diagonal = gram.diagonal(dim1=-2, dim2=-1)
+    return torch.diag_embed((1e-12 * diagonal.amax(-1, keepdim=True) + 1e-12).expand_as(diagonal))
+
+
+def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: Layout) -> Tensor:
+    """Parameters (P,) of the least squares under which no curve falls."""
+    free = torch.linalg.solve(gram, cross)
+    rows, start = [], 0
+    for part in parts:
+        for _ in range({"tone": 1, "curves": 3}.get(part, 0)):
+            rises = torch.zeros(layout.knots - 1, len(cross), dtype=gram.dtype)
+            rises[:, start : start + layout.knots] = torch.eye(layout.knots, dtype=gram.dtype).diff(dim=0)
+            rows.append(rises)
+            start += layout.knots
+        if part not in ("tone", "curves"):
+            start += layout.lengths[part] * (3 if part == "matrix" else 1)
+    if not rows:
+        return free
+    rises = torch.cat(rows)
+    slack = rises @ free + 1 / (layout.knots - 1)  # the parameters are changes of the identity
+    if bool((slack >= 0).all()):
+        return free
+    moves = torch.linalg.solve(gram, rises.mT)
+    return free + moves @ nonnegative(rises @ moves, -slack)
+
+
+def nonnegative(matrix: Tensor, vector: Tensor) -> Tensor:
+    """The x >= 0 that minimises ``x^T A x / 2 - b^T x``, by active sets after Lawson and Hanson.
+
+    Args:
+        matrix: A (n, n), positive semi-definite.
+        vector: b (n,).
+    """
+    count = len(vector)
+    x, free = torch.zeros_like(vector), torch.zeros(count, dtype=torch.bool)
+    least = 1e-10 * vector.abs().max().clamp(min=1e-30)
+    for _ in range(10 * count):
+        slope = torch.where(free, -torch.inf, vector - matrix @ x)
+        if bool(slope.max() <= least):
+            break
+        free[slope.argmax()] = True
+        while True:
+            wanted = torch.zeros_like(x)
+            inner = matrix[free][:, free]
+            jitter = 1e-13 * inner.diagonal().max() * torch.eye(len(inner), dtype=inner.dtype)
+            wanted[free] = torch.linalg.solve(inner + jitter, vector[free])
+            blocked = free & (wanted <= 0)
+            if not bool(blocked.any()):
+                x = wanted
+                break
+            x = x + (x[blocked] / (x[blocked] - wanted[blocked])).min() * (wanted - x)
+            free &= x > 1e-14 * x.max()
+            x = torch.where(free, x, 0.0)
+            if not bool(free.any()):
+                break
+    return x

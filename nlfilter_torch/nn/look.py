@@ -1,0 +1,93 @@
+"""A look whose parts are learned."""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nlfilter_torch.core.checks import check_image
+from nlfilter_torch.filtering.look import BLURS, NAMES, check_part, filter_look
+from nlfilter_torch.nn.parameters import check_learn
+from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import NonlocalOperator
+
+NEAR = 1 / 12  # spatial bandwidth, as a share of the short side, of looks that fit_look finds
+
+
+class Look(nn.Module):
+    """Image to the image under a look: sliders, gains of blurs, tone curves and a colour matrix, added up.
+
+    Paper: eq. (12) for the sliders. Starts from the identity, or from what :func:`fit_look` found.
+
+    Args:
+        parts: values to start from, by the names ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K) and ``matrix``
+            (3, 3), as :meth:`FittedLook.tensors` gives them; those that are left out are the identity.
+        learn: names of the parts that are learned; the others are buffers.
+        knots: K, for curves that start from the identity.
+        **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
+            short side by default.
+
+    Raises:
+        TypeError, ValueError: if a part has another shape or name.
+
+    Example:
+        >>> layer = Look(learn=("curves", "matrix"))
+        >>> image = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+        >>> torch.equal(layer(image), image), [name for name, _ in layer.named_parameters()]
+        (True, ['curves', 'matrix'])
+    """
+
+    alpha: Tensor
+    bands: Tensor
+    curves: Tensor
+    matrix: Tensor
+
+    def __init__(
+        self,
+        parts: Mapping[str, Tensor] | None = None,
+        *,
+        learn: Collection[str] = NAMES,
+        knots: int = 17,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        names = check_learn(learn, NAMES)
+        given = {} if parts is None else dict(parts)
+        check_learn(list(given), NAMES, "parts")
+        start = {
+            "alpha": torch.ones(4),
+            "bands": torch.ones(BLURS + 1),
+            "curves": torch.linspace(0, 1, knots).expand(3, -1),
+            "matrix": torch.eye(3),
+        } | given
+        for name, value in start.items():
+            check_part(value, name, 1)
+            own = value.detach().to(torch.get_default_dtype()).clone()
+            if name in names:
+                self.register_parameter(name, nn.Parameter(own))
+            else:
+                self.register_buffer(name, own)
+        self.options = {"photometric_bandwidth": 20 / 255, "num_landmarks": 300, **options}
+
+    def forward(self, image: Tensor, operator: NonlocalOperator | None = None, **parts: Tensor) -> Tensor:
+        """The image under the look, (B, 3, H, W); values may leave [0, 1].
+
+        Args:
+            image: (B, 3, H, W) in [0, 1].
+            operator: W of its luminance, where it is known; None builds it if the sliders are not all 1.
+            **parts: values for this call in place of the layer's own, such as those that a network computes, with a
+                first dimension of B if they differ between images.
+        """
+        check_image(image, "image", channels=3)
+        check_learn(list(parts), NAMES, "parts")
+        used = {name: parts.get(name, getattr(self, name)) for name in NAMES}
+        if not (used["alpha"].requires_grad or bool((used["alpha"] != 1).any())):
+            del used["alpha"]
+        elif operator is None:
+            near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
+            operator = nonlocal_operator(reduce_channels(image, "luminance"), **near | self.options)
+        if not (used["bands"].requires_grad or bool((used["bands"] != 1).any())):
+            del used["bands"]
+        return filter_look(image, operator=operator, **used)
