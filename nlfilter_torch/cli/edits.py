@@ -50,11 +50,21 @@ PresetName = Annotated[
 ]
 #: Options for what is painted or marked on the photograph, by the name of the edit.
 SCRIBBLES: dict[str, dict[str, Any]] = {
-    "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile},
-    "recolor": {"strokes": options.StrokesFile, "region": options.ColourRegions, "keep": options.Keeps},
-    "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions},
-    "defocus": {"region": options.Regions, "mask": options.MaskFile},
-    "mask": {"region": options.Regions, "background": options.Backgrounds, "mask": options.MaskFile},
+    "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile, "show": options.Show},
+    "recolor": {
+        "strokes": options.StrokesFile,
+        "region": options.ColourRegions,
+        "keep": options.Keeps,
+        "show": options.Show,
+    },
+    "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions, "show": options.Show},
+    "defocus": {"region": options.Regions, "mask": options.MaskFile, "show": options.Show},
+    "mask": {
+        "region": options.Regions,
+        "background": options.Backgrounds,
+        "mask": options.MaskFile,
+        "show": options.Show,
+    },
 }
 
 
@@ -170,13 +180,21 @@ def edit_photograph(
 
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, scribbles
+    from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.edits.applying import apply_to, fit_step, seeded
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture, Rows
+
+    def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
+        """Say what the scribbles cover, and show it."""
+        showing.tell_colours(showing.overlays(drawn), read)
+        if given.get("show") is not None:
+            if not any(True for _ in showing.overlays(drawn)):
+                raise ValueError("--show needs scribbles to show; give --region X,Y,W,H, or leave it out")
+            showing.show(given["show"], name, step.arguments, size, read, drawn)
 
     def work(photograph: Photograph) -> Tensor:
         free = editing.allowed_memory(memory)
@@ -186,11 +204,13 @@ def edit_photograph(
                 return files.enter_context(open_picture(path, free))
 
             drawn = scribbles.of_edit(step, photograph.size, given, read)
+            tell(drawn, photograph.size, lambda rows: photograph.pixels[..., rows, :])
             return apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
 
     def by_rows(job: Job) -> Rows:
         tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
         drawn = scribbles.of_edit(step, job.size, given, job.open)
+        tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
         yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
 
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))
