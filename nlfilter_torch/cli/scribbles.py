@@ -55,8 +55,8 @@ class Rectangle:
             x, y, width, height = (math.floor(number) for number in found)
         except ValueError:
             raise ValueError(
-                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, or a point X,Y, or shares such as "
-                f"25%, got {text!r}"
+                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; shares such as 25% "
+                "and a point X,Y will do, too"
             ) from None
         if width < 1 or height < 1:
             raise ValueError(f"{option} must be at least 1 pixel wide and high, got {width}x{height} in {text!r}")
