@@ -121,6 +121,7 @@ def test_picture_follows_a_slider_and_undo(opened: Tab) -> None:
 
 
 def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
+    """The mask is there for a second, or for as long as it is asked for, but never while a slider moves."""
     page = opened.page
     expect(opened.mask).not_to_be_visible()
     opened.paint((0.2, 0.9), (0.3, 0.9), release=False)
@@ -128,6 +129,9 @@ def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
     page.mouse.up()
     expect(opened.mask).to_be_visible()
     expect(page.get_by_text("In the region")).to_be_visible()
+    expect(opened.mask).not_to_be_visible()  # after a second, by itself
+    page.get_by_role("checkbox", name="Mask").click()
+    expect(opened.mask).to_be_visible()
     before = opened.source()
     opened.drag(opened.slider("Texture in the region"), 0.2, 0.9, release=False)
     opened.wait_for_picture(before)
@@ -169,6 +173,7 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     before = opened.source()
     opened.load_edit(folder / "edit.json")
     opened.wait_for_picture(before)
+    page.get_by_role("tab", name="Detail").click()
     expect(opened.mask).to_be_visible()
     page.wait_for_timeout(500)
     assert difference(shown(opened), saved) < 5
@@ -206,9 +211,91 @@ def test_preset_and_response(opened: Tab) -> None:
     opened.wait_for_picture(before)
     expect(opened.page.get_by_text("2.20 ×").first).to_be_visible()
     assert curve.get_attribute("points") != flat
+    expect(opened.page.get_by_text("crisp:").first).to_be_visible()  # the name stays
     before = opened.source()
     opened.drag(opened.slider("Bandwidth"), 0.3, 0.6)
     opened.wait_for_picture(before)
+    expect(opened.page.get_by_text("Started from crisp, then changed")).to_be_visible()
+
+
+def test_histogram_and_clipping(opened: Tab) -> None:
+    page = opened.page
+    expect(page.get_by_role("img", name="histogram")).to_be_visible()
+    clipped = page.get_by_alt_text("clipped")
+    expect(clipped).not_to_be_visible()
+    page.get_by_role("checkbox", name="Clipped").click()
+    expect(clipped).to_be_visible()
+    page.get_by_role("tab", name="Tone").click()
+    before = opened.source()
+    opened.drag(opened.slider("Contrast"), 0.5, 1.0)
+    opened.wait_for_picture(before)
+    expect(page.get_by_text("Clipped: ")).to_be_visible()
+
+
+def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None:
+    (folder / "notes.png").write_text("dear diary")
+    opened.open(folder / "notes.png")
+    error = opened.page.get_by_text("notes.png is not a PNG")
+    expect(error).to_be_visible()
+    before = opened.source()
+    opened.drag(opened.slider("Texture"), 0.2, 0.8)
+    opened.wait_for_picture(before)
+    expect(error).not_to_be_visible(timeout=5000)  # sooner than by itself
+
+
+def test_keyboard_focus_can_be_seen(opened: Tab) -> None:
+    page = opened.page
+    frame = "() => getComputedStyle(document.activeElement).boxShadow"
+    page.keyboard.press("Tab")
+    for _ in range(3):
+        assert "rgb(255, 213, 74)" in page.evaluate(frame), page.evaluate("() => document.activeElement.outerHTML")
+        page.keyboard.press("Tab")
+    opened.slider("Texture").focus()
+    page.keyboard.press("ArrowRight")
+    assert "rgb(255, 213, 74)" in page.evaluate(frame)
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (800, 600), (1280, 800), (1920, 1080)])
+def test_layout_on_every_screen(browser: Browser, editor: Editor, folder: Path, width: int, height: int) -> None:
+    """Nothing is off the screen, and a finger can draw and save on a phone."""
+    phone = width < 500
+    context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
+    tab = Tab(context.new_page())
+    page = tab.page
+    page.goto(editor.url)
+    tab.open(folder / "cat.png")
+    tab.wait_for_picture()
+    expect(page.locator(".response circle")).not_to_have_count(0)
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    photo, save = tab.photo.bounding_box(), page.get_by_role("button", name="Save photo").bounding_box()
+    panel = page.locator(".panel").bounding_box()
+    assert photo is not None
+    assert save is not None
+    assert panel is not None
+    assert save["x"] + save["width"] <= width
+    assert photo["width"] * photo["height"] > 0.15 * width * height
+    assert panel["y"] >= photo["y"] + photo["height"] or panel["x"] >= photo["x"] + photo["width"]  # beside it
+    if not phone:
+        context.close()
+        return
+    touch = context.new_cdp_session(page)
+    for kind, share in (("touchStart", 0.2), ("touchMove", 0.25), ("touchMove", 0.3), ("touchEnd", None)):
+        place = (
+            []
+            if share is None
+            else [{"x": photo["x"] + share * photo["width"], "y": photo["y"] + 0.9 * photo["height"]}]
+        )
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": place})
+    expect(page.locator("path.stroke")).to_have_count(1)
+    expect(page.get_by_text("In the region")).to_be_visible()
+    page.get_by_role("button", name="Show or hide the controls").tap()
+    expect(page.get_by_text("In the region")).not_to_be_in_viewport()
+    page.get_by_role("button", name="Save photo").tap()
+    page.get_by_label("Name").fill("phone.png")
+    page.get_by_role("button", name="Save", exact=True).tap()
+    expect(page.get_by_text("Saved ").and_(page.get_by_text("phone.png"))).to_be_visible()
+    assert (folder / "phone.png").exists()
+    context.close()
 
 
 def test_wipe_shows_what_was_before(opened: Tab) -> None:

@@ -31,6 +31,10 @@ class Canvas:
         self._token = token
         self._drawn = drawn
         self._frame = 0
+        self.histogram = ""
+        self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
+        self._flashes = 0
+        self._mask_shown: bytes | None = None  # the mask that was shown last
         self._step = "detail"  # the step whose strokes are shown
         self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
         with ui.element("div").classes("canvas"):
@@ -43,6 +47,7 @@ class Canvas:
             ).classes("photo")
             with self._photo:
                 self._mask = ui.element("img").classes("over mask").props('alt="mask"')
+                self._clipped = ui.element("img").classes("over").props('alt="clipped"')
                 self._before = ui.element("img").classes("over before").props('alt="before"')
                 ui.element("div").classes("edge")
                 ui.label("before").classes("tag")
@@ -54,24 +59,33 @@ class Canvas:
                 "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
             )
         self._photo.set_visibility(False)
+        self._clipped.set_visibility(False)
+        self._mask.set_visibility(False)
         self._welcome.on("pointerdown", lambda: show_error("open a photograph first; there is nothing to paint on"))
         with ui.row().classes("bar"):
-            ui.label("Before").classes("hint")
+            ui.label("Before").classes("hint wide")
             wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
             wipe.props('dense aria-label="Before and after"')
             wipe.on("update:model-value", js_handler="(v) => document.documentElement.style.setProperty('--wipe', v)")
             self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
-            self._show_mask = ui.checkbox("Mask", value=True, on_change=lambda: self.draw_mask()).props("dense")
+            self._show_mask = ui.checkbox("Mask", value=False, on_change=lambda: self.draw_mask()).props("dense")
+            self._show_mask.tooltip(
+                "Keep the mask of the region in sight; otherwise it shows for a second after a stroke"
+            )
+            self._show_clipped = ui.checkbox("Clipped", value=False, on_change=lambda: self._draw_clipped())
+            self._show_clipped.props("dense").tooltip("Mark what has become white (red) or black (blue)")
             ui.space()
-            self._size = ui.label("").classes("hint")
+            self._size = ui.label("").classes("hint wide")
 
     def open(self, opened: Opened) -> None:
         """Show a photograph that was opened."""
         preview = opened.preview
         height, width = opened.photograph.size
         self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
-        self._photo.style(f"width: min(100%, calc((100vh - 130px) * {preview.size[1] / preview.size[0]:.4f}))")
+        self._photo.style(f"width: min(100cqw, calc(100cqh * {preview.size[1] / preview.size[0]:.4f}))")
+        self._mask_shown = None
         self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
+        self.clipped_before = drawing.clipped_shares(preview.pixels.clamp(0, 1))
         self._show("before", self._before)
         self._show("before", self._photo)
         self._welcome.set_visibility(False)
@@ -85,20 +99,42 @@ class Canvas:
 
     def draw(self, upto: str | None) -> None:
         """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
-        self.pictures["after"] = drawing.picture(self.session.render(upto))
+        drawn = self.session.render(upto)
+        self.pictures["after"] = drawing.picture(drawn)
+        self.pictures["clipped"] = drawing.clipped_picture(drawn) if self._show_clipped.value else b""
+        self.histogram, self.clipped = drawing.histogram_svg(drawn), drawing.clipped_shares(drawn)
         mask = self.session.mask()
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
 
     def show(self) -> None:
         """Show the picture that was computed."""
         self._show("after", self._photo)
+        self._draw_clipped()
 
     def draw_mask(self, *, moving: bool = False) -> None:
-        """Show the mask, except while a slider is moving."""
-        shown = bool(self._show_mask.value and self._step == "detail" and self.pictures.get("mask")) and not moving
-        if shown:
-            self._show("mask", self._mask)
-        self._mask.set_visibility(shown)
+        """Show the mask, except while a slider is moving; for a second, if it is new and not to be kept in sight."""
+        mask = self.pictures.get("mask") if self._step == "detail" else None
+        new = mask != self._mask_shown
+        keep = bool(self._show_mask.value)
+        if not mask or moving or not (keep or new):
+            self._mask.set_visibility(False)
+            self._mask_shown = mask if not moving else self._mask_shown
+            return
+        self._mask_shown = mask
+        self._flashes += 1
+        # An animation begins again if its name changes.
+        self._mask.classes(remove="flash-0 flash-1", add="" if keep else f"flash-{self._flashes % 2}")
+        self._show("mask", self._mask)
+        self._mask.set_visibility(True)
+
+    def _draw_clipped(self) -> None:
+        """Show what is clipped, if it is asked for."""
+        wanted = bool(self._show_clipped.value) and self.session.opened is not None
+        if wanted and not self.pictures.get("clipped"):
+            self.pictures["clipped"] = drawing.clipped_picture(self.session.render())
+        if wanted:
+            self._show("clipped", self._clipped)
+        self._clipped.set_visibility(wanted)
 
     def draw_strokes(self) -> None:
         """Show the strokes of the step and the one being drawn, unless strokes are hidden."""

@@ -16,9 +16,18 @@ TINT, OPACITY = (255, 40, 80), 120  # of the mask
 WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes that have a meaning instead
 
 
+WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
+BINS = 64  # of a histogram
+
+
+def _bytes(image: Tensor) -> Tensor:
+    """An image (1, C, H, W) in [0, 1] as (C, H, W) of 8 bits."""
+    return (image[0] * 255).round_().to(torch.uint8)
+
+
 def picture(image: Tensor) -> bytes:
     """An image (1, 1 or 3, H, W) in [0, 1] as a JPEG."""
-    values = (image[0] * 255).round_().to(torch.uint8).permute(1, 2, 0).numpy()
+    values = _bytes(image).permute(1, 2, 0).numpy()
     return _encode(Image.fromarray(np.ascontiguousarray(values.squeeze())), "JPEG", quality=QUALITY, subsampling=0)
 
 
@@ -28,6 +37,42 @@ def mask_picture(mask: Tensor) -> bytes:
     layer = np.empty((*alpha.shape, 4), np.uint8)
     layer[..., :3], layer[..., 3] = TINT, alpha
     return _encode(Image.fromarray(layer), "PNG", compress_level=1)
+
+
+def clipped_picture(image: Tensor) -> bytes:
+    """Where an image (1, C, H, W) has lost light or shade, as a transparent PNG: red and blue."""
+    values = _bytes(image)
+    layer = np.zeros((*values.shape[1:], 4), np.uint8)
+    layer[(values == 0).any(0).numpy()] = BLACK_TINT
+    layer[(values == 255).any(0).numpy()] = WHITE_TINT
+    return _encode(Image.fromarray(layer), "PNG", compress_level=1)
+
+
+def clipped_shares(image: Tensor) -> tuple[float, float]:
+    """Shares of the pixels of which a channel is white, and of those of which one is black.
+
+    >>> clipped_shares(torch.tensor([1.0, 0.999, 0.5, 0.0]).view(1, 1, 2, 2))
+    (0.5, 0.25)
+    """
+    values = _bytes(image)
+    return float((values == 255).any(0).float().mean()), float((values == 0).any(0).float().mean())
+
+
+def histogram_svg(image: Tensor) -> str:
+    """SVG of the histogram of each channel of an image (1, C, H, W), on a scale that a spike does not flatten."""
+    values = _bytes(image)
+    counts = torch.stack([torch.bincount(plane.flatten().int() * BINS // 256, minlength=BINS) for plane in values])
+    shares = counts.float() / values[0].numel()
+    top = max(float(shares.flatten().quantile(0.98)), 1e-9)
+    colours = ("#ef4444", "#22c55e", "#60a5fa") if len(values) == 3 else ("#cbd5e1",)
+    parts = [
+        '<svg viewBox="0 0 300 60" class="histogram" role="img" aria-label="histogram" preserveAspectRatio="none">'
+    ]
+    for colour, bins in zip(colours, shares.tolist(), strict=True):
+        places = [(300 * (i + 0.5) / BINS, 60 - 58 * min(share / top, 1)) for i, share in enumerate(bins)]
+        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        parts.append(f'<polygon points="0,60 {line} 300,60" fill="{colour}" stroke="{colour}" class="bins" />')
+    return "".join([*parts, "</svg>"])
 
 
 def _encode(image: Image.Image, kind: str, **options: object) -> bytes:

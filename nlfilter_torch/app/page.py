@@ -33,6 +33,7 @@ LEAVING = """<script>
 window.unsaved = false;
 window.addEventListener("beforeunload", (e) => { if (window.unsaved) { e.preventDefault(); e.returnValue = ""; } });
 </script>"""
+FOLD = "() => document.documentElement.classList.toggle('folded')"  # the controls, on small screens
 DISCONNECTED = "window.socket.on('disconnect', () => { window.unsaved = false; });"
 
 
@@ -65,6 +66,8 @@ class Editor:
             with ui.element("div").classes("viewer"):
                 self._canvas = Canvas(self.session, brush, self._token, self._changed, self._show_error)
             with ui.column().classes("panel"):
+                handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
+                handle.classes("handle").on("click", js_handler=FOLD)
                 self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
         ui.keyboard(on_key=self._key)
         self._client.on_connect(lambda: self._begin(image, address))
@@ -77,9 +80,9 @@ class Editor:
     # Layout
 
     def _build_header(self) -> None:
-        with ui.header().classes("items-center no-wrap q-px-md q-py-none topbar"):
-            ui.label("nlfilter-torch").classes("text-weight-medium text-body1")
-            self._title = ui.label("").classes("hint q-ml-sm")
+        with ui.header().classes("items-center no-wrap q-py-none topbar"):
+            ui.label("nlfilter-torch").classes("text-weight-medium text-body1 wide")
+            self._title = ui.label("").classes("hint q-ml-sm ellipsis title")
             ui.space()
             with ui.row().classes("items-center gap-2 no-wrap") as self._working:
                 ui.spinner(size="20px", color="white")
@@ -190,6 +193,7 @@ class Editor:
                 await self._run("Working", partial(self._canvas.draw, upto))
                 self._canvas.show()
                 self._draw_response()
+                self._panel.draw_levels(self._canvas.histogram, self._canvas.clipped, self._canvas.clipped_before)
                 self._canvas.draw_mask(moving=upto is not None)
         finally:
             self._drawing = False

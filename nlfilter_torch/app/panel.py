@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 from nicegui import ui
 
@@ -11,11 +12,12 @@ from nlfilter_torch.app.controls import Change, Control, Slider
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, PURPOSES
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import NONE, Step
 
 COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
 BRUSHES: dict[str, dict[str, str]] = {edit.name: dict(edit.brushes) for edit in EDITS.values() if edit.brushes}
 TABS = ("detail", *(edit for edit in EDITS if edit != "detail"))
+CLIPPED = 0.001  # share of the picture that an edit may clip without a warning
 BANDWIDTH = 20.0  # grey levels, the start when the bandwidth is not automatic
 
 
@@ -50,6 +52,7 @@ class Panel:
         self._following = False
         self._sliders: list[Slider] = []
         self._layout: tuple[int, bool] = (0, False)
+        self._started: str | None = None  # the preset that was chosen last
         with ui.tabs(on_change=lambda event: switch(event.value)).classes("w-full") as tabs:
             tabs.props("dense no-caps align=justify")
             for step in TABS:
@@ -63,6 +66,7 @@ class Panel:
                         ui.label(EDITS[step].hint).classes("hint")
                         self._sliders += [self._slider(control) for control in controls.OF_EDIT[step]]
                         self._build_brush(step)
+        self._build_levels()
         self.follow()
 
     def follow(self) -> None:
@@ -79,7 +83,17 @@ class Panel:
         self._bandwidth.set_visibility(not automatic)
         if not isinstance(detail["bandwidth"], str):
             self._bandwidth.set_value(detail["bandwidth"])
+        self._name_preset(detail)
         self._following = False
+
+    def draw_levels(self, histogram: str, clipped: tuple[float, float], before: tuple[float, float]) -> None:
+        """Show the histogram, and how much of the picture is white or black, now and before the edit."""
+        self._histogram.set_content(histogram)
+        texts = [f"{100 * now:.1f} % {name}" for now, name in zip(clipped, ("white", "black"), strict=True)]
+        worse = any(now > was + CLIPPED for now, was in zip(clipped, before, strict=True))
+        warning = f"; before the edit {100 * before[0]:.1f} % and {100 * before[1]:.1f} %" if worse else ""
+        self._clipped.set_text("Clipped: " + ", ".join(texts) + warning)
+        self._clipped.classes(add="warning" if worse else "", remove="" if worse else "warning")
 
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders."""
@@ -87,6 +101,11 @@ class Panel:
 
     def _slider(self, control: Control, suffix: str = "") -> Slider:
         return Slider(control, lambda: self.session.recipe, self._change, suffix)
+
+    def _build_levels(self) -> None:
+        ui.label("Histogram").classes("group q-px-sm")
+        self._histogram = ui.html("", sanitize=False).classes("w-full q-px-sm")
+        self._clipped = ui.label("").classes("hint q-px-sm")
 
     def _build_detail(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
@@ -114,6 +133,7 @@ class Panel:
         with self._box:
             if detail.has_region():
                 ui.label("In the region").classes("group")
+                ui.label("They begin as the sliders elsewhere, and move by themselves.").classes("hint")
                 inside = controls.detail_sliders("inside", len(detail.sliders_inside))
                 self._detail_sliders += [self._slider(control, " in the region") for control in inside]
                 self._detail_sliders.append(self._slider(controls.OF_EDIT["detail"][0]))
@@ -157,14 +177,30 @@ class Panel:
                 ).style(f"background: {colour} !important")
 
     def _choose(self, name: str | None) -> None:
-        if name is None:
+        if name is None or self._following:
             return
-        self._presets.set_value(None)  # so that the same one can be chosen again
-        preset, inside = PRESETS[name], self.session.recipe.last("detail")["inside"]
-        entries = {entry: getattr(preset, entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
-        entries["inside"] = inside if inside is not None and len(inside) == len(preset.alpha) else None
+        self._started = name
+        inside = self.session.recipe.last("detail")["inside"]
+        entries = _entries_of(name)
+        entries["inside"] = inside if inside is not None and len(inside) == len(entries["alpha"]) else None
         self._change("detail", entries, True)
+
+    def _name_preset(self, detail: Step) -> None:
+        """Show the preset that the sliders are; or the one that they began with, which can then be chosen again."""
+        same = [name for name in PRESETS if all(detail[k] == v for k, v in _entries_of(name).items())]
+        if same and self._started not in same:
+            self._started = same[0]
+        if detail["alpha"] == NONE:
+            self._started = None
+        self._presets.set_value(self._started if self._started in same else None)
+        changed = self._started is not None and self._started not in same
+        self._presets.props(f'label="{f"Started from {self._started}, then changed" if changed else "Start from"}"')
 
     def _set_bandwidth(self, value: float | str) -> None:
         if not self._following:
             self._change("detail", {"bandwidth": value}, True)
+
+
+def _entries_of(name: str) -> dict[str, Any]:
+    """What a preset sets."""
+    return {entry: getattr(PRESETS[name], entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}

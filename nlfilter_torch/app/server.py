@@ -35,7 +35,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
         content = None if editor is None else editor.pictures.get(kind)
         if not content:
             return Response(status_code=404)
-        media_type = "image/png" if kind == "mask" else "image/jpeg"
+        media_type = "image/png" if kind in ("mask", "clipped") else "image/jpeg"
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
     @ui.page("/", title=TITLE)

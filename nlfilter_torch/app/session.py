@@ -135,11 +135,11 @@ class Session:
             self._keep()
 
     def _keep(self) -> None:
-        written = self._shown.written
-        if self._sidecar is not None and written != self._kept:
-            self._sidecar.write(written)
+        drawn = self._shown.drawn
+        if self._sidecar is not None and drawn != self._kept:
+            self._sidecar.write(drawn)
             if self._sidecar.trouble is None:
-                self._kept = written
+                self._kept = drawn
 
     def load(self, recipe: Recipe) -> None:
         """Replace the edit, as one change."""
@@ -176,8 +176,10 @@ class Session:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = Stroke.from_entries(entries, words, step)
         last = self.recipe.last(step)
-        if step == "detail" and paint == "in" and not last.has_region():  # the sliders move into the region
-            self.set("detail", inside=last["alpha"], alpha=(1.0,) * len(last["alpha"]))
+        if (
+            step == "detail" and paint == "in" and not last.has_region()
+        ):  # the region begins with the sliders of the rest
+            self.set("detail", inside=last["alpha"])
         self.set(step, strokes=(*last.strokes, stroke))
         self.commit()
 
@@ -251,7 +253,7 @@ class Session:
         """
         target, recipe = self.check_preset(name), self.recipe
         with open_beside(target) as stream:
-            stream.write(recipe.to_json().encode())
+            stream.write(recipe.to_json(drawn=True).encode())
         self.saved = recipe
         return target
 

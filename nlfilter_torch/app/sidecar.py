@@ -65,13 +65,13 @@ class Sidecar:
         """Keep an edit, completely or not at all; one that says nothing leaves no file."""
         self.trouble = None
         try:
-            if recipe.written == Recipe():
+            if recipe.drawn == Recipe():
                 self.path.unlink(missing_ok=True)
                 return
             if self.path.parent == state_folder():
                 self.path.parent.mkdir(parents=True, exist_ok=True)
             with open_beside(self.path) as stream:
-                stream.write(recipe.to_json().encode())
+                stream.write(recipe.to_json(drawn=True).encode())
         except OSError as error:
             reason = str(error) if str(self.path) in str(error) else f"{self.path}: {error}"
             self.trouble = f"the edit cannot be kept ({reason}); use Save edit before you leave"

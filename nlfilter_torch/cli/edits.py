@@ -50,11 +50,21 @@ PresetName = Annotated[
 ]
 #: Options for what is painted or marked on the photograph, by the name of the edit.
 SCRIBBLES: dict[str, dict[str, Any]] = {
-    "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile},
-    "recolor": {"strokes": options.StrokesFile, "region": options.ColourRegions, "keep": options.Keeps},
-    "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions},
-    "defocus": {"region": options.Regions, "mask": options.MaskFile},
-    "mask": {"region": options.Regions, "background": options.Backgrounds, "mask": options.MaskFile},
+    "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile, "show": options.Show},
+    "recolor": {
+        "strokes": options.StrokesFile,
+        "region": options.ColourRegions,
+        "keep": options.Keeps,
+        "show": options.Show,
+    },
+    "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions, "show": options.Show},
+    "defocus": {"region": options.Regions, "mask": options.MaskFile, "show": options.Show},
+    "mask": {
+        "region": options.Regions,
+        "background": options.Backgrounds,
+        "mask": options.MaskFile,
+        "show": options.Show,
+    },
 }
 
 
@@ -168,15 +178,35 @@ def edit_photograph(
     edit = EDITS[name]
     step = step_of(edit, given)
 
+    import torch
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing, scribbles
+    from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.editing import Job
-    from nlfilter_torch.edits.applying import apply_to, fit_step, seeded
+    from nlfilter_torch.cli.noise import NoiseReport
+    from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
+    from nlfilter_torch.edits.denoise import noise_of
+    from nlfilter_torch.edits.source import InMemory, Source
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture, Rows
+
+    def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
+        """Say what the scribbles cover, and show it."""
+        check_channels(name, read(slice(0, 1)).shape[1])
+        if given.get("show") is not None and not any(True for _ in showing.overlays(drawn)):
+            raise ValueError("--show needs scribbles to show; give --region X,Y,W,H, or leave it out")
+        showing.tell_colours(showing.overlays(drawn), read)
+        if given.get("show") is not None:
+            showing.show(given["show"], name, step.arguments, size, read, drawn)
+
+    def measured(named: dict[str, Any], picture: Source) -> NoiseReport:
+        """The report of the noise, which is estimated once, here."""
+        level = step.arguments(picture.size)["noise_level"]
+        if level is None:
+            named["noise_level"] = noise_of(picture)
+        return NoiseReport(torch.as_tensor(named.get("noise_level", level)), given=level is not None)
 
     def work(photograph: Photograph) -> Tensor:
         free = editing.allowed_memory(memory)
@@ -186,12 +216,21 @@ def edit_photograph(
                 return files.enter_context(open_picture(path, free))
 
             drawn = scribbles.of_edit(step, photograph.size, given, read)
-            return apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
+            tell(drawn, photograph.size, lambda rows: photograph.pixels[..., rows, :])
+            noise = measured(drawn[1], InMemory(photograph.pixels)) if name == "denoise" else None
+            edited = apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
+            if noise is not None:
+                noise.add(photograph.pixels.numpy(), edited.numpy())
+                noise.tell()
+            return edited
 
     def by_rows(job: Job) -> Rows:
         tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
         drawn = scribbles.of_edit(step, job.size, given, job.open)
-        yield from tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
+        tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
+        noise = measured(drawn[1], tiled) if name == "denoise" else None
+        rows = tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
+        yield from rows if noise is None else noise.watched(rows, job.picture.rows)
 
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))
     editing.edit_file(

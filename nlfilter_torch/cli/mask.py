@@ -23,6 +23,7 @@ def mask(
     region: list[str] | None = None,
     background: list[str] | None = None,
     mask: Path | None = None,
+    show: Path | None = None,
     depth: options.FileDepth | None = None,
     seed: int = 0,
     memory: float | None = None,
@@ -30,7 +31,7 @@ def mask(
     **given: Any,
 ) -> None:
     """See :data:`MASK`."""
-    from nlfilter_torch.cli import editing, scribbles
+    from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.progress import stages, steps
     from nlfilter_torch.core.memory import working_bytes
     from nlfilter_torch.edits.applying import seeded
@@ -48,13 +49,23 @@ def mask(
     kind = options.DEPTHS[depth or ("16" if place.suffix.lower() in (".tif", ".tiff") else "8")]
     allowed = editing.allowed_memory(memory)
 
+    def values(size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
+        return {p.keyword: p.argument_of(given[p.name], size, stride) for p in MASK}
+
     def arguments(size: tuple[int, int]) -> dict[str, Any]:
-        return {p.keyword: p.argument_of(given[p.name], size) for p in MASK} | {"generator": seeded(seed)}
+        return values(size) | {"generator": seeded(seed)}
 
     def selected_by(size: tuple[int, int], read: scribbles.Open) -> tuple[Any, Any]:
         """Regions of the foreground and the background."""
         inside = scribbles.selection(size, mask, region, "--region", read)
         return inside, scribbles.selection(size, None, background, "--background", read)
+
+    def tell(drawn: tuple[Any, Any], size: tuple[int, int], read: showing.Read) -> None:
+        """Say what the scribbles cover, and show it."""
+        scribbled = (drawn[:1], {"keep": drawn[1]})
+        showing.tell_colours(showing.overlays(scribbled), read)
+        if show is not None:
+            showing.show(show, "mask", values, size, read, scribbled)
 
     with steps(3) as begin:
         begin("Reading")
@@ -65,6 +76,7 @@ def mask(
             begin("Selecting")
             with ExitStack() as files:
                 drawn = selected_by(photograph.size, lambda path: files.enter_context(open_picture(path, allowed)))
+                tell(drawn, photograph.size, lambda rows: photograph.pixels[..., rows, :])
                 inside, outside = (None if rows is None else rows.at_once() for rows in drawn)
             assert inside is not None  # for mypy
             found = region_mask(photograph.pixels, inside, outside, **arguments(photograph.size))
@@ -82,7 +94,9 @@ def mask(
         with ExitStack() as files:
             job = editing.Job(picture, kind, allowed - picture.cached, report, files)
             tiled = Tiled(Picture(picture.rows, source), job.passes(full), "--region")
-            fitted = fit_mask(tiled, *selected_by(job.size, job.open), **arguments(job.size))
+            drawn = selected_by(job.size, job.open)
+            tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
+            fitted = fit_mask(tiled, *drawn, **arguments(job.size))
             write_picture(place, _first_channel(tiled.rows(fitted, place.parent)), kind, plain)
 
 

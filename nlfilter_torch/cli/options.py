@@ -121,8 +121,8 @@ ColourRegions = Annotated[
         "--region",
         metavar="X,Y,W,H:COLOUR",
         help="A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, "
-        "width and height in pixels, and a colour such as red or #c04020. May be given several times; later ones cover "
-        "earlier ones.",
+        "width and height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a "
+        "small square around that point. May be given several times; later ones cover earlier ones.",
     ),
 ]
 Keeps = Annotated[
@@ -138,8 +138,8 @@ Regions = Annotated[
     typer.Option(
         "--region",
         metavar="X,Y,W,H",
-        help="A rectangle: column and row of its upper left corner, width and height in pixels. May be given several "
-        "times.",
+        help="A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the "
+        "photograph; X,Y alone is a small square around that point. May be given several times.",
     ),
 ]
 Backgrounds = Annotated[
@@ -165,5 +165,14 @@ MaskFile = Annotated[
         "--mask",
         metavar="FILE",
         help="A picture of the size of the photograph, white where it is selected and black elsewhere.",
+    ),
+]
+Show = Annotated[
+    Path | None,
+    typer.Option(
+        "--show",
+        metavar="FILE",
+        help="A picture to write before the edit: the photograph, reduced, with scribbles and what they select over "
+        "it.",
     ),
 ]

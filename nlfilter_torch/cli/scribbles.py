@@ -1,5 +1,6 @@
 """Scribbles, masks and rectangles on a photograph, from the options of a command, as rows."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from nlfilter_torch.tiled.sources import Picture, transparency
 Size = tuple[int, int]  # (height, width) of the photograph
 Open = Callable[[Path], StoredPicture]  # reads a picture over it
 Floats = NDArray[np.float32]
+DOT = 0.03  # side of the square around a point, as a share of the short side
 
 
 @dataclass(frozen=True)
@@ -32,17 +34,29 @@ class Rectangle:
 
     @staticmethod
     def parse(text: str, option: str, size: tuple[int, int]) -> "Rectangle":
-        """Read ``X,Y,W,H`` or ``X,Y,W,H:NOTE`` for a photograph of ``size`` (height, width).
+        """Read ``X,Y,W,H``, or ``X,Y`` for a small square around a point, and ``:NOTE`` for a photograph of a size.
+
+        Numbers are pixels, or with a percent sign shares of the width (X, W) or height (Y, H).
 
         >>> Rectangle.parse("2,3,4,5:red", "--region", (20, 30))
         Rectangle(rows=slice(3, 8, None), columns=slice(2, 6, None), note='red')
+        >>> str(Rectangle.parse("50%,25%,4,10%", "--region", (20, 30))), str(Rectangle.parse("50%,0%", "", (90, 120)))
+        ('15,5,4,2', '59,0,3,3')
         """
         numbers, colon, note = text.partition(":")
         try:
-            x, y, width, height = (int(part) for part in numbers.split(","))
+            lengths = [size[1 - i % 2] for i in range(4)]
+            parts = numbers.split(",")
+            found = [_pixels(part, length) for part, length in zip(parts, lengths[: len(parts)], strict=True)]
+            if len(found) == 2:
+                side = max(1, round(DOT * min(size)))
+                found = [min(max(int(at) - side // 2, 0), n - side) for at, n in zip(found, lengths, strict=False)]
+                found += [side, side]
+            x, y, width, height = (math.floor(number) for number in found)
         except ValueError:
             raise ValueError(
-                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}"
+                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; shares such as 25% "
+                "and a point X,Y will do, too"
             ) from None
         if width < 1 or height < 1:
             raise ValueError(f"{option} must be at least 1 pixel wide and high, got {width}x{height} in {text!r}")
@@ -52,6 +66,22 @@ class Rectangle:
                 f"columns {x} to {x + width - 1} and rows {y} to {y + height - 1} in {text!r}; move or shrink it"
             )
         return Rectangle(slice(y, y + height), slice(x, x + width), note if colon else None)
+
+    def __str__(self) -> str:
+        """``X,Y,W,H`` in pixels."""
+        rows, columns = self.rows, self.columns
+        return f"{columns.start},{rows.start},{columns.stop - columns.start},{rows.stop - rows.start}"
+
+
+def _pixels(text: str, length: int) -> float:
+    """A number of pixels, from one or from a share of a length."""
+    text = text.strip()
+    if not text.endswith("%"):
+        return int(text)
+    value = float(text[:-1]) / 100 * length
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
 
 
 @dataclass(frozen=True)

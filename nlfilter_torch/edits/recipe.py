@@ -47,8 +47,8 @@ class Recipe:
         return tuple(step for step in self.steps if step.changes())
 
     @property
-    def written(self) -> "Recipe":
-        """The edit without steps that change nothing and hold no strokes, as it is written to a file."""
+    def drawn(self) -> "Recipe":
+        """The edit without steps that change nothing and hold no strokes."""
         return Recipe(tuple(step for step in self.steps if step.changes() or step.strokes))
 
     def last(self, edit: str) -> Step:
@@ -101,8 +101,8 @@ class Recipe:
             result = apply_step(step, image if result is image else result.clamp(0, 1))
         return result
 
-    def to_json(self) -> str:
-        """The edit as text, without steps that change nothing and hold no strokes.
+    def to_json(self, *, drawn: bool = False) -> str:
+        """The edit as text, without steps that change nothing; ``drawn`` adds those of them that hold strokes.
 
         >>> print(Recipe((Step("tone"), Step("detail", alpha=(2.0, 1.0)))).to_json())
         {
@@ -120,7 +120,7 @@ class Recipe:
         }
         <BLANKLINE>
         """
-        return in_file(step.to_json("    ") for step in self.written.steps)
+        return in_file(step.to_json("    ") for step in (self.drawn.steps if drawn else self.acting))
 
     @staticmethod
     def from_json(text: str, name: str, remedy: str = REMEDY) -> "Recipe":

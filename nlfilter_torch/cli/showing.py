@@ -1,0 +1,132 @@
+"""What scribbles cover: their colours as text, a note where one covers unlike things, and a picture of it all."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+import typer
+from torch import Tensor
+
+from nlfilter_torch.cli.scribbles import Overlay, Strokes
+from nlfilter_torch.edits.applying import seeded
+from nlfilter_torch.edits.detail import enhance
+from nlfilter_torch.edits.mask import lab_of, region_mask
+from nlfilter_torch.edits.parameters import EDITS, MASK
+from nlfilter_torch.io.photographs import Photograph, write_photograph
+
+Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
+PIXELS = 500_000  # of the picture that shows scribbles, at most
+UNLIKE = 0.2  # distance in hundredths of Lab beyond which two colours are very different
+FEW = 0.15  # share of such pixels that a scribble may cover
+ROWS = 64
+DIM = 0.4  # light of what is outside the mask, which is shown without colour
+
+
+def overlays(drawn: tuple[tuple[Any, ...], dict[str, Any]]) -> Iterator[tuple[str, Overlay]]:
+    """Scribbles of an edit, with the option that they come from."""
+    scribbles, named = drawn
+    for option, found in (*(("--region", each) for each in scribbles), ("--keep", named.get("keep"))):
+        if isinstance(found, Overlay):
+            yield option, found
+
+
+def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
+    """Print the colour under each rectangle; and a note on the standard error stream if it covers very unlike ones."""
+    for option, overlay in drawn:
+        for rectangle, _, _ in overlay.rectangles:
+            pixels = read(rectangle.rows)[..., rectangle.columns].float().clamp(0, 1).flatten(2)
+            middle = pixels.median(2).values
+            red, green, blue = (middle[0].expand(3) * 255).round().int().tolist()
+            place = f"{option} {rectangle}"
+            typer.echo(f"{place}: {pixels.shape[2]} pixels, most of them about #{red:02x}{green:02x}{blue:02x}")
+            share = unlike(pixels, middle)
+            if share > FEW:
+                typer.echo(
+                    f"nlfilter-torch: note: {place} covers very different pixels: {100 * share:.0f} % of them differ "
+                    "much from the others; make it smaller or move it, and look at it with --show FILE",
+                    err=True,
+                )
+
+
+def unlike(pixels: Tensor, middle: Tensor) -> float:
+    """The share of pixels (1, C, n) whose colour is very different from a colour (1, C)."""
+    lab = lab_of(pixels.expand(-1, 3, -1).unsqueeze(2)) - lab_of(middle.expand(-1, 3)[..., None, None])
+    return float((lab.norm(dim=1) > UNLIKE).float().mean())
+
+
+def show(
+    target: Path,
+    edit: str,
+    arguments: Callable[[tuple[int, int], float], dict[str, Any]],
+    size: tuple[int, int],
+    read: Read,
+    drawn: tuple[tuple[Any, ...], dict[str, Any]],
+) -> None:
+    """Write the photograph, reduced, with scribbles and mask over it.
+
+    Args:
+        target: an image file.
+        edit: the name of the edit whose scribbles they are, or ``mask``.
+        arguments: of its function, for a size and for every how many pixels it has one.
+        size: (H, W) of the photograph.
+        read: its rows.
+        drawn: the scribbles, as of :func:`~nlfilter_torch.cli.scribbles.of_edit`.
+    """
+    stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / PIXELS)))
+    image = _reduced(read, size, stride, F.avg_pool2d).float().clamp(0, 1).expand(-1, 3, -1, -1)
+    laid = {option: _planes(overlay, size, stride) for option, overlay in overlays(drawn)}
+    region, kept = laid["--region"], laid.get("--keep")
+    is_strokes = any(isinstance(overlay, Strokes) for _, overlay in overlays(drawn))
+    painted = region[:, 3:].ceil() if is_strokes else region.amax(1, keepdim=True).ceil()
+    options = arguments((image.shape[-2], image.shape[-1]), stride)
+    if edit == "detail":
+        mask = detail_mask(image, painted, options)
+    elif edit == "colorize":
+        mask = torch.ones_like(painted)  # every pixel takes a colour
+    else:
+        names = {parameter.keyword for parameter in MASK}
+        taken = {name: value for name, value in options.items() if name in names}
+        mask = region_mask(image, painted, kept, **taken, generator=seeded())
+    outside = DIM * image.mean(1, keepdim=True)  # no colour is like every picture's
+    shown = torch.lerp(outside.expand_as(image), image, mask)
+    colours = region[:, :3] if is_strokes else shown.new_tensor((0.1, 0.8, 0.3)).view(1, 3, 1, 1).expand_as(shown)
+    shown = torch.lerp(shown, colours, 0.75 * painted)
+    if kept is not None:
+        shown = torch.lerp(shown, torch.full_like(shown, 0.6), 0.75 * kept.ceil())
+        painted = painted.maximum(kept.ceil())
+    rim = F.max_pool2d(painted, 3, stride=1, padding=1) - painted
+    write_photograph(Photograph(torch.where(rim > 0, torch.ones_like(shown), shown)), target)
+
+
+def detail_mask(image: Tensor, region: Tensor, options: dict[str, Any]) -> Tensor:
+    """The mask of sliders in a region: what it leaves of a change of the shading."""
+    order = torch.as_tensor(options.pop("alpha", EDITS["detail"].defaults["alpha"])).shape[-1]
+    options |= {"limits": "none", "threshold": 0.0, "residual": None}
+    shading = torch.ones(order)
+    shading[-1] = 1.5
+
+    def change(*regions: Tensor) -> Tensor:
+        found = enhance(image, shading, *regions, **options, generator=seeded())
+        return (found - image).mean(1, keepdim=True)
+
+    whole = change()
+    return torch.where(whole > 1e-3, change(region) / whole.clamp(min=1e-3), 0.0).clamp(0, 1)
+
+
+def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
+    """Scribbles, reduced; one that covers less than a pixel stays in sight."""
+
+    def rows(part: slice) -> Tensor:
+        return torch.from_numpy(overlay[part]).permute(2, 0, 1)[None]
+
+    return _reduced(rows, size, stride, F.max_pool2d)
+
+
+def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[[Tensor, int], Tensor]) -> Tensor:
+    """Every ``stride`` pixels in both directions as one, without more than some rows in memory."""
+    height = size[0] // stride * stride
+    starts = range(0, height, ROWS * stride)
+    return torch.cat([pool(read(slice(a, min(a + ROWS * stride, height))), stride) for a in starts], dim=2)
