@@ -243,8 +243,9 @@ class InMemory:
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Weights in another size."""
         check_same_size(weights, self.size, name, "image")
-        least = float(weights.detach().min())  # interpolation may go below it, but hides no weight that is invalid
-        return resize(weights.to(self.image), size).clamp(min=least)
+        weights = weights.to(self.image)
+        # Interpolation may go below the least of them, but hides no weight that is invalid.
+        return torch.maximum(resize(weights, size), weights.detach().min())
 
     def all(self, fitted: "Fitted") -> Tensor:
         """All pixels under an edit."""
