@@ -233,8 +233,9 @@ class InMemory:
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Weights in another size."""
         check_same_size(weights, self.size, name, "image")
+        weights = weights.to(self.image)
         ends = weights.detach().aminmax()  # interpolation may go beyond them, but hides no weight that is invalid
-        return resize(weights.to(self.image), size).clamp(float(ends.min), float(ends.max))
+        return resize(weights, size).clamp(ends.min, ends.max)
 
     def all(self, fitted: "Fitted") -> Tensor:
         """All pixels under an edit."""

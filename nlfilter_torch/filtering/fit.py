@@ -25,6 +25,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.operator.operator import NonlocalOperator
 
@@ -303,10 +304,10 @@ def _pixel_weights(mask: Tensor | None, layers: Tensor, among: Communicator) -> 
         return layers.new_full((1, channels, height, width), 1.0 / (channels * pixels))
     check_image(mask, "mask", channels=1, batch=batch)
     check_same_size(mask, (height, width), "mask", "image")
-    if bool((mask < 0).any()):
+    if not is_hidden(mask) and bool((mask < 0).any()):
         raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
     total = among.sum(mask.double().sum((2, 3), keepdim=True))
-    if bool((total <= 0).any()):
+    if not is_hidden(mask) and bool((total <= 0).any()):
         raise ValueError(
             "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"
         )

@@ -156,10 +156,10 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     check_image(region, name, batch=spectrum.factor.shape[0])
     check_same_size(region, spectrum.size, name, "spectrum")
     flat = region.to(spectrum.factor).flatten(2)
-    if bool((flat < 0).any()):
+    if not is_hidden(flat) and bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
     total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
-    if bool((total <= 0).any()):
+    if not is_hidden(flat) and bool((total <= 0).any()):
         raise ValueError(
             f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
         )
