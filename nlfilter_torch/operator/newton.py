@@ -132,7 +132,8 @@ def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), landmarks, landmarks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
         before, error = total, total - found
-        if gain > RESAMPLED if watched else sweeps < 3:
+        resampled = gain > RESAMPLED if watched else sweeps < 3
+        if resampled:
             sample, part = _draw(matrix, scaling, count)
             # The sample predicts how the moment changes with t. The true moment at the current t is known, and so the
             # error of the sample there, which is subtracted.
@@ -147,7 +148,8 @@ def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
         else:
             total = total - inverse @ error
         scaling, found = _sweep(matrix, total)
-        inverse = _updated(inverse, total - before, total - found - error)
+        if not resampled:  # a first step is so long that the Jacobian changes along it
+            inverse = _updated(inverse, total - before, total - found - error)
         if not watched:
             continue
         previous, worst = worst, sample.residual(total, found).max().item()

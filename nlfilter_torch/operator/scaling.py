@@ -79,7 +79,7 @@ class KernelMatrix:
 
     def largest(self, values: Tensor) -> Tensor:
         """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of them is not finite."""
-        return self.among.max(values.abs().nan_to_num(nan=torch.inf).amax(1))
+        return self.among.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
 
 
 def isolated(scaling: Tensor, residual: float) -> Tensor:

@@ -114,10 +114,10 @@ def _parts(planes: Tensor) -> Tensor:
 
 def positive_root(half: Tensor, diagonal: Tensor) -> Tensor:
     """The positive root d of ``d (2 half + diagonal d) = 1``, without cancellation whichever sign ``half`` has."""
-    root = torch.addcmul(diagonal, half, half).sqrt()
+    larger = torch.addcmul(diagonal, half, half).sqrt() + half.abs()
     # Without a diagonal a negative sum has no root; the bound, below the rounding of 1 - |u|^2, keeps d finite.
     least = torch.finfo(half.dtype).eps / 4
-    return torch.where(half < 0, (root - half) / diagonal.clamp(min=least), (root + half).clamp(min=least).reciprocal())
+    return torch.where(half < 0, larger / diagonal.clamp(min=least), larger.clamp(min=least).reciprocal())
 
 
 def _empty(factor: Tensor) -> tuple[Tensor, Tensor]:
