@@ -5,6 +5,7 @@ names are in ``CHOOSING`` were used to choose the defaults of masks, recolouring
 were not.
 """
 
+import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ REPORTING = ("hubble_deep_field", "immunohistochemistry", "retina", "colorwheel"
 SHAPES = ("blob", "hairs", "holes", "motion", "soft")
 SIZE = (112, 160)
 RADIUS, LENGTH = 0.014, 0.14  # of a scribble, as shares of the short side
+COMPOSITES = 25
 FIRST_SEED = {"choosing": 0, "reporting": 10_000}
 
 
@@ -155,3 +157,38 @@ def sources(folder: Path | None, kind: str) -> dict[str, Tensor]:
         return pictures(folder, 426, ())
     names = CHOOSING if kind == "choosing" else REPORTING
     return {name: photograph(name)[:, :3].expand(-1, 3, -1, -1) for name in names}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a benchmark of composites measures.
+
+    Attributes:
+        count: of composites.
+        size: of each, (H, W).
+        images: that they are made of.
+        first: seed of the first one.
+        kind: which set of photographs and seeds.
+        quick: whether only to see that it runs.
+    """
+
+    count: int
+    size: tuple[int, int]
+    images: dict[str, Tensor]
+    first: int
+    kind: str
+    quick: bool
+
+
+def setup(description: str, arguments: list[str] | None) -> Setup:
+    """From the options of the command line."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
+    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
+    parser.add_argument("--first-seed", type=int, help="of composites and scribbles; without it, that of the set")
+    parser.add_argument("--composites", type=int, default=COMPOSITES, help="how many")
+    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to see that it runs")
+    options = parser.parse_args(arguments)
+    count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
+    first = FIRST_SEED[options.set] if options.first_seed is None else options.first_seed
+    return Setup(count, size, sources(options.pictures, options.set), first, options.set, options.quick)

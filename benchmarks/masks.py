@@ -6,17 +6,15 @@ and each of :mod:`benchmarks.mask_peers`; how often it is better than each; what
 ``--set choosing`` takes the photographs and seeds that its defaults were chosen on.
 """
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from benchmarks.composites import FIRST_SEED, SIZE, Composite, composites, sources
+from benchmarks.composites import Composite, composites, setup
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import photograph
 from nlfilter_torch import region_mask
@@ -26,7 +24,6 @@ from nlfilter_torch.edits.source import InMemory
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)
-COMPOSITES = 25
 WON = 0.6  # share of cases in which each peer is to be beaten
 MEGAPIXEL = 1024
 METHODS = {OURS: region_mask, **PEERS}
@@ -103,27 +100,20 @@ def speed(side: int) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description="Masks from scribbles, against matting and segmentation.")
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
-    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
-    parser.add_argument("--composites", type=int, default=COMPOSITES, help="how many")
-    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to see that it runs")
-    options = parser.parse_args(arguments)
-    count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
-    images, cases = sources(options.pictures, options.set), {}
-    first = FIRST_SEED[options.set]
-    for number, composite in enumerate(composites(count, first, images, size)):
+    chosen, cases = setup("Masks from scribbles, against matting and segmentation.", arguments), {}
+    for number, composite in enumerate(composites(chosen.count, chosen.first, chosen.images, chosen.size)):
         for scribbles in COUNTS:
             key = f"{number} {composite.name}, {scribbles} scribbles"
-            cases[key] = measure(composite, scribbles, first + 10 * number + scribbles)
+            cases[key] = measure(composite, scribbles, chosen.first + 10 * number + scribbles)
+    count, size = chosen.count, chosen.size
     for scribbles in COUNTS:
-        print(f"\n{count} composites of {size[0]}x{size[1]}, {scribbles} scribbles on each side ({options.set} set)")
+        print(f"\n{count} composites of {size[0]}x{size[1]}, {scribbles} scribbles on each side ({chosen.kind} set)")
         report({key: case for key, case in cases.items() if key.endswith(f", {scribbles} scribbles")})
     print(f"\nall {len(cases)}")
     holds = report(cases)
-    if not options.quick:
+    if not chosen.quick:
         print(f"best in both means, and {WON:.0%} against each: {'holds' if holds else 'FALLS SHORT'}")
-    speed(64 if options.quick else MEGAPIXEL)
+    speed(64 if chosen.quick else MEGAPIXEL)
 
 
 if __name__ == "__main__":

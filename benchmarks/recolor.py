@@ -8,21 +8,19 @@ halo is the error beside the object against the background blurred alone.
 ``--set choosing`` takes the photographs and seeds that the defaults were chosen on.
 """
 
-import argparse
 import statistics
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from benchmarks.composites import FIRST_SEED, SIZE, Composite, composites, sources
+from benchmarks.composites import Composite, composites, setup
 from nlfilter_torch import defocus, recolor
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 from nlfilter_torch.edits.defocus import _convolve, _kernel
+from nlfilter_torch.edits.matting import colours_beside
 from nlfilter_torch.edits.recolor import Recoloring
 
-COMPOSITES = 25
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint
 RADIUS = 0.03  # of the blur, as a share of the short side
@@ -44,8 +42,9 @@ def recoloured(composite: Composite, colour: Tensor, under: Tensor) -> Tensor:
     """The composite of the object in its new colour."""
     chroma = split_luminance(colour.expand_as(composite.image))[1]
     old = (split_luminance(composite.image)[1] * under).sum((2, 3)) / under.sum()
-    change = Recoloring(chroma[:, None, :, 0, 0], old[:, None], torch.ones(1, 1, dtype=torch.bool), 0)
-    thing = change(composite.object, torch.ones_like(composite.alpha))
+    change = Recoloring(chroma[:, None, :, 0, 0], old[:, None], torch.ones(1, 1, dtype=torch.bool))
+    within = torch.ones_like(composite.alpha)
+    thing = change(composite.object, within, [colours_beside(split_luminance(composite.object)[1], within)])
     mixed = composite.alpha * thing + (1 - composite.alpha) * composite.background
     # Luminance is that of the photograph: what is compared is colour.
     return merge_luminance(split_luminance(composite.image)[0], split_luminance(mixed)[1])
@@ -122,16 +121,10 @@ def report(title: str, cases: list[dict[str, float]], limits: dict[str, str]) ->
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description="Recolouring and defocus of things with known borders.")
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
-    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
-    parser.add_argument("--composites", type=int, default=COMPOSITES, help="how many")
-    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to see that it runs")
-    options = parser.parse_args(arguments)
-    count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
-    first, images = FIRST_SEED[options.set] + 1000, sources(options.pictures, options.set)
-    scenes = list(enumerate(composites(count, first, images, size)))
-    print(f"{count} composites of {size[0]}x{size[1]} ({options.set} set)")
+    chosen = setup("Recolouring and defocus of things with known borders.", arguments)
+    first = chosen.first + 1000
+    scenes = list(enumerate(composites(chosen.count, first, chosen.images, chosen.size)))
+    print(f"{chosen.count} composites of {chosen.size[0]}x{chosen.size[1]} ({chosen.kind} set)")
     one = [measure_recolor(scene, i, 1, first + 10 * i, keep=False) for i, scene in scenes]
     report("recolor, one scribble", one, {"covered": "covered", "outside": "outside", "border": "border"})
     two = [measure_recolor(scene, i, 2, first + 10 * i, keep=True) for i, scene in scenes]

@@ -100,10 +100,7 @@ def test_full_passes_recolour_as_in_memory(options: dict[str, Any], kept: bool, 
     given = {"keep": keep} if kept else {}
     edited = recoloured(picture, strokes, mask, statistics="full", tile_rows=17, **given, **options)
     assert np.abs(rows_of(whole) - picture).max() > 0.1
-    # The colours beside a border are divided by how much of each side is there: that multiplies rounding at few pixels.
-    apart = np.abs(edited - rows_of(whole))
-    assert apart.max() < (2e-3 if dtype == np.float32 else 2e-6)
-    assert np.quantile(apart, 0.95) < (2e-5 if dtype == np.float32 else 1e-7)
+    assert np.abs(edited - rows_of(whole)).max() < (1e-5 if dtype == np.float32 else 1e-12)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -131,7 +128,7 @@ def test_a_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> Non
     strokes, mask, keep = paint(270, 350)
     whole = recolor(planes(picture), planes(strokes), planes(mask), keep=planes(keep), num_landmarks=50)
     edited = recoloured(picture, strokes, mask, keep=keep, sample=1 << 12)
-    assert 1e-5 < np.abs(edited - rows_of(whole)).max() < LEVEL
+    assert np.abs(edited - rows_of(whole)).max() < 1e-5  # takes sums over all pixels of a reduced picture
     whole = colorize(planes(grey(picture)), planes(strokes), planes(mask), num_landmarks=50)
     edited = coloured(picture, strokes, mask, sample=1 << 12)
     assert 1e-5 < np.abs(edited - rows_of(whole)).max() < LEVEL
@@ -206,18 +203,11 @@ def test_report_tells_every_stage() -> None:
     seen: list[str] = []
     picture, (strokes, mask, _) = cat(40, 60), paint(40, 60)
     recoloured(picture, strokes, mask, sample=1000, num_landmarks=20, report=lambda *step: seen.append(step[0]))
-    stages = [
-        "Reading strokes",
-        "Looking",
-        "Comparing strokes",
-        "Sampling",
-        "Balancing",
-        "Bounding",
-        "Summing up",
-        "Comparing",
-        "Filtering",
-    ]
-    assert list(dict.fromkeys(seen)) == stages
+    assert list(dict.fromkeys(seen)) == ["Reading strokes", "Reducing", "Filtering"]
+    seen.clear()
+    coloured(grey(picture), strokes, mask, sample=1000, num_landmarks=20, report=lambda *step: seen.append(step[0]))
+    stages = ["Reading strokes", "Reducing", "Looking", "Comparing strokes", "Sampling", "Balancing", "Bounding"]
+    assert list(dict.fromkeys(seen))[: len(stages)] == stages
 
 
 def test_painted_pixels_need_memory() -> None:
@@ -232,8 +222,8 @@ def test_painted_pixels_need_memory() -> None:
             memory=500_000,
             report=lambda *_: None,
         )
-    for edit in (recoloured, coloured):
-        with pytest.raises(MemoryError, match="the strokes on source cover"):
+    for edit, reason in ((recoloured, "source needs"), (coloured, "the strokes on source cover")):
+        with pytest.raises(MemoryError, match=reason):
             edit(picture, strokes, 0 * mask + 1, memory=7_000_000, num_landmarks=5)
         with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least"):
             edit(picture, strokes, mask, memory=1_000_000)
@@ -304,7 +294,7 @@ def test_a_source_that_changes_its_size_is_named() -> None:
 
 # --- the command line
 
-LITTLE = "0.012"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+LITTLE = "0.014"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
 
 
 @pytest.fixture

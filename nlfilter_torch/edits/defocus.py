@@ -100,11 +100,10 @@ def fit_defocus(
     spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
     found = fit_regions(source, [scribbles], [], spatial_bandwidth=spatial_bandwidth, **options)
 
-    def finish(image: Tensor, planes: Tensor) -> Tensor:
-        return blur_behind(image, focus_of(found.masks(image, planes)), reach, aperture)
+    def finish(image: Tensor, masks: Tensor) -> Tensor:
+        return blur_behind(image, focus_of(masks), reach, aperture)
 
-    beyond = -(-_kernel_radius(reach, aperture) // found.step) * found.step
-    return Fitted(found.planes, finish, found.margin + beyond, found.step)
+    return Fitted(found.masks, finish, _kernel_radius(reach, aperture))
 
 
 def focus_of(mask: Tensor) -> Tensor:

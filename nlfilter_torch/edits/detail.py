@@ -191,16 +191,11 @@ def fit_detail(
         elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
         rows = [*sliders, elsewhere]
 
-        def parts(pixels: Pixels) -> Tensor:
-            return torch.cat([*(added_and_rest(pixels, row) for row in rows), masks.planes(pixels)], dim=1)
+        def blended(pixels: Pixels) -> Tensor:
+            changes = torch.cat([added_and_rest(pixels, row) for row in rows], dim=1)
+            return blend_changes(changes, masks.masks(pixels))
 
-        def blended(image: Tensor, found: Tensor) -> Tensor:
-            changes, marks = found[:, : -3 * count], found[:, -3 * count :]
-            inside = masks.masks(image, marks)
-            return limited(image, blend_changes(changes, inside))
-
-        margin = -(-CALM_MARGIN // masks.step) * masks.step
-        return Fitted(parts, blended, max(masks.margin, margin), masks.step)
+        return Fitted(blended, limited, CALM_MARGIN)
 
     return fit_change(source, change, planes, viewing_size, limits)
 

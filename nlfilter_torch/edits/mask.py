@@ -1,11 +1,13 @@
 """Soft masks of things from scribbles on them and on what is around. Goes beyond the paper's Sec. IV.
 
 The scribbles train a regression on the filter's covariance, see :mod:`nlfilter_torch.filtering.scribbles`, whose guide
-compares colours, their surroundings and texture; a local solve then lays the borders along those of the picture.
+compares colours, their surroundings and texture; local solves then lay the borders along those of the picture. All of
+this is done to a picture that is reduced to about :data:`SOLVED` pixels, so that its cost hardly grows with the size.
+It ends in a linear function of the colours for each place, which gives the mask of any pixel from its own colours; so
+tiles are exact.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,16 +20,19 @@ from nlfilter_torch.core.checks import check_count, check_photograph, check_posi
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import LIGHTNESS, colour_guide, nearby
 from nlfilter_torch.edits.components import Scribbles, scribbled_blocks
-from nlfilter_torch.edits.matting import pyramid_levels, pyramid_margin, solve_mask
+from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
-from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source, edited
+from nlfilter_torch.edits.resizing import enlarged
+from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import pad_border
 
+SOLVED = 1 << 17  # pixels
 CHROMA = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
 AROUND, GRAIN, TEXTURE = 2.0, 1.5, 3.0  # standard deviations in pixels: surroundings, grain, mean of its strength
 TEXTURED = 1.5  # weight of texture
 PLANES = 9  # of the guide
+FLOATS = 80  # of a pixel of the reduced picture, about, beside those of its operator
 SMOOTHNESS = 0.25  # of the regression
 FRAME = 64  # points along the upper or left border of a picture, about
 CONTRAST = 4.0  # with which a likelihood becomes a rough mask
@@ -132,8 +137,7 @@ def region_mask(
 
 def fit_mask(source: Source, scribbles: Any, background: Any = None, **options: Any) -> Fitted:
     """:func:`region_mask` for any source."""
-    found = select_regions(source, scribbles, background, **options)
-    return Fitted(found.planes, found.masks, found.margin, found.step)
+    return Fitted(select_regions(source, scribbles, background, **options).masks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,23 +145,40 @@ class Regions:
     """Masks of K regions, for an edit that needs them.
 
     Attributes:
-        planes: of any pixels, what their masks are made from, (B, 3 K, h, W).
-        masks: from an image and these planes to the masks (B, K, h, W).
-        margin: how many pixels around a pixel its mask depends on.
-        levels: as of :func:`pyramid_levels`.
-        around: largest weight of what is scribbled as background of each region, (B, K).
+        reduced: the picture that they were found in, (B, C, h, w).
+        step: rows and columns of the picture that are one of this one.
+        functions: from colours to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
+        scribbles: on each and on what is around it.
     """
 
-    planes: Planes
-    masks: Callable[[Tensor, Tensor], Tensor]
-    margin: int
-    levels: int
-    around: Tensor
+    reduced: Tensor
+    step: int
+    functions: Tensor
+    scribbles: list[Scribbles]
 
     @property
-    def step(self) -> int:
-        """See :attr:`Fitted.step`."""
-        return 1 << self.levels
+    def around(self) -> Tensor:
+        """Largest weight of what is scribbled as background of each region, (B, K)."""
+        return torch.stack([marked.weights[:, 1].amax(1) for marked in self.scribbles], dim=1)
+
+    def rows(self, planes: Tensor, pixels: Any) -> Tensor:
+        """The part (B, C, h, W) that some rows have of planes of the reduced picture."""
+        height, width = pixels.image.shape[-2:]
+        return enlarged(planes, self.step, pixels.first // width, (height, width))
+
+    def masks(self, pixels: Any) -> Tensor:
+        """The masks (B, K, h, W) of some rows."""
+        image, found = pixels.image - 0.5, []
+        for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
+            mask = linear_mask(image, self.rows(functions, pixels)).clamp(0.0, 1.0)
+            front, back = marked.planes(pixels).split(1, dim=1)
+            found.append(mask * (1 - front - back) + front)
+        return torch.cat(found, dim=1)
+
+    def reduced_masks(self) -> Tensor:
+        """The masks (B, K, h, w) of the reduced picture."""
+        image = self.reduced - 0.5
+        return torch.cat([linear_mask(image, f).clamp(0.0, 1.0) for f in self.functions.unbind(1)], dim=1)
 
 
 def select_regions(
@@ -210,33 +231,44 @@ def fit_regions(
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
     check_count(options["num_landmarks"], "num_landmarks")
-    options["num_landmarks"] = min(options["num_landmarks"], source.size[0] * source.size[1])
+    step = math.ceil(math.sqrt(source.size[0] * source.size[1] / SOLVED))
+    small = source.blocks(step, FLOATS + options["num_landmarks"])
+    marks = [blocks_of(marked, small, source.size[1], step) for marked in both]
+    options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
         if spatial_bandwidth is not None:
             check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
-        options["spatial_bandwidth"] = nearby(spatial_bandwidth, MASK["spatial_bandwidth"].share, source.size)
-    operator = source.operator(Guide(options, region_guide, MARGIN, PLANES, spectral=True, sampled=True))
-    places = frame_places(source.size)
-    frame, colours = operator.at(places), source.colours(places)
+            spatial_bandwidth = spatial_bandwidth / step
+        options["spatial_bandwidth"] = nearby(spatial_bandwidth, MASK["spatial_bandwidth"].share, small.size)
+    operator = small.operator(Guide(options, region_guide, MARGIN, PLANES, spectral=True, sampled=True))
+    places = frame_places(small.size)
+    frame, colours = operator.at(places), small.colours(places)
     rough = []
-    for marked in both:
+    for marked in marks:
         alike = likeness(marked.image, marked.weights[:, 0], colours, options["photometric_bandwidth"])
-        rough.append(_regression(source, operator, marked, frame, 1 - alike, reach))
+        rough.append(_regression(small, operator, marked, frame, 1 - alike, reach)(small))
+    front, back = (torch.cat([marked.planes(small)[:, k : k + 1] for marked in marks], dim=1) for k in (0, 1))
+    return Regions(small.image, step, fit_borders(small.image, torch.cat(rough, dim=1), front, back), both)
 
-    def planes(pixels: Any) -> Tensor:
-        marks = [marked.planes(pixels) for marked in both]
-        parts = [*(of(pixels) for of in rough), *(m[:, :1] for m in marks), *(m[:, 1:] for m in marks)]
-        return torch.cat(parts, dim=1)
 
-    short = min(source.size)
-    levels = pyramid_levels(short)
+def blocks_of(marked: Scribbles, small: InMemory, width: int, step: int) -> Scribbles:
+    """Scribbles on a reduced picture: each block has the weights of the pixels scribbled on, as a share of all.
 
-    def masks(image: Tensor, found: Tensor) -> Tensor:
-        likely, front, back = found.split(count, dim=1)
-        return fit_borders(image, likely, front, back, short)
-
-    around = torch.stack([marked.weights[:, 1].amax(1) for marked in both], dim=1)
-    return Regions(planes, masks, pyramid_margin(levels), levels, around)
+    Args:
+        marked: scribbles.
+        small: the picture, reduced.
+        width: W of the picture.
+        step: rows and columns of a block.
+    """
+    if step == 1:
+        return marked
+    columns = small.size[1]
+    places, block = (marked.places // width // step * columns + marked.places % width // step).unique(
+        return_inverse=True
+    )
+    weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
+    weights = weights.index_add(2, block, marked.weights) / step**2
+    return Scribbles(places, weights, small.colours(places))
 
 
 def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:
@@ -311,19 +343,18 @@ def _regression(
     return operator.each(lambda found: fitted(found.factor))
 
 
-def fit_borders(image: Tensor, likely: Tensor, front: Tensor, back: Tensor, short: int) -> Tensor:
-    """Masks (B, K, H, W) from how likely pixels are in the regions, and from weights of what is scribbled.
+def fit_borders(image: Tensor, likely: Tensor, front: Tensor, back: Tensor) -> Tensor:
+    """Functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
 
     Args:
         image: (B, C, H, W).
-        likely: (B, K, H, W).
+        likely: how likely pixels are in the regions, (B, K, H, W).
         front: weights of the scribbles on the regions, likewise.
         back: of those on what is around.
-        short: pixels of the short side of the whole picture.
     """
     bound = math.tanh(CONTRAST / 2)
     rough = (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)  # 0 and 1 stay as they are
     painted = front + back
     target = (rough * TRUST + front * CERTAIN) / (TRUST + painted * CERTAIN)
-    solved = solve_mask(image, target, TRUST + painted * CERTAIN, short)
-    return solved * (1 - painted) + front
+    start = solve_mask(image, target, TRUST + painted * CERTAIN)
+    return solve_linear(image, start, rough, front, back)

@@ -1,12 +1,14 @@
-"""A rough mask to a soft one whose borders follow those of the picture: a small linear solve over neighbours.
+"""A rough mask to a soft one whose borders follow those of the picture: two solves over neighbours.
 
-The mask a minimises ``sum_ij w_ij (a_i - a_j)^2 + sum_i c_i (a_i - t_i)^2`` over pixels and their eight neighbours,
-with weights w that fall with the difference of colours, a rough mask t and confidences c in it. A fixed number of
-Jacobi steps on each level of a pyramid, from the coarsest to the finest, solves it nearly, and sees a bounded
-neighbourhood, so that tiles agree with the whole picture.
+The first minimises ``sum_ij w_ij (a_i - a_j)^2 + sum_i c_i (a_i - t_i)^2`` over pixels and their eight neighbours, with
+weights w that fall with the difference of colours, a rough mask t and confidences c in it; a few Jacobi steps on each
+level of a pyramid solve it nearly. The second starts from it and is closed-form matting (Levin, Lischinski and Weiss,
+2008): in every small window the mask is to be a linear function of the colours, which hairs and soft borders obey.
+These functions then give the mask of any pixel of a larger picture from its own colours (:class:`LinearMasks`).
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -24,6 +26,11 @@ BESIDE = 4  # coarsest pixels that the colours on either side of a border are av
 KNOWN = 0.02  # share of a side, of what is nearby, at which its colour counts as half known
 TINY = 1e-4  # weight of pixels that hardly belong to a side
 REFERENCE = 112  # short side for which confidences are meant
+WINDOW, NOISE = 2, 1e-5  # pixels to each side in which masks are linear in colours; variance of what is no colour
+LINEAR_LEVELS, LINEAR_STEPS = 2, 8  # levels of the pyramid that the second solve works on, and steps on each
+DOUBT = 0.1  # masks closer than this to 0 and 1 are that
+SLOWEST = 0.03  # smallest eigenvalue that these steps are to damp
+LINEAR_TRUST, LINEAR_CERTAIN = 3e-3, 10.0  # confidence where the rough mask is 0 or 1, and in scribbles
 
 
 def pyramid_levels(short: int) -> int:
@@ -31,58 +38,50 @@ def pyramid_levels(short: int) -> int:
     return max(0, min(LEVELS, int(math.log2(max(short / COARSEST, 1)))))
 
 
-def pyramid_margin(levels: int) -> int:
-    """How many pixels around a pixel the solve depends on; a multiple of the pixels of the coarsest level."""
-    seen = sum((steps_on(level, levels) + 1) << level for level in range(levels + 1))
-    step = 1 << levels
-    return -(-seen // step) * step + step
-
-
 def steps_on(level: int, levels: int) -> int:
     """Steps on a level, 0 is the finest, of a pyramid."""
     return STEPS[-1] if level == levels else STEPS[min(level, len(STEPS) - 1)]
 
 
-def sides_margin(levels: int) -> int:
-    """How many pixels around a pixel :func:`colours_beside` depends on."""
-    return (2 + BESIDE) << levels
-
-
-def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor, short: int) -> Tensor:
-    """The soft mask (B, K, H, W).
+def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
+    """The soft mask (B, K, H, W) of the first solve.
 
     Args:
         image: (B, C, H, W), C = 1 or 3.
         rough: t, (B, K, H, W).
-        confidence: c, (B, K, H, W), for a picture whose short side is at most
-            :data:`REFERENCE`.
-        short: pixels of the short side of the whole picture.
+        confidence: c, (B, K, H, W), for a picture whose short side is at most :data:`REFERENCE`.
     """
     height, width = image.shape[-2:]
+    short = min(height, width)
     levels = pyramid_levels(short)
-    step = 1 << levels
-    # A multiple of the coarsest pixels, so that these are the same in tiles and in the whole.
-    pad = (0, -width % step, 0, -height % step)
     planes = torch.cat([image, confidence * rough, confidence], dim=1)
-    planes = F.pad(planes, pad, "replicate")
     scale = min(1.0, REFERENCE / short) ** 2
-    pyramid = [planes]
-    for _ in range(levels):
-        pyramid.append(F.avg_pool2d(pyramid[-1], 2))
+    pyramid = halved(planes, levels)
     count, steepness = rough.shape[1], -STEEPNESS / image.shape[1]
     found: Tensor | None = None
     for level, some in reversed(list(enumerate(pyramid))):
         colours, target, trust = some.split([image.shape[1], count, count], dim=1)
         area = scale * 4**level
         target, trust = area * target, area * trust
-        if found is None:
-            found = target / trust
-        else:
-            found = F.interpolate(found, scale_factor=2, mode="bilinear", align_corners=False)
+        found = target / trust if found is None else doubled(found, some)
         weights = neighbour_weights(colours, lambda squared: torch.exp(steepness * squared) + LEAST)
         found = jacobi(found, target, trust, weights, steps_on(level, levels))
     assert found is not None  # for mypy
-    return found[..., :height, :width].clamp(0.0, 1.0)
+    return found.clamp(0.0, 1.0)
+
+
+def halved(planes: Tensor, levels: int) -> list[Tensor]:
+    """Planes (B, C, H, W), and as many times half the size; a last row or column that is left over stands alone."""
+    pyramid = [planes]
+    for _ in range(levels):
+        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
+    return pyramid
+
+
+def doubled(planes: Tensor, like: Tensor) -> Tensor:
+    """Planes of a level of a pyramid on the level before, which has the size of ``like``."""
+    twice = F.interpolate(planes, scale_factor=2, mode="bilinear", align_corners=False)
+    return twice[..., : like.shape[-2], : like.shape[-1]]
 
 
 def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps: int) -> Tensor:
@@ -103,17 +102,154 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps:
     return found
 
 
-def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The mean colours nearby of what is inside a mask and of what is outside, both (B, C, H, W).
+@dataclass(frozen=True, eq=False)
+class LinearMasks:
+    """Masks that are a linear function of colours in every window of a picture. Those of neighbours overlap.
 
-    Third, how far these are known, (B, 1, H, W) in [0, 1]: hardly where nearly all or nearly nothing nearby is inside.
+    Attributes:
+        image: less its middle value, (B, C, H, W).
+        mean: of windows, likewise.
+        inverse: of the covariance of colours in windows, (B, C, C, H, W).
+    """
+
+    image: Tensor
+    mean: Tensor
+    inverse: Tensor
+
+    @staticmethod
+    def of(image: Tensor) -> "LinearMasks":
+        """From (B, C, H, W)."""
+        image = image - 0.5
+        count = image.shape[1]
+        mean = window_means(image)
+        product = window_means((image.unsqueeze(1) * image.unsqueeze(2)).flatten(1, 2)).unflatten(1, (count, count))
+        covariance = (product - mean.unsqueeze(1) * mean.unsqueeze(2)).permute(0, 3, 4, 1, 2).double()
+        inverse = torch.linalg.inv(covariance + NOISE * torch.eye(count).to(covariance))
+        return LinearMasks(image, mean, inverse.to(image).permute(0, 3, 4, 1, 2).contiguous())
+
+    def fit(self, mask: Tensor) -> Tensor:
+        """The functions nearest to a mask (B, 1, H, W), means of those of all windows around a pixel, (B, C+1, H, W).
+
+        Their last channel is what is added to the product of the others with the colours less 0.5.
+        """
+        moments = window_means(torch.cat([mask, mask * self.image], dim=1))
+        mean = moments[:, :1]
+        slopes = (self.inverse * (moments[:, 1:] - self.mean * mean).unsqueeze(1)).sum(2)
+        rest = mean - (slopes * self.mean).sum(1, keepdim=True)
+        return window_means(torch.cat([slopes, rest], dim=1))
+
+    def smoothed(self, mask: Tensor) -> Tensor:
+        """The mask by these functions."""
+        return linear_mask(self.image, self.fit(mask))
+
+
+def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
+    """The mask (B, 1, H, W) of an image less 0.5 by functions of :meth:`LinearMasks.fit`."""
+    return (functions[:, :-1] * image).sum(1, keepdim=True) + functions[:, -1:]
+
+
+def window_means(planes: Tensor) -> Tensor:
+    """Means over the window around each pixel; nothing is outside the picture."""
+    size = 2 * WINDOW + 1
+    for axis, pad in ((2, (0, 0, WINDOW, WINDOW)), (3, (WINDOW, WINDOW))):
+        length = planes.shape[axis]
+        padded = F.pad(planes, pad)
+        total = padded.narrow(axis, 0, length).clone()  # shifted sums: F.avg_pool2d takes several times as long
+        for shift in range(1, size):
+            total += padded.narrow(axis, shift, length)
+        place = torch.arange(length, device=planes.device)
+        count = (place + WINDOW).clamp(max=length - 1) - (place - WINDOW).clamp(min=0) + 1
+        planes = total.mul_(1 / count.to(planes).view(-1, *[1] * (3 - axis)))
+    return planes
+
+
+def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+    """The functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit` for the masks of the second solve.
 
     Args:
         image: (B, C, H, W).
-        mask: (B, 1, H, W).
-        levels: as of :func:`pyramid_levels`.
+        start: masks (B, K, H, W) to start from.
+        rough: those to stay near, the nearer the closer to 0 or 1 they are.
+        front: weights of what is certainly inside, likewise.
+        back: of what is certainly outside.
     """
-    (height, width), step = image.shape[-2:], 1 << levels
+    trust = LINEAR_TRUST * ((2 * rough - 1).square() + 0.01)
+    levels = min(LINEAR_LEVELS - 1, pyramid_levels(min(image.shape[-2:])))
+    certain = LINEAR_CERTAIN * (front + back)
+    planes = torch.cat([image, trust * rough + LINEAR_CERTAIN * front, trust + certain, start], dim=1)
+    count = rough.shape[1]
+    found: Tensor | None = None
+    for level, some in reversed(list(enumerate(halved(planes, levels)))):
+        colours, target, trust, first = some.split([image.shape[1], count, count, count], dim=1)
+        model = LinearMasks.of(colours)
+        found = first if found is None else doubled(found, some)
+        masks = [
+            damped(model, a, 4**level * t, 4**level * c)
+            for a, t, c in zip(found.split(1, 1), target.split(1, 1), trust.split(1, 1), strict=True)
+        ]
+        found = torch.cat(masks, dim=1)
+    assert found is not None  # for mypy
+    functions = torch.stack([model.fit(mask.clamp(0.0, 1.0)) for mask in found.split(1, 1)], dim=1)
+    slopes, rest = functions.split([image.shape[1], 1], dim=2)
+    return torch.cat([slopes, rest - DOUBT], dim=2) / (1 - 2 * DOUBT)
+
+
+def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
+    """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S of :meth:`LinearMasks.smoothed`.
+
+    The preconditioned system has its eigenvalues in [0, 1]; parts of the error whose eigenvalue is below
+    :data:`SLOWEST` are left to coarser levels.
+
+    Args:
+        model: of the picture.
+        mask: to start from.
+        target: c t.
+        trust: c.
+    """
+    middle, half = (1 + SLOWEST) / 2, (1 - SLOWEST) / 2
+    ratio, step = half / middle, torch.zeros(())
+    for number in range(LINEAR_STEPS):
+        residual = (model.smoothed(mask) + target) / (1 + trust) - mask
+        if number == 0:
+            step = residual / middle
+        else:
+            following = 1 / (2 * middle / half - ratio)
+            step = following * ratio * step + 2 * following / half * residual
+            ratio = following
+        mask = mask + step
+    return mask
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """Colours on both sides of a border.
+
+    Attributes:
+        inside: the mean colours nearby of what is inside a mask, (B, C, H, W).
+        outside: likewise of what is outside.
+        known: how far these are known, (B, 1, H, W) in [0, 1]: hardly where nearly all or nearly nothing nearby is
+            inside.
+    """
+
+    inside: Tensor
+    outside: Tensor
+    known: Tensor
+
+    def refine(self, image: Tensor, mask: Tensor) -> Tensor:
+        """A mask (B, 1, H, W) whose border pixels hold as much of the inside as their own colours say.
+
+        For things of one colour on grounds of another; of textures it would make patterns.
+        """
+        across = self.inside - self.outside
+        contrast = across.square().mean(1, keepdim=True)
+        share = ((image - self.outside) * across).mean(1, keepdim=True) / (contrast + TINY * CONTRAST)
+        trust = self.known * contrast / (contrast + CONTRAST**2) * (1 - (2 * mask - 1).pow(8))  # 0 and 1 are certain
+        return torch.lerp(mask, share.clamp(0.0, 1.0), trust)
+
+
+def colours_beside(image: Tensor, mask: Tensor) -> Sides:
+    """The colours on both sides of the borders of a mask (B, 1, H, W) of an image (B, C, H, W)."""
+    (height, width), step = image.shape[-2:], 1 << pyramid_levels(min(image.shape[-2:]))
     weights = torch.cat([mask, 1 - mask], dim=1).pow(4) + TINY  # (B, 2, H, W)
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
     planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
@@ -125,28 +261,14 @@ def colours_beside(image: Tensor, mask: Tensor, levels: int) -> tuple[Tensor, Te
     means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
     least = sums[:, :2].amin(1, keepdim=True)
     found = torch.cat([means.flatten(1, 2), least / (least + KNOWN)], dim=1)
-    if levels:
+    if step > 1:
         found = F.interpolate(found, scale_factor=step, mode="bilinear", align_corners=False)
     channels = image.shape[1]
-    inside, outside, known = found[..., :height, :width].split([channels, channels, 1], dim=1)
-    return inside, outside, known
+    return Sides(*found[..., :height, :width].split([channels, channels, 1], dim=1))
 
 
-def refine_mask(image: Tensor, mask: Tensor, levels: int) -> Tensor:
-    """A mask (B, 1, H, W) whose border pixels hold as much of the inside as their own colours say.
-
-    For things of one colour on grounds of another; of textures it would make patterns.
-
-    Args:
-        image: (B, C, H, W).
-        mask: (B, 1, H, W).
-        levels: as of :func:`colours_beside`.
-    """
+def refine_mask(image: Tensor, mask: Tensor) -> Tensor:
+    """A mask (B, 1, H, W), refined by the colours beside its borders, which are worked out anew in each round."""
     for _ in range(REFINED):
-        inside, outside, known = colours_beside(image, mask, levels)
-        across = inside - outside
-        contrast = across.square().mean(1, keepdim=True)
-        share = ((image - outside) * across).mean(1, keepdim=True) / (contrast + TINY * CONTRAST)
-        trust = known * contrast / (contrast + CONTRAST**2) * (1 - (2 * mask - 1).pow(8))  # 0 and 1 are certain
-        mask = torch.lerp(mask, share.clamp(0.0, 1.0), trust)
+        mask = colours_beside(image, mask).refine(image, mask)
     return mask

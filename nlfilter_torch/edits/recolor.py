@@ -11,11 +11,10 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, region_means, split_luminance
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.mask import fit_regions
-from nlfilter_torch.edits.matting import REFINED, colours_beside, refine_mask, sides_margin
+from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
 from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.source import Fitted, Source, edited
 
-FAINT, FULL = 0.2, 0.5  # a mask below FAINT leaves a pixel as it is, above FULL it takes the whole colour
 TINY = 1e-12  # keeps the derivative of a root finite
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
 
@@ -103,13 +102,18 @@ def fit_recolor(
     options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
     options["spatial_bandwidth"] = nearby(spatial_bandwidth, RECOLOR["spatial_bandwidth"].share, source.size)
     found = fit_regions(source, inside, [] if kept is None else [kept], reach=reach, **options)
-    change = Recoloring(colours, old, counts, found.levels)
-    return Fitted(
-        found.planes,
-        lambda image, planes: change(image, found.masks(image, planes)),
-        found.margin + (REFINED + 1) * sides_margin(found.levels),
-        found.step,
-    )
+    change = Recoloring(colours, old, counts)
+    reduced = split_luminance(found.reduced)[1]
+    beside = []
+    for share in change.shares(found.reduced_masks()).split(1, dim=1):
+        sides = colours_beside(reduced, refine_mask(reduced, share))
+        beside.append(torch.cat([sides.inside, sides.outside, sides.known], dim=1))
+
+    def recoloured(pixels: Any) -> Tensor:
+        sides = [Sides(*found.rows(planes, pixels).split([3, 3, 1], dim=1)) for planes in beside]
+        return change(pixels.image, found.masks(pixels), sides)
+
+    return Fitted(recoloured)
 
 
 def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
@@ -131,24 +135,27 @@ class Recoloring:
         colours: chroma of the strokes, (B, K, 3).
         old: mean chroma of what they are painted on, (B, K, 3).
         counts: which of these an image has, (B, K).
-        levels: as of :func:`colours_beside`.
     """
 
     colours: Tensor
     old: Tensor
     counts: Tensor
-    levels: int
 
-    def __call__(self, pixels: Tensor, masks: Tensor) -> Tensor:
-        """Pixels (B, 3, H, W) in their new colours, under masks (B, K, H, W)."""
-        shares = ((masks - FAINT) / (FULL - FAINT)).clamp(0.0, 1.0) * self.counts[..., None, None]
-        shares = shares / shares.sum(1, keepdim=True).clamp(min=1.0)
+    def shares(self, masks: Tensor) -> Tensor:
+        """How much of a pixel takes each colour, (B, K, H, W), under masks likewise."""
+        shares = masks * self.counts[..., None, None]
+        return shares / shares.sum(1, keepdim=True).clamp(min=1.0)
+
+    def __call__(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
+        """Pixels (B, 3, H, W) in their new colours, under masks (B, K, H, W), with the colours beside each of these."""
+        shares = self.shares(masks)
         luminance, chroma = split_luminance(pixels)
         change, total = torch.zeros_like(chroma), torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
-            share = refine_mask(chroma, shares[:, k : k + 1], self.levels)
-            inside, outside, known = colours_beside(chroma, share, self.levels)
-            thing = chroma + known * (1 - share) * (inside - outside)  # its part of a mixed pixel; all of one inside
+            sides = beside[k]
+            share = sides.refine(chroma, shares[:, k : k + 1])
+            # Its part of a mixed pixel; all of one inside.
+            thing = chroma + sides.known * (1 - share) * (sides.inside - sides.outside)
             # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
             # saturation.
             usual = self.old[:, k].square().sum(1)[:, None, None, None]  # squared saturation

@@ -47,3 +47,19 @@ def cubic(distance: Tensor) -> Tensor:
     t = distance.abs()
     near, far = (1.5 * t - 2.5) * t * t + 1, ((-0.5 * t + 2.5) * t - 4) * t + 2
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
+
+
+def enlarged(blocks: Tensor, step: int, first: int, size: tuple[int, int]) -> Tensor:
+    """Rows (B, C, h, W) of a picture from values (B, C, n, m) of its blocks, between whose middles they are linear.
+
+    Args:
+        blocks: as of :func:`nlfilter_torch.edits.source.block_means`.
+        step: rows and columns of a block.
+        first: number of the first row.
+        size: (h, W).
+    """
+    low, high = max(0, first // step - 1), (first + size[0] - 1) // step + 2
+    rows = blocks[:, :, low:high]
+    if step > 1:
+        rows = F.interpolate(rows, scale_factor=step, mode="bilinear", align_corners=False)
+    return rows[:, :, first - low * step :, :][:, :, : size[0], : size[1]]

@@ -164,6 +164,13 @@ class Source(Protocol):
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means (B, C, H / step, W / step), rounded up, over blocks of ``step`` pixels in both directions."""
 
+    def blocks(self, step: int, floats: int) -> "InMemory":
+        """The picture reduced by means over blocks of ``step`` pixels in both directions, in memory.
+
+        Raises:
+            MemoryError: if there is no room for so many ``floats`` for each of its pixels.
+        """
+
     def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
         """Medians (B, C) over all pixels but ``margin`` at the borders.
 
@@ -184,7 +191,7 @@ class InMemory:
     first = 0
     whole = True
 
-    def __init__(self, image: Tensor, kept: dict[Any, "InMemoryOperator"] | None = None) -> None:
+    def __init__(self, image: Tensor, kept: dict[Any, Any] | None = None) -> None:
         self.image, self.kept, self.dtype = image, kept, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size = (size[0], size[1])
@@ -197,7 +204,7 @@ class InMemory:
             *((name, value) for name, value in sorted(guide.options.items()) if name != "generator"),
         )
         if self.kept is not None and key in self.kept:
-            return self.kept[key]
+            return cast(InMemoryOperator, self.kept[key])
         operator = InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
         if self.kept is not None and not any(isinstance(value, Tensor) for value in guide.options.values()):
             self.kept[key] = operator
@@ -229,6 +236,13 @@ class InMemory:
         if size == self.size:
             return self
         return InMemory(resize(self.image, size))
+
+    def blocks(self, step: int, floats: int) -> "InMemory":
+        """The image reduced by :func:`block_means`."""
+        if step == 1:
+            return self
+        kept = None if self.kept is None else self.kept.setdefault(("blocks", step), {})
+        return InMemory(block_means(self.image, step), kept)
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Weights in another size."""

@@ -1,5 +1,6 @@
 """A picture that is read a few rows at a time, as the source of an edit: sums in passes, and tiles of edited rows."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.resizing import resized
-from nlfilter_torch.edits.source import Fitted, Guide, Planes, block_means
+from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Planes, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
@@ -192,6 +193,20 @@ class Tiled:
             self.passes.report("Reducing", tile.start, self.size[0])
             parts.append(block_means(planes(self.pixels_of(tile)), step))
         return torch.cat(parts, dim=2)
+
+    def blocks(self, step: int, floats: int) -> InMemory:
+        """The picture reduced by means over blocks, in memory.
+
+        Raises:
+            MemoryError: if there is no room for so many floats for each of its pixels.
+        """
+        needed = math.prod(-(-side // step) for side in self.size) * floats * self.dtype.itemsize
+        if needed > self.passes.memory:
+            raise MemoryError(
+                f"{self.picture.name} needs {needed / 1e6:.0f} MB of memory at least, but "
+                f"{self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+            )
+        return InMemory(self.reduced(lambda pixels: pixels.image, step))
 
     @torch.no_grad()
     def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
