@@ -73,6 +73,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.fuzz --cases 20
 	$(BIN)/python -m benchmarks.masks --quick
 	$(BIN)/python -m benchmarks.recolor --quick
+	$(BIN)/python -m benchmarks.looks --quick
 
 # A denoiser trained from nothing, and judged: weights, figures and a picture in out/denoiser.
 train: $(VENV)/.installed-test

@@ -24,6 +24,11 @@ def plain_step(recipe: Recipe) -> Step | None:
     return step if step is not None and step.edit == "detail" and not step.strokes else None
 
 
+def look_step(recipe: Recipe) -> Step | None:
+    """The only step of a recipe, if it is a look."""
+    return recipe.steps[0] if [step.edit for step in recipe.steps] == ["look"] else None
+
+
 def preset_option(help: str, *, plain: bool = True) -> Any:
     """An option for a preset, whose values take the place of the options' defaults; a ``plain`` one takes no others."""
 
@@ -31,7 +36,7 @@ def preset_option(help: str, *, plain: bool = True) -> Any:
         step = None if name is None else plain_step(find_recipe(name))
         if step is not None:
             context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
-        elif plain and name is not None:
+        elif plain and name is not None and look_step(find_recipe(name)) is None:
             raise ValueError(
                 f"--preset must be a file with one step, of detail and without strokes, got {name}; "
                 "use nlfilter-torch apply, which takes any"
@@ -177,6 +182,11 @@ def edit_photograph(
     """Do the edit of a name to a file; options are those of its command, and those left out have their defaults."""
     edit = EDITS[name]
     step = step_of(edit, given)
+    preset = given.get("preset")
+    if preset is not None and (look := look_step(find_recipe(preset))) is not None:
+        if step.values or given.get("region") or given.get("mask"):
+            raise ValueError(f"--preset must be without options of detail where it is a look, got {preset}; drop them")
+        edit, step, name = EDITS["look"], look, "look"
 
     import torch
     from torch import Tensor

@@ -296,13 +296,14 @@ def _add(
             region.folds.append(whole)
         else:
             region.folds[number % FOLDS] = region.folds[number % FOLDS] + whole
-        _add_sliders(region, operator, luminance, after, weights, whole, rounding)
+        _add_sliders(region, operator, luminance, before, after, weights, whole, rounding)
 
 
 def _add_sliders(
     region: _Region,
     operator: Any,
     luminance: Tensor,
+    before: Tensor,
     after: Tensor,
     weights: Tensor,
     sums: Sums,
@@ -314,7 +315,9 @@ def _add_sliders(
     if sums.explained(fit_parts(sums, ("alpha",), region.layout, RIDGES[0])) < SLIDERS_ONLY:
         region.sliders = None
         return
-    edited = reduce_channels(after[None], "luminance")
+    # Sliders add the same to every channel, each of which is rounded by itself.
+    luminance = luminance.expand(-1, 3, -1, -1)
+    edited = luminance + (after - before)[None]
     mask = (weights.amin(0) > 0)[None, None].to(luminance)
     alpha = fit_alpha(operator, luminance, edited, order=region.layout.sliders - 1, mask=mask, rounding=rounding)[0]
     place = region.layout.place("alpha")
