@@ -15,7 +15,7 @@ from nlfilter_torch import colorize, recolor
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import split_luminance
 from nlfilter_torch.io.photographs import read_photograph
-from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor
+from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor, tiles
 from nlfilter_torch.tiled.scribbles import read_scribbles
 from nlfilter_torch.tiled.sources import Picture
 from tests.test_streaming import FEW, LEVEL, Rows, Shrinking, cat
@@ -149,6 +149,15 @@ def test_tiles_of_any_size_give_the_same(statistics: Any) -> None:
     )
     for other in others:
         assert max(np.abs(one - two).max() for one, two in zip(first, other, strict=True)) < 1e-6
+
+
+def test_a_guide_that_is_kept_changes_nothing() -> None:
+    picture, (strokes, mask, _) = cat(90, 60), paint(90, 60)
+    kept, made_again = (
+        recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16),
+        recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16, memory=tiles.AMPLE - 1),
+    )
+    np.testing.assert_allclose(kept, made_again, atol=1e-4)
 
 
 def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,6 +23,7 @@ from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import cat, difference
+from tests.test_streaming import cat as photograph
 
 LINE = ((0.25, 0.25), (0.5, 0.3))
 IN, OUT = Stroke(LINE, 0.06, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
@@ -45,6 +46,14 @@ def from_rows(rows: NDArray[Any]) -> torch.Tensor:
 def by_rows(recipe: Recipe, source: NDArray[Any], folder: Path, **options: Any) -> NDArray[Any]:
     passes = Passes("float32", "full", **options)
     return np.concatenate([rows for _, rows in whole_edit.edit_rows(passes, source, recipe, "scan.tif", folder)])
+
+
+def test_denoising_by_a_sample_is_within_a_grey_level() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.06, (200, 260, 3))
+    picture = (photograph(200, 260) + noise).clip(0, 1).astype(np.float32)
+    step, options = Recipe((Step("denoise", landmarks=60),)), {"sample": 4096}
+    rows = [rows for _, rows in whole_edit.edit_rows(Passes("float32", **options), picture, step, "scan.tif", Path())]
+    assert difference(from_rows(np.concatenate(rows)), step.apply(from_rows(picture))) < 1  # grey level
 
 
 @pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(7, 48), slice(0, 48)])

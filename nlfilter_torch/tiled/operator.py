@@ -49,6 +49,7 @@ class TilePixels:
     features: "Callable[[TiledOperator], Tensor]"
     first: int = 0
     _columns: dict[int, Columns] = field(default_factory=dict)
+    _layers: tuple[Planes, Tensor] | None = None
 
     def columns(self, operator: "TiledOperator") -> Columns:
         """Their columns, worked out once for each operator."""
@@ -58,6 +59,12 @@ class TilePixels:
                 operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
             )
         return self._columns[id(operator)]
+
+    def once(self, layers: Planes) -> Tensor:
+        """What a function gives of these pixels, kept until another one is asked for."""
+        if self._layers is None or self._layers[0] is not layers:
+            self._layers = layers, layers(self)
+        return self._layers[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +144,8 @@ class TiledOperator:
                 lacking.moment, limiter @ lacking.coefficients, limiter @ lacking.grams.to(limiter) @ limiter
             )
         self._grams = lacking.grams
-        self._sums[id(planes)] = (planes, replace(self._summed_up(planes, order), correction=lacking.coefficients))
+        sample = self._summed_up(planes, order, self.over("Summing up"))
+        self._sums[id(planes)] = (planes, replace(sample, correction=lacking.coefficients))
 
     def _look_again(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
         """About ``count`` pixels, and what their sums under the pilot's guess lack to those of all pixels."""
@@ -186,7 +194,7 @@ class TiledOperator:
     @property
     def margin(self) -> int:
         """How many pixels around a pixel its column depends on."""
-        return self.kernel.recipe.patch_weights.shape[0] // 2 + self.guide.guide.margin
+        return self.kernel.recipe.patch_weights.shape[0] // 2 + self.guide.margin
 
     def features(self, tile: Tile) -> Tensor:
         """Features (1, D, h W) of a tile of the picture."""
@@ -216,20 +224,24 @@ class TiledOperator:
     @torch.no_grad()
     @full_precision
     def sums(self, planes: Planes, order: int) -> Sums:
-        """The sums for the first ``order`` powers of W, and some planes."""
+        """The sums for the first ``order`` powers of W, and some planes.
+
+        Those of planes that were not known when the first sums were taken are of all pixels: a sample that is drawn for
+        the balancing is off by several grey levels for what is large at a few pixels.
+        """
         self.settle(planes, order)
         known = self._sums.get(id(planes))
         if known is None or known[1].moments.shape[1] < order:
-            known = (planes, self._summed_up(planes, order))
+            known = (planes, self._summed_up(planes, order, self._over_all("Summing up")))
             self._sums[id(planes)] = known  # the planes are kept, so that no other ones get their number
         return known[1]
 
-    def _summed_up(self, planes: Planes, order: int) -> Sums:
+    def _summed_up(self, planes: Planes, order: int, blocks: Pass) -> Sums:
         def values(block: Block) -> tuple[Tensor, Columns]:
             pixels = self.pixels(block)
             return planes(pixels).flatten(2), pixels.found
 
-        return sum_up(self.over("Summing up"), values, order)
+        return sum_up(blocks, values, order)
 
     @cached_property
     def pairs(self) -> RitzPairs:
@@ -265,7 +277,7 @@ class TiledOperator:
             found = layers_of_columns(pixels.columns(self), coefficients, image.flatten(2))
             return found.unflatten(-1, image.shape[-2:])
 
-        return layers
+        return lambda pixels: pixels.once(layers) if isinstance(pixels, TilePixels) else layers(pixels)
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""

@@ -71,7 +71,7 @@ def over_all(
     size = kernel.recipe.patch_weights.shape[0] // 2
 
     def tiles() -> Iterator[Tile]:
-        for tile in picture.picture.tiles(size + picture.guide.margin, picture.statistics_rows):
+        for tile in picture.picture.tiles(size + picture.margin, picture.statistics_rows):
             report(stage, tile.start, picture.size[0])
             yield tile
 
@@ -159,7 +159,7 @@ def take_pilot(
         slope = float(gradients(guide, seen.halo).double().mean((0, 1)).sum()) if automatic else 0.0
         return patches_at(guide, seen, chosen, patch_size), tile.inner.flatten(2)[:, :, chosen], slope
 
-    parts = visit(picture.picture, margin + picture.guide.margin, wanted.sort().values, report, "Looking")
+    parts = visit(picture.picture, margin + picture.margin, wanted.sort().values, report, "Looking")
     patches, values, slopes = zip(*in_order(look, parts, workers), strict=True)
     if isinstance(photometric_bandwidth, str):
         photometric_bandwidth = float(

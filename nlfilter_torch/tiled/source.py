@@ -44,6 +44,7 @@ class Tiled:
         self.floats = 8 * picture.colours + 40  # floats for each pixel of a tile, without features
         self.scribbled = 0  # pixels
         self.kept = 0  # floats of columns
+        self.stored = 0  # floats of guides
 
     @torch.no_grad()
     @full_precision
@@ -65,9 +66,13 @@ class Tiled:
         self.room(numbers, count)
         passes, picture = self.passes, GuidePicture(self.picture, guide)
         workers = passes.workers(count)
+        if guide.margin and passes.stores(picture.pixels * compared * self.dtype.itemsize):
+            self.stored += picture.pixels * compared
+            self.room(numbers, count)
+            picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
         pilot = take_pilot(picture, passes.report, workers, **options)
         sampled, count = passes.sample < picture.pixels, pilot.balancing.shape[1]
-        kept = pixels_kept(picture, passes, numbers, count, self.scribbled * floats_of_scribbled(numbers))
+        kept = pixels_kept(picture, passes, numbers, count, self.held(numbers))
         self.kept = kept * (count + 2)
         found = TiledOperator(
             picture,
@@ -97,8 +102,12 @@ class Tiled:
             floats=self.floats + numbers,
             planes=numbers,
             num_landmarks=num_landmarks,
-            held=self.kept + self.scribbled * floats_of_scribbled(numbers),
+            held=self.kept + self.held(numbers),
         )
+
+    def held(self, numbers: int) -> int:
+        """Floats of scribbles, with so many features of each pixel, and of guides."""
+        return self.stored + self.scribbled * floats_of_scribbled(numbers)
 
     def scribbles(
         self, mask: RowSource | None, colours: RowSource | None, name: str, *, needed: bool = True
@@ -304,7 +313,7 @@ class Tiled:
             yield from self.passes.work_out(self.picture, finished, margin, self._rows_to_finish(fitted, rows))
 
     def _rows_to_finish(self, fitted: Fitted, rows: int) -> int:
-        """Rows of a tile that is finished: not fewer than its margins, as far as memory allows.
+        """Rows of a tile that is finished: its margins, several times if none were asked for, as far as memory allows.
 
         Raises:
             MemoryError: if it allows none.
@@ -316,5 +325,6 @@ class Tiled:
                 f"{self.picture.name} needs {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory at least, "
                 f"but {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
-        rows = max(rows, fitted.margin) if self.size[0] <= most else min(max(rows, fitted.margin), most)
+        rows = max(rows, (1 if self.passes.tile_rows else 4) * fitted.margin)
+        rows = rows if self.size[0] <= most else min(rows, most)
         return max(1, rows // fitted.step) * fitted.step

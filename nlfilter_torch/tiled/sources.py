@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.edits.source import Guide
+from nlfilter_torch.tiled.workers import in_order
 
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
@@ -151,20 +152,39 @@ class GuidePicture(Picture):
     Attributes:
         picture: what it is the guide of.
         guide: makes it.
+        stored: the whole guide (1, C, H, W), if it is kept in memory.
     """
 
     def __init__(self, picture: Picture, guide: Guide) -> None:
         super().__init__(picture.source, picture.name)
         self.picture, self.guide = picture, guide
+        self.stored: Tensor | None = None
+
+    def store(self, rows: int, workers: int) -> None:
+        """Keep the whole guide, which is made in tiles of ``rows``, so that further passes need not make it again."""
+        planes: Tensor | None = None
+        tiles = self.picture.tiles(self.margin, rows)
+        for start, part in in_order(lambda tile: (tile.start, self.seen(tile, 0).pixels), tiles, workers):
+            if planes is None:
+                planes = part.new_empty(*part.shape[:2], *self.size)
+            planes[:, :, start : start + part.shape[2]] = part
+        self.stored = planes
+
+    @property
+    def margin(self) -> int:
+        """How many pixels around a pixel of the picture are read for its guide."""
+        return 0 if self.stored is not None else self.guide.margin
 
     def tile(self, start: int, stop: int, margin: int) -> Tile:
         """A tile of the guide, as :meth:`Picture.tile`."""
-        return self.seen(super().tile(start, stop, margin + self.guide.margin), margin)
+        return self.seen(super().tile(start, stop, margin + self.margin), margin)
 
     def seen(self, tile: Tile, margin: int) -> Tile:
         """The guide of a tile of the picture that has at least as large a margin as that takes."""
         stop = tile.start + tile.stored.shape[0]
         halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
+        if self.stored is not None:
+            return Tile(tile.start, self.stored[:, :, tile.start - halo[0] : stop + halo[1]], halo, tile.stored)
         around = tuple(min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
         rows = tile.pixels.shape[2]
         image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]

@@ -76,6 +76,10 @@ class Passes:
             return 1
         return max(1, min(torch.get_num_threads(), self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
 
+    def stores(self, taken: int) -> bool:
+        """Whether a guide of so many bytes is kept from one pass to the next."""
+        return self.memory >= AMPLE and taken <= self.memory // 4
+
     def work_out(
         self,
         picture: Picture,
