@@ -35,6 +35,7 @@ from nlfilter_torch.tiled.sources import Rows, RowSource
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
+FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is done in tiles
 CODED = 8  # memory to decode or encode other formats, as a multiple of the picture's bytes
 
 
@@ -147,6 +148,11 @@ def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> No
 def free_memory() -> int:
     """Default memory budget in bytes: four fifths of the free memory."""
     return int(psutil.virtual_memory().available * 4 // 5)
+
+
+def modest_memory() -> int:
+    """What an edit takes without being asked: a fifth of the machine's memory, and no more than is free."""
+    return min(FIFTH, free_memory())
 
 
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
