@@ -19,11 +19,15 @@ from nlfilter_torch.app.library import Library
 from nlfilter_torch.app.panel import Brush, Panel
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
+from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.tiled.sampling import Report
 
+Save = Callable[[str, Report], Path]  # name and progress
 EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
 LARGEST_PRESET = 20_000_000  # bytes
 PATIENCE = 0.3  # seconds until the page shows that it is working
+SHOWN = 0.5  # seconds between two texts of the progress
 LASTING = 10.0  # seconds that an error is shown
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
@@ -260,7 +264,7 @@ class Editor:
         name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
         await self._ask("Save the edit", f"{name}.json", self.session.check_preset, self.session.save_preset)
 
-    async def _ask(self, title: str, name: str, check: Callable[[str], Path], save: Callable[[str], Path]) -> None:
+    async def _ask(self, title: str, name: str, check: Callable[[str], Path], save: Save) -> None:
         """Ask for a name that passes a check, and whether to replace a file of that name, and save."""
         with self._client, ui.dialog() as dialog, ui.card().classes("dialog"):
             ui.label(title).classes("text-h6")
@@ -291,8 +295,9 @@ class Editor:
         if chosen is not None:
             self._start(self._save(save, chosen))
 
-    async def _save(self, save: Callable[[str], Path], name: str) -> None:
-        path: Path = await self._run("Saving", lambda: save(name))
+    async def _save(self, save: Save, name: str) -> None:
+        progress = Progress()
+        path: Path = await self._run("Saving", lambda: save(name, progress), progress)
         self._clear_error()
         if self._client.is_deleted:
             return
@@ -329,14 +334,17 @@ class Editor:
         if error is not None and not error.is_deleted:
             error.dismiss()
 
-    async def _run(self, doing: str, work: Callable[[], Any]) -> Any:
-        """Run something in a thread; the page shows ``doing`` if it takes long."""
+    async def _run(self, doing: str, work: Callable[[], Any], progress: Progress | None = None) -> Any:
+        """Run something in a thread; the page shows ``doing`` if it takes long, and its progress."""
         task = asyncio.ensure_future(asyncio.to_thread(work))
         done, _ = await asyncio.wait({task}, timeout=PATIENCE)
         if not done:
             self._doing.set_text(f"{doing}\u2026")
             self._working.set_visibility(True)
-            await asyncio.wait({task})
+            while not task.done():
+                await asyncio.wait({task}, timeout=SHOWN)
+                known = "" if progress is None else str(progress)
+                self._doing.set_text(f"{doing}: {known}" if known else f"{doing}\u2026")
             self._working.set_visibility(False)
         return await task
 

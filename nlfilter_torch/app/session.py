@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from nlfilter_torch.app.preview import PIXELS, Preview
@@ -24,6 +25,10 @@ from nlfilter_torch.io.photographs import (
     read_photograph,
     write_photograph,
 )
+from nlfilter_torch.io.rows import FIFTH, modest_memory
+from nlfilter_torch.tiled.recipe import edit_rows
+from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.tiles import Passes, in_silence
 
 SPACING = 0.2  # of the points of a stroke, as a share of its radius
 UNDOS = 100
@@ -229,8 +234,12 @@ class Session:
             suffix = ".tif" if BITS[photograph.depth] == "floats" else ".png"
         return f"{path.stem}-edited{suffix}"
 
-    def save(self, name: str) -> Path:
+    def save(self, name: str, report: Report = in_silence) -> Path:
         """Edit the photograph at its full size and write it; the file appears complete or not at all.
+
+        Args:
+            name: of a file in the folder.
+            report: told of the progress.
 
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
@@ -239,14 +248,29 @@ class Session:
         assert self.opened is not None  # for mypy
         recipe, photograph = self.recipe, self.opened.photograph
         height, width = photograph.size
-        needed = recipe.bytes_per_pixel
-        check_memory(Path(self.opened.name), width, height, needed)
-        write_photograph(photograph.with_pixels(recipe.apply(photograph.pixels)), target)
+        if width * height * recipe.bytes_per_pixel > FIFTH:
+            pixels = self._in_tiles(recipe, photograph, target.parent, report)
+        else:
+            check_memory(Path(self.opened.name), width, height, recipe.bytes_per_pixel)
+            pixels = recipe.apply(photograph.pixels)
+        report("Writing", 0, 1)
+        write_photograph(photograph.with_pixels(pixels), target)
         self.saved = recipe
         return target
 
-    def save_preset(self, name: str) -> Path:
-        """Write the edit as a file for :meth:`load_preset` and the command line.
+    @staticmethod
+    def _in_tiles(recipe: Recipe, photograph: Photograph, folder: Path, report: Report) -> Tensor:
+        """The edited pixels, from as much memory as an edit takes without being asked."""
+        rows = photograph.pixels[0].permute(1, 2, 0).numpy()
+        passes = Passes(str(rows.dtype), memory=modest_memory(), report=report)
+        channels = 3 if recipe.gives_colour else rows.shape[2]
+        pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
+        for part, values in edit_rows(passes, rows, recipe, "the photograph", folder):
+            pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
+        return pixels
+
+    def save_preset(self, name: str, report: Report = in_silence) -> Path:
+        """Write the edit as a file for :meth:`load_preset` and the command line; nothing to report takes that long.
 
         Raises:
             ValueError, OSError: if it cannot be written.

@@ -74,9 +74,10 @@ def batch(
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.core.checks import check_patch_size
     from nlfilter_torch.core.ranks import connected_ranks
+    from nlfilter_torch.io.rows import free_memory
 
     check_patch_size(given["patch_size"])
-    allowed_memory(memory)
+    shared = allowed_memory(memory) if memory is not None else free_memory()
     settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
     if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
@@ -94,7 +95,7 @@ def batch(
         share, tally, total, interrupted = ranks.share(paths), Tally(), Tally(), False
         cores = max(1, _cores() // ranks.local)
         count = min(workers or cores, len(share)) or 1
-        room = allowed_memory(memory) / (count * ranks.local) / 1e9
+        room = shared / (count * ranks.local) / 1e9
         try:
             with steps(len(share)) as begin:
                 edit_folder(

@@ -17,7 +17,7 @@ from nlfilter_torch.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import StoredPicture, check_place, free_memory, is_zarr, open_picture, write_picture
+from nlfilter_torch.io.rows import StoredPicture, check_place, is_zarr, modest_memory, open_picture, write_picture
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import Rows
 from nlfilter_torch.tiled.tiles import Passes
@@ -28,7 +28,7 @@ MOST = 1e6  # gigabytes that anyone may have
 def allowed_memory(gigabytes: float | None) -> int:
     """``--memory`` in bytes."""
     if gigabytes is None:
-        return free_memory()
+        return modest_memory()
     if not 0 < gigabytes <= MOST:
         raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
     return int(gigabytes * 1e9)
@@ -97,7 +97,7 @@ def edit_file(
         depth: of the output, None for that of the input.
         edit: from the photograph to new pixels (1, C, H, W).
         bytes_per_pixel: memory that the edit needs for each pixel of an image.
-        memory: gigabytes that may be used, None for most of what is free.
+        memory: gigabytes that may be used, None for a fifth of the machine's.
         by_rows: the same edit of a photograph that is larger.
         coloured: that the edit by rows gives colours to a grey photograph.
     """

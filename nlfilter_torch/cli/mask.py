@@ -36,6 +36,7 @@ def mask(
     from nlfilter_torch.core.memory import working_bytes
     from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.edits.mask import fit_mask, region_mask
+    from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
     from nlfilter_torch.io.photographs import Photograph, check_file, check_output, write_photograph
     from nlfilter_torch.io.rows import check_place, open_picture, write_picture
@@ -89,7 +90,7 @@ def mask(
     with open_picture(Path(source), allowed) as picture, stages() as report:
         if floats:
             raise ValueError(f"{target} takes the whole mask in memory; write a TIFF file, or allow more memory")
-        plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None)
+        plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
         check_place(place, kind, plain, allowed)
         with ExitStack() as files:
             job = editing.Job(picture, kind, allowed - picture.cached, report, files)

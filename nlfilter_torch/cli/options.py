@@ -96,7 +96,7 @@ Memory = Annotated[
     typer.Option(
         metavar="GB",
         help="Gigabytes of memory that may be used, besides the 0.3 of the program itself. A photograph that needs "
-        "more is processed in tiles, which takes longer and leaves no seams. Left out: four fifths of the free memory.",
+        "more is processed in tiles, which leaves no seams. Left out: a fifth of the machine's memory.",
     ),
 ]
 Full = Annotated[

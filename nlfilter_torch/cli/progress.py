@@ -1,5 +1,7 @@
-"""Progress bars on the standard error stream; nothing is drawn unless it is a terminal."""
+"""Progress on the standard error stream: bars on a terminal, elsewhere a line now and then."""
 
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,6 +17,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from nlfilter_torch.core import progress
+
+PAUSE = 10.0  # seconds between two lines
+
 
 def _bar(*columns: ProgressColumn) -> Progress:
     """A bar that disappears when the work is done."""
@@ -24,23 +30,51 @@ def _bar(*columns: ProgressColumn) -> Progress:
 
 
 @contextmanager
+def _lines(wanted: bool) -> Iterator[progress.Progress]:
+    """Progress that is printed every few seconds, by a thread, if that is wanted."""
+    current, ended = progress.Progress(), threading.Event()
+
+    def tell() -> None:
+        while not ended.wait(PAUSE):
+            sys.stderr.write(f"nlfilter-torch: {current}\n")
+            sys.stderr.flush()
+
+    thread = threading.Thread(target=tell, daemon=True)
+    if wanted:
+        thread.start()
+    try:
+        yield current
+    finally:
+        ended.set()
+        if wanted:
+            thread.join()
+
+
+@contextmanager
 def steps(total: int) -> Iterator[Callable[[str], None]]:
     """A bar of ``total`` steps; yields a function that begins the step of a name and ends the one before."""
-    with _bar(SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()) as bar:
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+    with _bar(*columns) as bar, _lines(bar.disable) as lines:
         task = bar.add_task("", total=total, completed=-1)
-        yield lambda name: bar.update(task, description=name, advance=1)
+
+        def begin(name: str) -> None:
+            bar.update(task, description=name, advance=1)
+            lines.begin(name)
+
+        yield begin
 
 
 @contextmanager
 def stages() -> Iterator[Callable[[str, int, int], None]]:
     """A bar that starts again with every stage; yields a function of the stage, what is done, and the total."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with _bar(*columns) as bar:
+    with _bar(*columns) as bar, _lines(bar.disable) as lines:
         task = bar.add_task("")
 
         def report(stage: str, done: int, total: int) -> None:
             if stage != bar.tasks[0].description:
                 bar.reset(task, description=stage)
             bar.update(task, completed=done, total=total)
+            lines(stage, done, total)
 
         yield report

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
+from nlfilter_torch.io.extras import NO_EXTRAS, Extras, read_extras
 from nlfilter_torch.tiled.sources import Picture, stored_as
 
 if sys.platform != "win32":
@@ -61,6 +62,7 @@ class Photograph:
         alpha: (1, 1, H, W) likewise, or None. Kept as it is.
         icc: The colour profile, or None. Pixels are not converted.
         exif: The EXIF block, whose orientation is 1 since the pixels are upright, or None.
+        extras: XMP, and the resolution in print.
     """
 
     pixels: Tensor
@@ -68,6 +70,7 @@ class Photograph:
     alpha: Tensor | None = None
     icc: bytes | None = None
     exif: bytes | None = None
+    extras: Extras = NO_EXTRAS
 
     @property
     def size(self) -> tuple[int, int]:
@@ -109,7 +112,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     planes = Picture(channels, str(path), planes=channels.shape[2]).tile(0, len(channels), 0).pixels  # (1, S, H, W)
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
-    return Photograph(planes[:, :colours], depth, alpha, icc, exif)  # type: ignore[arg-type]
+    return Photograph(planes[:, :colours], depth, alpha, icc, exif, read_extras(path))  # type: ignore[arg-type]
 
 
 def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
@@ -173,18 +176,27 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
     channels = stored_as(torch.cat(planes, dim=1), photograph.depth)  # (H, W, S)
     with open_beside(path) as stream:
-        encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif)
+        encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif, photograph.extras)
 
 
-def encode(stream: BinaryIO, kind: str, channels: Pixels, alpha: bool, icc: bytes | None, exif: bytes | None) -> None:
+def encode(
+    stream: BinaryIO,
+    kind: str,
+    channels: Pixels,
+    alpha: bool,
+    icc: bytes | None,
+    exif: bytes | None,
+    extras: Extras,
+) -> None:
     """Write channels (H, W, S) of the stored dtype as an image file of a type in :data:`DEPTHS`."""
     channels = channels[..., 0] if channels.shape[2] == 1 else channels
     if kind == "TIFF":
-        tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif)
+        tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, extras.xmp, **extras.tags())
     elif channels.dtype == np.uint16:
-        stream.write(_encode_deep_png(channels, icc, exif))
+        stream.write(_encode_deep_png(channels, icc, exif, extras))
     else:
         options: dict[str, object] = {"icc_profile": icc, "exif": exif or b""} | ENCODING.get(kind, {})
+        options |= extras.options(kind)
         Image.fromarray(channels).save(stream, format=kind, **options)
 
 
@@ -385,8 +397,8 @@ def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
     return image.convert(modes[image.mode])
 
 
-def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None) -> bytes:
-    """A 16-bit PNG file, with profile and EXIF between header and pixels as the format requires."""
+def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None, extras: Extras) -> bytes:
+    """A 16-bit PNG file, with profile, EXIF and the rest between header and pixels as the format requires."""
     encoded = imagecodecs.png_encode(channels)
     start = 8 + 25  # signature and header chunk, of fixed length
     chunks = io.BytesIO()
@@ -394,4 +406,6 @@ def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None) ->
         PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(icc))
     if exif is not None:
         PngImagePlugin.putchunk(chunks, b"eXIf", exif.removeprefix(exif_tags.PREFIX))
+    for name, content in extras.chunks():
+        PngImagePlugin.putchunk(chunks, name, content)
     return bytes(encoded[:start]) + chunks.getvalue() + bytes(encoded[start:])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
+from nlfilter_torch.io.extras import NO_EXTRAS, Extras, read_extras
 from nlfilter_torch.io.photographs import (
     check_file,
     check_type,
@@ -35,6 +36,7 @@ from nlfilter_torch.tiled.sources import Rows, RowSource
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
+FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is done in tiles
 CODED = 8  # memory to decode or encode other formats, as a multiple of the picture's bytes
 
 
@@ -49,6 +51,7 @@ class StoredPicture:
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
         attributes: of a zarr array.
+        extras: XMP, and the resolution in print.
     """
 
     rows: RowSource
@@ -57,6 +60,7 @@ class StoredPicture:
     icc: bytes | None = None
     exif: bytes | None = None
     attributes: dict[str, Any] | None = None
+    extras: Extras = NO_EXTRAS
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -97,7 +101,9 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
             stored = _open_tiff(path, stack)
         else:
             channels, icc, exif = read_channels(path, bytes_per_pixel=CODED, memory=memory)
-            stored = StoredPicture(channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif)
+            stored = StoredPicture(
+                channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif, extras=read_extras(path)
+            )
         if stored.cached > memory:
             raise MemoryError(
                 f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but {memory / 1e6:.0f} MB may be "
@@ -136,12 +142,14 @@ def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> No
     with open_beside(path) as stream:
         if kind == "TIFF":
             values = (part for _, part in rows)
-            tiff.write_rows(stream, values, shape, dtype, like.alpha, like.icc, like.exif)
+            tiff.write_rows(
+                stream, values, shape, dtype, like.alpha, like.icc, like.exif, like.extras.xmp, **like.extras.tags()
+            )
         else:
             whole = np.empty(shape, dtype)
             for part, values_of_part in rows:
                 whole[part] = values_of_part
-            encode(stream, kind, whole, like.alpha, like.icc, like.exif)
+            encode(stream, kind, whole, like.alpha, like.icc, like.exif, like.extras)
 
 
 def free_memory() -> int:
@@ -149,11 +157,16 @@ def free_memory() -> int:
     return int(psutil.virtual_memory().available * 4 // 5)
 
 
+def modest_memory() -> int:
+    """What an edit takes without being asked: a fifth of the machine's memory, and no more than is free."""
+    return min(FIFTH, free_memory())
+
+
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     with tiff.decoding(path):
         rows = stack.enter_context(TiffRows(path))
     source: RowSource = _turn(rows, stack) if rows.turned else rows
-    return StoredPicture(source, rows.alpha, rows.cached, rows.icc, rows.exif)
+    return StoredPicture(source, rows.alpha, rows.cached, rows.icc, rows.exif, extras=read_extras(path))
 
 
 def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:

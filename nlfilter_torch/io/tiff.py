@@ -20,6 +20,7 @@ _DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)
 _ORIENTATION = int(ExifTags.Base.Orientation)
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
+XMP = 700  # tag
 TILE = 256  # side of the tiles that are written
 CLASSIC = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
@@ -110,6 +111,8 @@ def write_rows(
     alpha: bool,
     icc: bytes | None,
     exif: bytes | None,
+    xmp: bytes | None = None,
+    **resolution: Any,
 ) -> None:
     """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF."""
     height, width, samples = shape
@@ -126,7 +129,19 @@ def write_rows(
     big = height * width * samples * dtype.itemsize > CLASSIC
     # Compressing ahead in threads would queue hundreds of megabytes.
     options = {"tile": (TILE, TILE), "maxworkers": 1, "buffersize": TILE * TILE * samples * dtype.itemsize}
-    write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, bigtiff=big, **options)
+    write(
+        stream,
+        tiles(),
+        plain_shape,
+        dtype,
+        alpha,
+        icc,
+        None if big else exif,
+        xmp,
+        bigtiff=big,
+        **options,
+        **resolution,
+    )
 
 
 def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
@@ -154,6 +169,7 @@ def write(
     alpha: bool,
     icc: bytes | None,
     exif: bytes | None,
+    xmp: bytes | None = None,
     **options: Any,
 ) -> None:
     """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
@@ -163,11 +179,13 @@ def write(
     tags = Image.Exif()
     if exif is not None:
         tags.load(exif)
-    text = [
+    text: list[tuple[int, str, int, bytes, bool]] = [
         (code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True)  # as Pillow has decoded it
         for code in _DESCRIPTIVE
         if code in tags and code not in exif_tags.FOLDERS
     ]
+    if xmp is not None:
+        text.append((XMP, "B", len(xmp), xmp, True))
     folders = {code: folder for code in exif_tags.FOLDERS if (folder := tags.get_ifd(code))}
     # tifffile does not write nested tables, so a placeholder tag of the next lower number keeps each one's place.
     places = [(code - 1, "I", 1, 0, True) for code in folders]

@@ -1,0 +1,108 @@
+"""What an image file carries beside pixels, profile and EXIF: XMP and the resolution in print."""
+
+import math
+import re
+import struct
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tifffile
+from PIL import Image, PngImagePlugin
+
+from nlfilter_torch.io import tiff
+
+PNG_KEY = "XML:com.adobe.xmp"
+JPEG_LIMIT = 65_000  # bytes of XMP in a segment of a JPEG file; longer ones are left out there
+INCH, CENTIMETRE = 2, 3  # units of TIFF
+# Pixels are turned upright when they are read, and XMP may repeat the orientation that they had.
+ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[1-8]")
+
+
+@dataclass(frozen=True)
+class Extras:
+    """Data of a file to write back.
+
+    Attributes:
+        xmp: an XMP packet, or None.
+        dpi: pixels to the inch, horizontally and vertically, or None.
+    """
+
+    xmp: bytes | None = None
+    dpi: tuple[float, float] | None = None
+
+    def options(self, kind: str) -> dict[str, Any]:
+        """Options of Pillow to write them to a JPEG, WebP or PNG file."""
+        options: dict[str, Any] = {}
+        if self.dpi is not None and kind != "WebP":
+            options["dpi"] = self.dpi
+        if self.xmp is None or (kind == "JPEG" and len(self.xmp) > JPEG_LIMIT):
+            return options
+        if kind != "PNG":
+            return options | {"xmp": self.xmp}
+        info = PngImagePlugin.PngInfo()
+        info.add_itxt(PNG_KEY, self.xmp.decode("utf-8", "replace"))
+        return options | {"pnginfo": info}
+
+    def chunks(self) -> list[tuple[bytes, bytes]]:
+        """Chunks of a PNG file."""
+        found = []
+        if self.dpi is not None:
+            found.append((b"pHYs", struct.pack(">IIB", *(round(value / 0.0254) for value in self.dpi), 1)))
+        if self.xmp is not None:
+            found.append((b"iTXt", PNG_KEY.encode() + bytes(5) + self.xmp))
+        return found
+
+    def tags(self) -> dict[str, Any]:
+        """Options of tifffile, without those tags that are given beside others."""
+        return {} if self.dpi is None else {"resolution": self.dpi, "resolutionunit": INCH}
+
+
+NO_EXTRAS = Extras()
+
+
+def read_extras(path: Path) -> Extras:
+    """Those of an image file whose pixels can be read; fields without sense are dropped, as pixels do not need them."""
+    try:
+        return _read(path)
+    except Exception:  # decoders have no common base class for errors
+        return NO_EXTRAS
+
+
+def _read(path: Path) -> Extras:
+    with path.open("rb") as stream:
+        is_tiff = tiff.is_tiff(stream.read(4))
+    if is_tiff:
+        with tifffile.TiffFile(path) as file:
+            tags = file.pages.first.tags
+            values = {code: tags[code].value for code in (tiff.XMP, 282, 283, 296) if code in tags}
+        scale = {INCH: 1.0, CENTIMETRE: 2.54}.get(values.get(296, INCH))
+        pair = None if scale is None else tuple(_ratio(values.get(code)) * scale for code in (282, 283))
+        return Extras(_upright(values.get(tiff.XMP)), _sound(pair))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's, about sizes and damaged EXIF
+        with Image.open(path) as image:
+            xmp = image.info.get("xmp", image.info.get(PNG_KEY))
+            return Extras(_upright(xmp.encode() if isinstance(xmp, str) else xmp), _sound(image.info.get("dpi")))
+
+
+def _ratio(value: Any) -> float:
+    """A fraction of TIFF, or NaN."""
+    if isinstance(value, tuple) and len(value) == 2 and value[1]:
+        return float(value[0]) / float(value[1])
+    return math.nan
+
+
+def _sound(pair: Any) -> tuple[float, float] | None:
+    """Two positive numbers that files can hold, or None."""
+    try:
+        x, y = (float(value) for value in pair)
+    except (TypeError, ValueError):
+        return None
+    return (x, y) if all(1 <= value <= 60_000 for value in (x, y)) else None  # 1 without a unit is no resolution
+
+
+def _upright(xmp: Any) -> bytes | None:
+    """An XMP packet that says that the picture is upright."""
+    return ORIENTATION.sub(rb"\g<1>1", xmp) if isinstance(xmp, bytes) and xmp.strip() else None

@@ -1,0 +1,83 @@
+"""XMP and the resolution in print: carried from every file to every other, in memory and in tiles."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from nlfilter_torch.cli import main
+from nlfilter_torch.io.extras import JPEG_LIMIT, Extras, read_extras
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from tests.problems import cat
+
+XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description tiff:Orientation="6" xmp:Rating="4"/>'
+    b"<tiff:Orientation>3</tiff:Orientation></rdf:RDF></x:xmpmeta>"
+)
+UPRIGHT = XMP.replace(b'Orientation="6"', b'Orientation="1"').replace(b">3<", b">1<")
+EXTRAS = Extras(UPRIGHT, (240.0, 300.0))
+KINDS = [("a.jpg", "uint8"), ("a.png", "uint8"), ("a.png", "uint16"), ("a.tif", "uint16"), ("a.webp", "uint8")]
+
+
+def check(path: Path) -> None:
+    found = read_extras(path)
+    assert found.xmp == UPRIGHT
+    if path.suffix != ".webp":  # has no such field
+        assert found.dpi == pytest.approx((240, 300), abs=0.02)
+
+
+@pytest.mark.parametrize(("name", "depth"), KINDS)
+def test_files_hold_them(tmp_path: Path, name: str, depth: str) -> None:
+    path = tmp_path / name
+    write_photograph(Photograph(cat(4), depth, extras=EXTRAS), path)  # type: ignore[arg-type]
+    check(path)
+    with Image.open(path) as opened:  # as another program finds them
+        opened.load()
+    assert read_photograph(path).extras == read_extras(path)
+
+
+def test_what_other_programs_wrote(tmp_path: Path) -> None:
+    picture = Image.fromarray((cat(4)[0].permute(1, 2, 0).numpy() * 255).astype(np.uint8))
+    picture.save(tmp_path / "a.jpg", xmp=XMP, dpi=(240, 300))
+    check(tmp_path / "a.jpg")
+    for unit, factor in ((2, 1.0), (3, 2.54)):
+        resolution = (240 / factor, 300 / factor)
+        tag = [(700, "B", len(XMP), XMP, True)]
+        tifffile.imwrite(
+            tmp_path / "a.tif", np.asarray(picture), resolution=resolution, resolutionunit=unit, extratags=tag
+        )
+        check(tmp_path / "a.tif")
+    picture.save(tmp_path / "plain.png")
+    assert read_extras(tmp_path / "plain.png") == Extras()
+    tifffile.imwrite(tmp_path / "plain.tif", np.asarray(picture))
+    assert read_extras(tmp_path / "plain.tif") == Extras()
+
+
+@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.parametrize(("name", "depth"), [("in.tif", "uint16"), ("in.jpg", "uint8")])
+def test_commands_carry_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, depth: str, tiled: bool
+) -> None:
+    write_photograph(Photograph(cat(4), depth, extras=EXTRAS), tmp_path / name)  # type: ignore[arg-type]
+    if tiled:
+        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+    for out in ("out.tif", "out.png"):
+        assert main(["tone", str(tmp_path / name), str(tmp_path / out), "--landmarks", "20"]) == 0
+        check(tmp_path / out)
+
+
+def test_fields_without_sense_are_dropped(tmp_path: Path) -> None:
+    pixels = (cat(4)[0].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "a.tif", pixels, extratags=[(296, "s", 0, "inches", True), (700, "s", 0, "", True)])
+    assert read_extras(tmp_path / "a.tif") == Extras()
+    assert read_photograph(tmp_path / "a.tif").extras == Extras()
+
+
+def test_what_a_file_cannot_hold_is_left_out(tmp_path: Path) -> None:
+    long = Extras(b"<x>" + b" " * JPEG_LIMIT + b"</x>")
+    write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.jpg")
+    assert read_extras(tmp_path / "a.jpg") == Extras()
+    write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.png")
+    assert read_extras(tmp_path / "a.png").xmp == long.xmp
