@@ -30,7 +30,7 @@ from benchmarks.photographs import pictures
 from benchmarks.unsharp import gaussian
 from nlfilter_torch import enhance
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.colour import change_luminance, edit_luminance
+from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, edit_luminance
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.operator.features import reduce_channels
@@ -124,7 +124,12 @@ class Scene:
 def ours(image: Tensor) -> Strength:
     """The detail edit for any strength from one filter: before the limits it is linear in the sliders."""
     change = luminance(enhance(image, torch.tensor([2.0, 2.0, 2.0, 1.0]), limits="none")) - luminance(image)
-    return lambda strength: change_luminance(image, strength * change)
+
+    def edit(strength: float) -> Tensor:
+        moved = strength * change
+        return change_luminance(image, moved, balance=balance_in_memory(image, moved))
+
+    return edit
 
 
 def boosted(smooth: Callable[..., object]) -> Callable[[Tensor], Strength]:

@@ -219,7 +219,7 @@ def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: py
     wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
     assert torch.equal(preview.mask(Step("detail", (first,))), wanted[0])
     monkeypatch.setattr("nlfilter_torch.edits.source.nonlocal_operator", None)
-    assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=40)), wanted[1])
+    assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=400)), wanted[1])
     assert not torch.equal(preview.mask(Step("detail", (first, second), reach=0.9)), wanted[1])
     with pytest.raises(TypeError):
         preview.mask(Step("detail", (first, second), tolerance=20.0))

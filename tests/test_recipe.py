@@ -106,8 +106,9 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
 
     assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
     # The same sliders on both sides are those of the whole.
-    same = Recipe((DETAIL.changed(inside=ALPHA),)).apply(pixels)
-    assert torch.allclose(same, Recipe((Step("detail", alpha=ALPHA, bandwidth=30.0),)).apply(pixels), atol=1e-5)
+    same = Recipe((plain.changed(inside=ALPHA),)).apply(pixels)
+    whole = Step("detail", alpha=ALPHA, bandwidth=30.0, limits="none", threshold=0.0)
+    assert torch.allclose(same, Recipe((whole,)).apply(pixels), atol=1e-5)
 
 
 def test_colours(pixels: torch.Tensor) -> None:

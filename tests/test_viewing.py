@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.colour import change_luminance
+from nlfilter_torch.edits.colour import balance_in_memory, change_luminance
 from nlfilter_torch.edits.detail import held_back, split_sliders
 from nlfilter_torch.edits.resizing import resize, resized
 from nlfilter_torch.edits.viewing import viewed_size
@@ -28,23 +28,65 @@ EDITS: dict[str, Any] = {
 # --- limits
 
 
+def drawn(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images of 8 bits with channels at both ends, and large changes of their luminance."""
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.randint(0, 256, (2, 3, 40, 40), generator=generator).double() / 255
+    image[0, 0, :9], image[1, 1, :9] = 0.0, 1.0  # no room in one direction
+    return image, torch.randn(2, 1, 40, 40, generator=generator, dtype=torch.float64)
+
+
 def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
-    generator = torch.Generator().manual_seed(0)
-    image = torch.rand(2, 3, 20, 20, generator=generator, dtype=torch.float64)
-    image[0, 0], image[1, 1] = 0.0, 1.0  # no room in one direction
-    change = torch.randn(2, 1, 20, 20, generator=generator, dtype=torch.float64)
+    image, change = drawn()
+    for balance in (None, balance_in_memory(image, change)):
+        found = change_luminance(image, change, balance=balance)
+        levels = (255 * found).round()
+        assert not bool(((levels <= 0) & (image > 0)).any())  # no channel clips that did not before
+        assert not bool(((levels >= 255) & (image < 1)).any())
+        assert found.min() >= -1e-12
+        assert found.max() <= 1 + 1e-12
     found = change_luminance(image, change)
-    assert found.min() >= -1e-6
-    assert found.max() <= 1 + 1e-6
-    assert bool(((found - image) * change >= -1e-12).all())  # in the direction of the change
-    assert bool(((found - image).abs() <= change.abs() + 1e-12).all())
-    room = torch.where(change > 0, 1 - image, image).clamp(min=1e-6)
-    expected = 0.9 * room * (1 - torch.exp(-change.abs() / (0.9 * room)))
-    torch.testing.assert_close((found - image).abs(), expected, atol=1e-6, rtol=0)
+    moved = luminance(found) - luminance(image)
+    assert bool((moved * change >= -1e-12).all())
+    assert bool((moved.abs() <= change.abs() + 1e-12).all())
+    before, after = (x - luminance(x) for x in (image, found))
+    assert bool((torch.linalg.cross(before, after, dim=1).abs() < 1e-7).all())  # hues are kept
+    assert bool((after.norm(dim=1) <= before.norm(dim=1) + 1e-6).all())
     middle = torch.full((1, 3, 4, 4), 0.5, dtype=torch.float64)
     torch.testing.assert_close(change_luminance(middle, middle[:, :1] * 0.002), middle + 0.001, atol=2e-6, rtol=0)
-    assert torch.equal(change_luminance(image, torch.zeros_like(change)), image)
+    still = torch.zeros_like(change)
+    assert torch.equal(change_luminance(image, still), image)
+    assert torch.equal(change_luminance(image, still, balance=balance_in_memory(image, still)), image)
     assert torch.equal(change_luminance(image, change, "none"), image + change)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_balance_keeps_mean_brightness_and_chroma(channels: int) -> None:
+    image, change = drawn()
+    image, change = 0.1 + 0.5 * image[:, :channels], 0.2 * change
+
+    def means(x: torch.Tensor) -> torch.Tensor:
+        grey = luminance(x) if channels == 3 else x
+        return torch.stack([grey.mean((1, 2, 3)), (x - grey).norm(dim=1).mean((1, 2))])
+
+    alone = means(change_luminance(image, change))
+    assert (alone[0] - means(image)[0]).abs().min() > 0.004
+    for brighter in (0.0, 0.05):
+        balance = balance_in_memory(image, change, brighter)
+        found = means(change_luminance(image, change, balance=balance))
+        torch.testing.assert_close(found[0], (1 + brighter) * means(image)[0], atol=2e-6, rtol=0)
+        torch.testing.assert_close(found[1], means(image)[1], atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_edits_keep_mean_brightness_and_chroma(name: str) -> None:
+    image = colour("astronaut", 60, 80)
+    for size in (0.0025, 0):
+        found = EDITS[name](image, viewing_size=size)
+        assert (luminance(found) - luminance(image)).mean().abs() < (1 / 255 if size else 1e-5)
+        assert (
+            (found - luminance(found)).norm(dim=1).mean() / (image - luminance(image)).norm(dim=1).mean() - 1
+        ) < 0.02
 
 
 def test_limits_have_exact_gradients() -> None:
@@ -69,7 +111,9 @@ def test_soft_limits_do_not_clip_and_none_is_the_plain_sum(name: str) -> None:
     assert hard.max() > 1
     chroma = [x - luminance(x) for x in (hard, image)]
     torch.testing.assert_close(chroma[0], chroma[1], atol=1e-5, rtol=0)  # the change is the same in all channels
-    torch.testing.assert_close(change_luminance(image, luminance(hard) - luminance(image)), soft, atol=1e-5, rtol=0)
+    change = luminance(hard) - luminance(image)
+    limited = change_luminance(image, change, balance=balance_in_memory(image, change))
+    torch.testing.assert_close(limited, soft, atol=1e-5, rtol=0)
     with pytest.raises(ValueError, match="limits must be one of 'soft', 'none', got 'hard'"):
         EDITS[name](image, limits="hard")
 

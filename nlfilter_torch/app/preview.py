@@ -18,10 +18,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared, viewed_stride
-from nlfilter_torch.edits.colour import change_luminance, nearby_or_far
+from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, nearby_or_far
 from nlfilter_torch.edits.detail import activity, held_back, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
-from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
@@ -95,7 +95,7 @@ class Preview:
         self.pixels = reduce(photograph.float(), self.stride)
         self._layers: Layers | None = None
         self._source = InMemory(self.pixels, {})  # with the filter of the masks
-        self._tolerance: float | None = None  # of that filter
+        self._compared_by: Key = ()  # the settings of that filter
         self._mask: tuple[Key, Tensor] | None = None
         self._active: tuple[int, Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
@@ -155,10 +155,11 @@ class Preview:
         """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""
         if not detail.has_region():
             return None
-        key = (detail.strokes, detail["reach"], detail["tolerance"])
+        key = (detail.strokes, detail["reach"], detail["tolerance"], detail["landmarks"])
         if self._mask is None or self._mask[0] != key:
-            if detail["tolerance"] != self._tolerance:
-                self._source, self._tolerance = InMemory(self.pixels, {}), detail["tolerance"]
+            fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
+            if (detail["tolerance"], fewer) != self._compared_by:
+                self._source, self._compared_by = InMemory(self.pixels, {}), (detail["tolerance"], fewer)
             (inner,), others = scribbles_of(detail, self.size)
             names = ("mask_bandwidth", "reach")
             bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
@@ -169,6 +170,7 @@ class Preview:
                 names=("regions", "negative"),
                 photometric_bandwidth=bandwidth,
                 reach=reach,
+                num_landmarks=fewer,
                 generator=seeded(),
             )
             self._mask = (key, self._source.all(fitted))
@@ -210,7 +212,9 @@ class Preview:
         if mask is not None:
             found = torch.lerp(found, changes(detail.sliders_inside), mask)
         change = held_back(found, self._activity(detail), detail["threshold"] / 255)
-        return change_luminance(self.pixels, change, detail["limits"])
+        alone = detail["limits"] == "none" or mask is not None
+        balance = None if alone else balance_in_memory(self.pixels, change, detail["alpha"][-1] - 1)
+        return change_luminance(self.pixels, change, detail["limits"], balance)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""

@@ -16,7 +16,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import Limits, nearby_or_far
 from nlfilter_torch.edits.mask import select_regions
-from nlfilter_torch.edits.parameters import DETAIL, FILTER
+from nlfilter_torch.edits.parameters import DETAIL, FILTER, MASK
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import fit_change
@@ -71,7 +71,7 @@ def enhance(
         photometric_bandwidth: h_y of the filter, or ``"auto"``.
         spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares spots
             however far apart they are, so that shading is detail, too.
-        num_landmarks: M of the filter; a spatial term needs more.
+        num_landmarks: M of the filter, a spatial term needs more; the masks have as many, but not more than 100.
         **options: further ones of :func:`nonlocal_operator`, for the filter; ``generator`` holds for the masks as well.
 
     Returns:
@@ -165,7 +165,8 @@ def fit_detail(
             "spatial_bandwidth": nearness,
             "num_landmarks": num_landmarks,
         }
-        compared = {"photometric_bandwidth": mask_bandwidth, "reach": reach}
+        fewer = min(num_landmarks, MASK.defaults["num_landmarks"])
+        compared: dict[str, Any] = {"photometric_bandwidth": mask_bandwidth, "reach": reach, "num_landmarks": fewer}
         if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
             compared["generator"] = options["generator"].clone_state()
         operator = viewed.operator(Guide(filter_options, exact=residual is not None))
@@ -197,7 +198,11 @@ def fit_detail(
 
         return Fitted(blended, limited, CALM_MARGIN)
 
-    return fit_change(source, change, planes, viewing_size, limits)
+    # W keeps means: only the last slider changes that of the picture.
+    brighter = (
+        None if regions is not None or alpha.ndim == 4 else sliders[..., -1].to(source.dtype).reshape(-1, 1, 1, 1)
+    )
+    return fit_change(source, change, planes, viewing_size, limits, brighter=brighter)
 
 
 def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:

@@ -100,9 +100,11 @@ def filter_frames(
 
         return Fitted(of, lambda image, found: held_back(found, activity(image), threshold))
 
+    brighter = float(alpha[-1]) - 1
+
     def edit(frame: Tensor) -> Tensor:
         check_image(frame, "frames")
         source = InMemory(frame.to(working_dtype(frame)))
-        return source.all(fit_change(source, change, planes, viewing_size, limits)).to(frame.dtype)
+        return source.all(fit_change(source, change, planes, viewing_size, limits, brighter=brighter)).to(frame.dtype)
 
     return map(edit, frames)

@@ -152,6 +152,12 @@ class Source(Protocol):
     def all(self, fitted: "Fitted") -> Tensor:
         """The planes (B, C, H, W) that an edit makes of all pixels, for pictures that are small enough."""
 
+    def held(self, fitted: "Fitted") -> "Fitted":
+        """An edit with the planes that it makes worked out, if there is room for them."""
+
+    def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means (B, S, 1, 1) of the planes (B, S, h, W) that a function makes of pixels and of what an edit makes."""
+
     def regions(self, masks: Any, name: str) -> list[Scribbles]:
         """Scribbles of several regions, one after the other, each as :meth:`scribbles` has them."""
 
@@ -255,6 +261,15 @@ class InMemory:
         """All pixels under an edit."""
         planes = fitted.pixels(self)
         return planes if fitted.finish is None else fitted.finish(self.image, planes)
+
+    def held(self, fitted: "Fitted") -> "Fitted":
+        """With the planes of all pixels."""
+        planes = self.all(fitted)
+        return Fitted(lambda _: planes)
+
+    def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means over all pixels."""
+        return function(self.image, self.all(fitted)).mean((2, 3), keepdim=True)
 
     def colours(self, places: Tensor) -> Tensor:
         """Some pixels."""

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.colour import Limits, change_luminance
+from nlfilter_torch.edits.colour import Balance, Limits, balance_of, change_luminance, limited_change, move_luminance
 from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.operator.features import pad_border
@@ -51,9 +51,21 @@ class Reducible(Protocol):
     def resized(self, size: tuple[int, int]) -> Any:
         """The picture in a smaller size."""
 
+    def held(self, fitted: Fitted) -> Fitted:
+        """An edit with the planes that it makes worked out, if there is room for them."""
+
+    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means (B, S, 1, 1) of what a function makes of the picture and of the planes of an edit."""
+
 
 def fit_change(
-    source: Reducible, change: Callable[[Any], Fitted], planes: Planes, size: float, limits: Limits
+    source: Reducible,
+    change: Callable[[Any], Fitted],
+    planes: Planes,
+    size: float,
+    limits: Limits,
+    *,
+    brighter: float | Tensor | None = 0.0,
 ) -> Fitted:
     """An edit of a picture from a change of its brightness at the viewing size.
 
@@ -63,31 +75,48 @@ def fit_change(
         planes: what is changed, luminance or all channels.
         size: the viewing size in megapixels; 0 is that of the picture.
         limits: of :func:`change_luminance`.
+        brighter: by what share the change is meant to raise the mean brightness, which is otherwise kept; None leaves
+            it, and chroma, to the limits.
     """
+
+    def balanced(of: Any, fitted: Fitted) -> tuple[Fitted, Balance | None]:
+        if limits == "none" or brighter is None:
+            return fitted, None
+        held = of.held(fitted)
+        return held, balance_of(lambda function: of.mean_of(held, function), brighter)
+
     small = viewed_size(source.size, size)
     if small == source.size:
-        fitted = change(source)
+        fitted, balance = balanced(source, change(source))
         if fitted.finish is None:
-            return Fitted(lambda pixels: change_luminance(pixels.image, fitted.pixels(pixels), limits))
+            return Fitted(lambda pixels: change_luminance(pixels.image, fitted.pixels(pixels), limits, balance))
         finish = fitted.finish
         return Fitted(
             fitted.pixels,
-            lambda image, found: change_luminance(image, finish(image, found), limits),
+            lambda image, found: change_luminance(image, finish(image, found), limits, balance),
             fitted.margin,
             fitted.step,
         )
     reduced = source.resized(small)
-    before = reduced.all(Fitted(planes))
-    after = reduced.all(change(reduced))
-    coarse = torch.cat([before, after, slope(before, after)], dim=1)
+    fitted, balance = balanced(reduced, change(reduced))
+    before, after = reduced.all(Fitted(planes)), reduced.all(fitted)
+    saturation = None
+    if limits == "soft":
+        image = reduced.all(Fitted(lambda pixels: pixels.image))
+        after, saturation = limited_change(image, after, balance)
+    parts = [before, after, slope(before, after), *([] if saturation is None else [saturation])]
+    coarse = torch.cat(parts, dim=1)
     width, count = source.size[1], before.shape[1]
 
     def edit(pixels: Pixels) -> Tensor:
         first = pixels.first // width
         rows = range(first, first + pixels.image.shape[2])
         found = resized(lambda start, stop: coarse[:, :, start:stop], small, source.size, rows)
-        blurred, changed, steepness = found.split(count, dim=1)
-        return change_luminance(pixels.image, changed + steepness * (planes(pixels) - blurred), limits)
+        blurred, changed, steepness = found[:, : 3 * count].chunk(3, dim=1)
+        moved = changed + steepness * (planes(pixels) - blurred)
+        if limits == "none":
+            return pixels.image + moved
+        return move_luminance(pixels.image, moved, None if saturation is None else found[:, 3 * count :])
 
     return Fitted(edit)
 

@@ -13,7 +13,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.resizing import resized
-from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Planes, block_means
+from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
@@ -22,6 +22,7 @@ from nlfilter_torch.tiled.scribbles import RegionRows, check_room, floats_of_scr
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
 
+HELD = 1 / 16  # of the memory that planes may take which an edit needs again
 FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
 
 
@@ -158,8 +159,7 @@ class Tiled:
             return self.picture.tile(start, stop, 0).pixels
 
         planes = resized(read, self.size, size)[0].permute(1, 2, 0).numpy()
-        kind = "float32" if self.dtype == torch.float32 else "float64"
-        passes = replace(self.passes, kind=kind, tile_rows=None)
+        passes = replace(self.plain, tile_rows=None)
         return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
 
     @torch.no_grad()
@@ -182,8 +182,30 @@ class Tiled:
 
     def all(self, fitted: Fitted) -> Tensor:
         """The planes (1, C, H, W) that an edit makes of all pixels."""
-        rows = np.concatenate([values for _, values in self.rows(fitted)])
+        rows = np.concatenate([values for _, values in self.rows(fitted, plain=True)])
         return torch.from_numpy(rows).permute(2, 0, 1)[None]
+
+    def held(self, fitted: Fitted) -> Fitted:
+        """With its planes in memory, if they take a small part of it; else they are worked out as often as needed."""
+        if self.picture.pixels * self.channels * self.dtype.itemsize > HELD * self.passes.memory:
+            return fitted
+        planes, width = self.all(fitted), self.size[1]
+
+        def part(pixels: Pixels) -> Tensor:
+            first = pixels.first // width
+            return planes[:, :, first : first + pixels.image.shape[2]]
+
+        return Fitted(part)
+
+    @torch.no_grad()
+    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means over all pixels, with a pass over the picture."""
+        total: Tensor | float = 0.0
+        for part, values in self.rows(fitted, plain=True):
+            image = self.picture.tile(part.start, part.stop, 0).pixels
+            planes = torch.from_numpy(values).permute(2, 0, 1)[None].to(image)
+            total = total + function(image, planes).double().sum((2, 3), keepdim=True)
+        return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
 
     @torch.no_grad()
     def mean(self, planes: Planes) -> Tensor:
@@ -273,13 +295,20 @@ class Tiled:
         """How many rows around a tile its columns depend on."""
         return max((operator.margin for operator in self.operators), default=0)
 
-    def rows(self, fitted: Fitted, folder: Path | None = None) -> Rows:
+    @property
+    def plain(self) -> Passes:
+        """How it is read where the output is numbers as they are computed."""
+        return replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
+
+    def rows(self, fitted: Fitted, folder: Path | None = None, *, plain: bool = False) -> Rows:
         """The rows (h, W, S) of the picture under an edit, in order.
 
         Args:
             fitted: to this source.
             folder: with room for planes that an edit makes before it finishes them; None is the system's.
+            plain: whether they are numbers as they are computed, without transparency.
         """
+        passes = self.plain if plain else self.passes
         landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
         rows = self.passes.tile_rows or (self.room(0, landmarks) if self.operators else TILE_PIXELS // self.size[1])
         together, workers = self.passes.rows_together(self.size[1]), self.passes.workers(landmarks)
@@ -287,13 +316,17 @@ class Tiled:
         for operator in self.operators:
             operator.settle()  # before several tiles at once need it
         if fitted.finish is None:
-            yield from self.passes.work_out(
-                self.picture, lambda tile: self.edited(fitted, tile), self.margin, rows, workers=workers
+            yield from passes.work_out(
+                self.picture,
+                lambda tile: self.edited(fitted, tile),
+                self.margin,
+                rows,
+                workers=workers,
+                transparent=not plain,
             )
             return
         finish, margin = fitted.finish, fitted.margin
-        plain = replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
-        before = plain.work_out(
+        before = self.plain.work_out(
             self.picture,
             lambda tile: self.edited(fitted, tile),
             self.margin,
@@ -310,7 +343,8 @@ class Tiled:
                 found = finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels)
                 return found[..., tile.halo[0] : found.shape[2] - tile.halo[1], :]
 
-            yield from self.passes.work_out(self.picture, finished, margin, self._rows_to_finish(fitted, rows))
+            rows = self._rows_to_finish(fitted, rows)
+            yield from passes.work_out(self.picture, finished, margin, rows, transparent=not plain)
 
     def _rows_to_finish(self, fitted: Fitted, rows: int) -> int:
         """Rows of a tile that is finished: its margins, several times if none were asked for, as far as memory allows.
