@@ -10,6 +10,7 @@ import torch
 from nlfilter_torch import nonlocal_operator, region_mask
 from nlfilter_torch.edits import mask as masks
 from nlfilter_torch.edits import matting
+from nlfilter_torch.edits.resizing import enlarged
 from nlfilter_torch.edits.source import InMemory, InMemoryOperator
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.source import Tiled
@@ -191,6 +192,17 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
     found = matting.linear_mask(image - 0.5, functions[:, 0])
     stretched = (smooth @ expected.clip(0, 1) - matting.DOUBT) / (1 - 2 * matting.DOUBT)
     np.testing.assert_allclose(found.flatten(), stretched, atol=1e-5)
+
+
+@pytest.mark.parametrize("step", [1, 3])
+def test_rows_of_enlarged_blocks_are_those_of_the_whole(step: int) -> None:
+    blocks = noise(1, 2, 7, 5)
+    whole = enlarged(blocks, step, 0, (7 * step - step // 2, 5 * step - step // 2))
+    for first, count in ((0, 4), (3, 3), (5, 2 * step)):
+        rows = enlarged(blocks, step, first, (count, whole.shape[3]))
+        torch.testing.assert_close(rows, whole[:, :, first : first + count][:, :, : rows.shape[2]])
+    middles = whole[:, :, step // 2 :: step, step // 2 :: step]
+    torch.testing.assert_close(middles, blocks[:, :, : middles.shape[2], : middles.shape[3]])
 
 
 def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypatch: pytest.MonkeyPatch) -> None:
