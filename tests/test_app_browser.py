@@ -273,6 +273,8 @@ def test_layout_on_every_screen(browser: Browser, editor: Editor, folder: Path, 
     assert save is not None
     assert panel is not None
     assert save["x"] + save["width"] <= width
+    assert save["y"] >= 0
+    assert (36 if width < 1000 else 30) <= save["height"] <= 52  # large enough for a finger, and not cut off
     assert photo["width"] * photo["height"] > 0.15 * width * height
     assert panel["y"] >= photo["y"] + photo["height"] or panel["x"] >= photo["x"] + photo["width"]  # beside it
     if not phone:

@@ -88,7 +88,7 @@ class Editor:
             ui.label("nlfilter-torch").classes("text-weight-medium text-body1 wide")
             self._title = ui.label("").classes("hint q-ml-sm ellipsis title")
             ui.space()
-            with ui.row().classes("items-center gap-2 no-wrap") as self._working:
+            with ui.row().classes("items-center gap-2 no-wrap working") as self._working:
                 ui.spinner(size="20px", color="white")
                 self._doing = ui.label("").classes("hint")
             self._working.set_visibility(False)

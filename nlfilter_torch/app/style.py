@@ -47,11 +47,14 @@ body { background: #17181b; }
 .handle { display: none; }
 .bar { width: 100%; color: #b9bcc4; gap: 14px; flex-wrap: nowrap; align-items: center; }
 @media (max-width: 1100px) {
-  .topbar .q-btn .block, .topbar .wide { display: none !important; }
+  .topbar .wide { display: none; }
+  .topbar .q-btn .block { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }
   .topbar .q-btn .on-left { margin-right: 0; }
   .topbar { gap: 2px; padding: 0 8px; }
   .topbar .q-btn { min-width: 40px; min-height: 40px; }
   .bar .wide { display: none; }
+  .bar { padding-left: 12px; }
+  .working { position: fixed; top: 58px; left: 10px; background: #000c; padding: 4px 10px; border-radius: 14px; }
   .panel { width: 300px; flex-wrap: nowrap; }
   .panel > * { flex: none; }
   .viewer { padding: 10px 10px 6px; }

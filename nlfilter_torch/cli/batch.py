@@ -97,7 +97,7 @@ def batch(
         count = min(workers or cores, len(share)) or 1
         room = shared / (count * ranks.local) / 1e9
         try:
-            with steps(len(share)) as begin:
+            with steps(len(share), lines=False) as begin:  # files that fail are told by lines
                 edit_folder(
                     share,
                     target,

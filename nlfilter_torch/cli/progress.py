@@ -36,8 +36,9 @@ def _lines(wanted: bool) -> Iterator[progress.Progress]:
 
     def tell() -> None:
         while not ended.wait(PAUSE):
-            sys.stderr.write(f"nlfilter-torch: {current}\n")
-            sys.stderr.flush()
+            if text := str(current):
+                sys.stderr.write(f"{text}\n")
+                sys.stderr.flush()
 
     thread = threading.Thread(target=tell, daemon=True)
     if wanted:
@@ -51,15 +52,18 @@ def _lines(wanted: bool) -> Iterator[progress.Progress]:
 
 
 @contextmanager
-def steps(total: int) -> Iterator[Callable[[str], None]]:
-    """A bar of ``total`` steps; yields a function that begins the step of a name and ends the one before."""
+def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
+    """A bar of ``total`` steps; yields a function that begins the step of a name and ends the one before.
+
+    Without ``lines`` nothing is printed where there is no terminal.
+    """
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with _bar(*columns) as bar, _lines(bar.disable) as lines:
+    with _bar(*columns) as bar, _lines(bar.disable and lines) as current:
         task = bar.add_task("", total=total, completed=-1)
 
         def begin(name: str) -> None:
             bar.update(task, description=name, advance=1)
-            lines.begin(name)
+            current.begin(name)
 
         yield begin
 

@@ -1,16 +1,22 @@
 """What an image file carries beside pixels, profile and EXIF: XMP and the resolution in print."""
 
+import io
 import math
 import re
 import struct
 import warnings
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
+import numpy as np
 import tifffile
+from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
+from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
 
 PNG_KEY = "XML:com.adobe.xmp"
@@ -106,3 +112,17 @@ def _sound(pair: Any) -> tuple[float, float] | None:
 def _upright(xmp: Any) -> bytes | None:
     """An XMP packet that says that the picture is upright."""
     return ORIENTATION.sub(rb"\g<1>1", xmp) if isinstance(xmp, bytes) and xmp.strip() else None
+
+
+def encode_deep_png(channels: NDArray[np.generic], icc: bytes | None, exif: bytes | None, extras: Extras) -> bytes:
+    """A 16-bit PNG file, with profile, EXIF and the rest between header and pixels as the format requires."""
+    encoded = imagecodecs.png_encode(channels)
+    start = 8 + 25  # signature and header chunk, of fixed length
+    chunks = io.BytesIO()
+    if icc is not None:
+        PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(icc))
+    if exif is not None:
+        PngImagePlugin.putchunk(chunks, b"eXIf", exif.removeprefix(exif_tags.PREFIX))
+    for name, content in extras.chunks():
+        PngImagePlugin.putchunk(chunks, name, content)
+    return bytes(encoded[:start]) + chunks.getvalue() + bytes(encoded[start:])

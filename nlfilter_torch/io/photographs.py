@@ -3,7 +3,6 @@
 Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil); nothing else in the package imports this module.
 """
 
-import io
 import os
 import re
 import secrets
@@ -11,7 +10,6 @@ import shutil
 import sys
 import time
 import warnings
-import zlib
 from collections.abc import Callable, Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -28,7 +26,7 @@ from torch import Tensor
 
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
-from nlfilter_torch.io.extras import NO_EXTRAS, Extras, read_extras
+from nlfilter_torch.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
 from nlfilter_torch.tiled.sources import Picture, stored_as
 
 if sys.platform != "win32":
@@ -193,7 +191,7 @@ def encode(
     if kind == "TIFF":
         tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, extras.xmp, **extras.tags())
     elif channels.dtype == np.uint16:
-        stream.write(_encode_deep_png(channels, icc, exif, extras))
+        stream.write(encode_deep_png(channels, icc, exif, extras))
     else:
         options: dict[str, object] = {"icc_profile": icc, "exif": exif or b""} | ENCODING.get(kind, {})
         options |= extras.options(kind)
@@ -395,17 +393,3 @@ def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
         raise tiff.UnhandledImage(sentence)
     image.load()
     return image.convert(modes[image.mode])
-
-
-def _encode_deep_png(channels: Pixels, icc: bytes | None, exif: bytes | None, extras: Extras) -> bytes:
-    """A 16-bit PNG file, with profile, EXIF and the rest between header and pixels as the format requires."""
-    encoded = imagecodecs.png_encode(channels)
-    start = 8 + 25  # signature and header chunk, of fixed length
-    chunks = io.BytesIO()
-    if icc is not None:
-        PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(icc))
-    if exif is not None:
-        PngImagePlugin.putchunk(chunks, b"eXIf", exif.removeprefix(exif_tags.PREFIX))
-    for name, content in extras.chunks():
-        PngImagePlugin.putchunk(chunks, name, content)
-    return bytes(encoded[:start]) + chunks.getvalue() + bytes(encoded[start:])
