@@ -65,8 +65,8 @@ class Plan:
     seconds: float = 2.0
     claimed_seconds: float = 20.0
     least: int = 3
-    pair_seconds: float = 6.0
-    pairs: int = 5
+    pair_seconds: float = 5.0
+    pairs: int = 3
     pause: float = 3.0
     processes: int = 5
     probes: int = 5
