@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels import columns, definitions_only, grams, tall_skinny
 from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
+from nlfilter_torch.operator import opaque  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
@@ -39,6 +40,8 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "gram": (factor, weights),
         "pivots": (features, torch.linspace(0.1, 0.9, LANDMARKS, dtype=dtype), 1e-4),
         "lloyd": (features, landmarks, 3, 1e-6),
+        "choose": (features, 1, PIXELS, LANDMARKS, "kmeans"),
+        "settle": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
 
 

@@ -3,6 +3,8 @@
 import io
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -18,8 +20,12 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
+from nlfilter_torch.operator.balancing import Rounds, balance, balance_in_rounds
+from nlfilter_torch.operator.landmarks import choose_landmarks
+from nlfilter_torch.operator.opaque import balance_in_graph, choose_in_graph
+from nlfilter_torch.operator.scaling import Balancing
 from tests.layers import ALPHA, EVERYTHING, OPTIONS, image
-from tests.problems import noise
+from tests.problems import noise, picture
 
 
 def compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -53,18 +59,92 @@ def test_compiled_layer_gives_the_same(learn: tuple[str, ...]) -> None:
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4 * theirs.abs().max().item())
 
 
-def test_compiled_layer_breaks_where_the_operator_is_built_and_nowhere_else() -> None:
-    from torch._dynamo.utils import counters
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
+def test_the_whole_layer_compiles_as_one_graph() -> None:
+    learn = tuple(name for name in EVERYTHING if name != "residual")  # a spectrum has a graph of its own
+    layer = NonlocalFilter(
+        ALPHA, learn=learn, photometric_bandwidth=0.2, spatial_bandwidth=9.0, num_landmarks=20, guide_channels="all"
+    )
+    torch.compiler.reset()
+    fast = torch.compile(layer, backend="aot_eager", fullgraph=True)
+    picture = image().requires_grad_()
+    expected, found = layer(picture), fast(picture)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    gradients = [torch.autograd.grad(y.square().mean(), [picture, *layer.parameters()]) for y in (found, expected)]
+    for ours, theirs in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5 * theirs.abs().max().item())
+    torch.testing.assert_close(fast(image(1)), layer(image(1)), atol=1e-5, rtol=0)
 
+
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
+def test_a_generator_keeps_building_out_of_the_graph() -> None:
+    def landmarks(guide: Tensor) -> Tensor:
+        options = OPTIONS | {"generator": torch.Generator().manual_seed(5)}
+        return nonlocal_operator(guide, **options).kernel.landmarks
+
+    torch.testing.assert_close(compiled(landmarks)(image()), landmarks(image()), atol=0, rtol=0)
+    assert not torch.equal(landmarks(image()), nonlocal_operator(image(), **OPTIONS).kernel.landmarks)
+
+
+@pytest.mark.slow
+def test_export_of_a_layer_that_builds_its_operator() -> None:
     layer = NonlocalFilter(ALPHA, **OPTIONS)
-    fast = compiled(layer)
-    counters.clear()
-    fast(image())
-    disabled = [reason for reason in counters["graph_break"] if "Skip calling" in reason]
-    others = [reason for reason in counters["graph_break"] if "disable" not in reason]
-    assert len(disabled) == 1
-    assert "nonlocal_operator" in disabled[0]
-    assert not others
+    sizes = {"image": {0: torch.export.Dim("images", min=1, max=64)}}
+    program = torch.export.export(layer, (image(batch=2),), dynamic_shapes=sizes)
+    stream = io.BytesIO()
+    torch.export.save(program, stream)
+    stream.seek(0)
+    loaded = torch.export.load(stream).module()
+    for batch in (1, 2, 5):
+        torch.testing.assert_close(loaded(image(3, batch)), layer(image(3, batch)), atol=1e-5, rtol=0)
+
+
+# --- what a graph calls as a whole
+
+
+def lonely() -> tuple[Tensor, Tensor]:
+    """A kernel (1, 3, 6) with negative affinities, and its diagonal: its last pixel resembles no other."""
+    factor = torch.tensor([[[1.0, 0.9, 0.8, 0.9, 0.7, -0.6], [0, 0.3, 0.4, 0.1, 0.5, 0.1], [0, 0.1, 0.2, 0.3, 0, 0.2]]])
+    return factor, (1 - factor.square().sum(1)).clamp(min=0)
+
+
+@pytest.mark.parametrize("completed", [True, False])
+def test_balancing_in_a_graph_is_that_without_one(completed: bool) -> None:
+    found = []
+    for in_graph in (False, True):
+        factor, diagonal = (tensor.clone().requires_grad_() for tensor in lonely())
+        if in_graph:
+            kept, rest, result, before = balance_in_graph(factor, diagonal, 1e-5, completed, False)
+            rounds = Rounds.MOST - sum(torch.equal(total, result.moment) for total in before)
+        else:
+
+            def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Balancing, float]:
+                return balance(factor, diagonal, completed=completed), 1e-5
+
+            whole = balance_in_rounds(factor, diagonal, balanced, completed=completed)
+            kept, rest, result, rounds = whole.factor, whole.diagonal, whole.found, len(whole.before)
+        gradients = torch.autograd.grad((result.scaling * kept[:, 0] + rest).square().sum(), [factor, diagonal])
+        found.append((kept, rest, result.scaling, result.moment, result.residual, *gradients, torch.tensor(rounds)))
+    assert int(found[0][-1]) == completed  # the lonely pixel is removed in one round
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("sampling", ["kmeans", "uniform", "random"])
+def test_landmarks_in_a_graph_are_those_without_one(sampling: Any) -> None:
+    features = noise(2, 3, 2000, dtype=torch.float32)
+    expected = choose_landmarks(features, (40, 50), 20, sampling, None)
+    torch.testing.assert_close(choose_in_graph(features, (40, 50), 20, sampling), expected, atol=0, rtol=0)
+    assert choose_in_graph(features, (40, 50), 2000, sampling) is features
+
+
+def test_eigenvalues_above_one_in_a_graph_are_warned_of() -> None:
+    guide = picture("camera", 40, 40)
+    operator = nonlocal_operator(guide, spatial_bandwidth=3.0, num_landmarks=50, landmarks="random")
+    unlimited = replace(operator.kernel, limiter=None).factor(operator.kernel.recipe(guide))
+    with pytest.warns(UserWarning, match="eigenvalues exceed 1, which compiled programs do not correct"):
+        balance_in_graph(*unlimited, 1e-5, True, True)
 
 
 def test_importing_and_running_does_not_load_the_compiler() -> None:

@@ -71,3 +71,20 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return wrapper
+
+
+def uncompiled_with(*options: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Run a function as :func:`uncompiled` does if one of these keyword arguments is given and not None."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        whole = uncompiled(function)
+
+        @functools.wraps(function)
+        def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+            if torch.compiler.is_compiling() and any(kwargs.get(name) is not None for name in options):
+                return whole(*args, **kwargs)
+            return function(*args, **kwargs)
+
+        return wrapper
+
+    return decorate

@@ -32,6 +32,8 @@ def refuse_transforms(name: str, *values: object) -> None:
         name: of the first of the values.
         *values: what derivatives may be wanted of, tensors or not.
     """
+    if torch.compiler.is_compiling():
+        return
     # Reading these three takes less than a microsecond.
     if torch._C._is_tracing():
         raise TypeError(

@@ -10,8 +10,9 @@ barely converges. The paper's method (``completion="none"``), whose affinities m
 large, is balanced this way.
 """
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,7 +24,9 @@ from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
 from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator import newton
-from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, Solution
+from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, Solution, isolated
+
+Found = TypeVar("Found", bound=Balancing)
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 # Larger residuals raise a warning, unless the tolerance allows them.
@@ -101,11 +104,7 @@ class _Balance(torch.autograd.Function):
         among: Communicator,
         weights: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, int]:
-        matrix = KernelMatrix(factor, diagonal, weights, among)
-        found = newton.solve(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
-        goal = attainable(factor, tolerance, among)
-        if not is_hidden(factor) and not bool((found.residual <= goal).all()):
-            found = newton.damped(matrix, found, goal)
+        found = solve(KernelMatrix(factor, diagonal, weights, among), tolerance, completed)
         ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
         ctx.among, ctx.completed = among, completed
         ctx.mark_non_differentiable(found.moment, found.residual)
@@ -114,20 +113,86 @@ class _Balance(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        factor, diagonal, scaling, total, inverse, weights = ctx.saved_tensors
-        dtype = factor.dtype
-        if not ctx.completed:  # d may be 1e25 without completion, its square too large for float32
-            factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
-        share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
-        weight = scaling.square() * share
-        matrix = KernelMatrix(factor, diagonal, None, ctx.among)
-        right = matrix.moment(weight * grad)
-        solution = newton.conjugate_gradients(factor, weighted(weight, weights), right, inverse, ctx.among)
-        affinity = weighted(matrix.affinities(solution), weights)
-        a = scaling * scaling * share * (grad - affinity)
-        totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
-        grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))
-        return grad_factor, (-a * scaling).to(dtype), None, None, None, None
+        factor, diagonal, scaling, moment, inverse, weights = ctx.saved_tensors
+        matrix = KernelMatrix(factor, diagonal, weights, ctx.among)
+        solution = Balancing(scaling, moment, scaling, 0)  # the residual takes no part
+        gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
+        return *gradients, None, None, None, None
+
+
+def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
+    """Balance a kernel, by the method that suits it, and by the damped one where that fails."""
+    found = newton.solve(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
+    goal = attainable(matrix.factor, tolerance, matrix.among)
+    if not is_hidden(matrix.factor) and not bool((found.residual <= goal).all()):
+        found = newton.damped(matrix, found, goal)
+    return found
+
+
+def implicit_gradients(
+    matrix: KernelMatrix, balancing: Balancing, inverse: Tensor, grad: Tensor, completed: bool
+) -> tuple[Tensor, Tensor]:
+    """The gradients by factor and diagonal, given that by the scaling; see :class:`_Balance`."""
+    factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
+    scaling, total, dtype = balancing.scaling, balancing.moment, factor.dtype
+    if not completed:  # d may be 1e25 without completion, its square too large for float32
+        factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
+    share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
+    weight = scaling.square() * share
+    matrix = KernelMatrix(factor, diagonal, None, among)
+    right = matrix.moment(weight * grad)
+    solution = newton.conjugate_gradients(factor, weighted(weight, weights), right, inverse, among)
+    affinity = weighted(matrix.affinities(solution), weights)
+    a = scaling * scaling * share * (grad - affinity)
+    totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
+    grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))
+    return grad_factor, (-a * scaling).to(dtype)
+
+
+@dataclass(frozen=True)
+class Rounds(Generic[Found]):
+    """A balancing after which no pixel is isolated, and how it was found.
+
+    Attributes:
+        factor: (B, M, N), zero at the pixels that were isolated.
+        diagonal: (B, N), 1 at these.
+        found: the balancing.
+        residual: largest deviation of a row sum from 1; 0 where values are hidden.
+        before: moments of the rounds in which pixels were found to be isolated.
+        removed: these pixels, (B, N) bool, or None.
+    """
+
+    MOST: ClassVar[int] = 8  # rounds; one or two are usual
+
+    factor: Tensor
+    diagonal: Tensor
+    found: Found
+    residual: float
+    before: tuple[Tensor, ...]
+    removed: Tensor | None
+
+
+def balance_in_rounds(
+    factor: Tensor,
+    diagonal: Tensor,
+    balanced: Callable[[Tensor, Tensor], tuple[Found, float]],
+    *,
+    completed: bool,
+    among: Communicator = ALONE,
+) -> Rounds[Found]:
+    """Balance and remove isolated pixels until there are none, if the kernel is ``completed`` and values are shown."""
+    found, worst = balanced(factor, diagonal)
+    before: list[Tensor] = []
+    removed: Tensor | None = None
+    while completed and len(before) < Rounds.MOST:
+        alone = isolated(found.scaling.detach(), worst)
+        if not bool(among.max(alone.any().to(factor))):
+            break
+        before.append(found.moment)
+        removed = alone if removed is None else removed | alone
+        factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
+        found, worst = balanced(factor, diagonal)
+    return Rounds(factor, diagonal, found, worst, tuple(before), removed)
 
 
 def _chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:

@@ -24,18 +24,17 @@ from nlfilter_torch.core.checks import (
     warn_of_scale,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
-from nlfilter_torch.core.precision import full_precision, uncompiled, working_dtype
+from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.values import is_hidden, refuse_transforms
-from nlfilter_torch.operator.balancing import balance, warn_of_residual
+from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_rounds, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.opaque import balance_in_graph, choose_in_graph
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling, isolated
-
-ROUNDS = 8  # most rounds in which isolated pixels are removed; one or two are usual
+from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 
 
 @dataclass(frozen=True)
@@ -70,12 +69,12 @@ def _is_small(bandwidth: float | Tensor | str) -> bool:
 
 def _largest(guide: Tensor) -> Tensor:
     """The largest magnitude of each image, (B,)."""
-    if is_hidden(guide) or len(guide) == 0:
+    if is_hidden(guide) or guide.shape[0] == 0:
         return guide.abs().amax((1, 2, 3))
     return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # quicker on processors
 
 
-@uncompiled
+@uncompiled_with("generator", "group")
 @full_precision
 def nonlocal_operator(
     guide: Tensor,
@@ -146,7 +145,7 @@ def nonlocal_operator(
         check_positive(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
     if spatial_bandwidth is not None:
         check_positive(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
-    if _is_small(photometric_bandwidth) and not called_by_edit():
+    if not is_hidden(guide) and _is_small(photometric_bandwidth) and not called_by_edit():
         warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
     among = all_gather_shapes(guide, group)
@@ -240,34 +239,38 @@ def _assemble(
     if count > points:
         warn(f"num_landmarks must be at most the number of pixels, {points}, got {described(count)}; using every pixel")
         count = points
-    if len(features) == 0:
+    if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
-    chosen = choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
+    in_graph = torch.compiler.is_compiling()  # never with a generator, weights or a group
+    chosen = (
+        choose_in_graph(features, size, count, method.landmarks)
+        if in_graph
+        else choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
+    )
     kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
+    bound = is_bounded(method.landmarks, points, count)
 
-    def balanced() -> tuple[Balancing, float]:
+    def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Balancing, float]:
         found = balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
         return found, float(found.residual.max()) if watched else 0.0
 
-    balancing, worst = balanced()
-    before: list[Tensor] = []
-    while completed and watched and len(before) < ROUNDS:
-        alone = isolated(balancing.scaling.detach(), worst)
-        if not bool(among.max(alone.any().to(factor))):
-            break
-        before.append(balancing.moment)
-        factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
-        balancing, worst = balanced()
+    if in_graph:
+        worst, goal = 0.0, tolerance or TOLERANCE[factor.dtype]
+        factor, diagonal, balancing, before = balance_in_graph(factor, diagonal, goal, completed, bound)
+    else:
+        rounds = balance_in_rounds(factor, diagonal, balanced, completed=completed and watched, among=among)
+        factor, diagonal, balancing = rounds.factor, rounds.diagonal, rounds.found
+        worst, before = rounds.residual, rounds.before
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, among)
     allowed = slack(factor.dtype, worst)
-    if watched and is_bounded(method.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
+    if watched and bound and exceeds(gram, balancing.moment, allowed):
         limit = limiter(gram, KernelMatrix(factor, diagonal, weights, among).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
-        before = [torch.linalg.solve(limit.detach(), total) for total in before]  # keeps their products with U
+        before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # keeps their products with U
         limited = KernelMatrix(factor.detach(), diagonal.detach(), weights, among)
         sums = limited.row_sums(scaling.detach(), limited.moment(scaling.detach()))
         residual = among.max((sums - 1).abs().amax(1))
@@ -279,7 +282,7 @@ def _assemble(
         size=size,
         kernel=kernel,
         remainder=remainder,
-        balancing=PixelScaling(balancing.moment, completed, worst, tuple(before)),
+        balancing=PixelScaling(balancing.moment, completed, worst, before),
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,

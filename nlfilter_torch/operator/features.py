@@ -136,8 +136,10 @@ class _ScaledPatches(torch.autograd.Function):
         ctx.save_for_backward(padded, scale)
         height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
         batch, channels = padded.shape[:2]
-        features = large_empty((batch, channels, *scale.shape[1:], height, width), padded)
         shifted = padded.unfold(2, height, 1).unfold(3, width, 1)  # (B, C, p, p, H, W): views, not copies
+        if torch.compiler.is_compiling():
+            return (shifted * scale[:, None, :, :, None, None]).flatten(4).flatten(1, 3)
+        features = large_empty((batch, channels, *scale.shape[1:], height, width), padded)
         torch.mul(shifted, scale[:, None, :, :, None, None], out=features)
         return features.flatten(4).flatten(1, 3)
 

@@ -80,7 +80,7 @@ def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, gene
         return torch.tensor(list(dict.fromkeys(draws.tolist()))[:count])  # distinct, in their random order
     if sampling == "random":
         return torch.randperm(pixels, generator=generator, device=generator.device)[:count]
-    return stratified(pixels, min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count)), generator)
+    return stratified(pixels, candidate_count(pixels, count, sampling), generator)
 
 
 def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -98,7 +98,14 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, among: Comm
     """Landmarks (B, D, M) from the features (B, D, S) of the candidates: centroids where there are more than M."""
     if subset.shape[2] == count:
         return subset
-    points = subset.detach()
+    start, assignment = clusters(subset.detach(), count, generator, among)
+    return means_of_clusters(subset, assignment, start)
+
+
+def clusters(
+    points: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE
+) -> tuple[Tensor, Tensor]:
+    """Which of the points (B, D, S) start the clusters of k-means, (B, 1, M), and the cluster of each, (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
     points = points.clamp(-LARGEST, LARGEST).float()  # a choice needs no more, and the kernels in C take no more
     # Half of them start the clusters, drawn at random.
@@ -107,7 +114,17 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, among: Comm
     chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
     start = among.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
     assignment = among.broadcast(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps))
+    return start, assignment
+
+
+def means_of_clusters(subset: Tensor, assignment: Tensor, start: Tensor) -> Tensor:
+    """Landmarks (B, D, M) from candidates (B, D, S) and their :func:`clusters`."""
     return _cluster_means(subset, assignment, pick(subset, start))
+
+
+def candidate_count(pixels: int, count: int, sampling: str) -> int:
+    """How many :func:`candidate_pixels` there are."""
+    return min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count)) if sampling == "kmeans" else count
 
 
 def _bounded(candidates: int, most: int, count: int) -> int:
