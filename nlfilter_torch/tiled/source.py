@@ -73,7 +73,7 @@ class Tiled:
             picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
         pilot = take_pilot(picture, passes.report, workers, **options)
         sampled, count = passes.sample < picture.pixels, pilot.balancing.shape[1]
-        kept = pixels_kept(picture, passes, numbers, count, self.held(numbers))
+        kept = pixels_kept(picture, passes, numbers, count, self.floats_stored(numbers))
         self.kept = kept * (count + 2)
         found = TiledOperator(
             picture,
@@ -103,10 +103,10 @@ class Tiled:
             floats=self.floats + numbers,
             planes=numbers,
             num_landmarks=num_landmarks,
-            held=self.kept + self.held(numbers),
+            held=self.kept + self.floats_stored(numbers),
         )
 
-    def held(self, numbers: int) -> int:
+    def floats_stored(self, numbers: int) -> int:
         """Floats of scribbles, with so many features of each pixel, and of guides."""
         return self.stored + self.scribbled * floats_of_scribbled(numbers)
 
