@@ -12,9 +12,8 @@ from torch import Tensor
 
 from nlfilter_torch.cli.scribbles import Overlay, Strokes
 from nlfilter_torch.edits.applying import seeded
-from nlfilter_torch.edits.detail import enhance
 from nlfilter_torch.edits.mask import lab_of, region_mask
-from nlfilter_torch.edits.parameters import EDITS, MASK
+from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
@@ -82,12 +81,12 @@ def show(
     is_strokes = any(isinstance(overlay, Strokes) for _, overlay in overlays(drawn))
     painted = region[:, 3:].ceil() if is_strokes else region.amax(1, keepdim=True).ceil()
     options = arguments((image.shape[-2], image.shape[-1]), stride)
-    if edit == "detail":
-        mask = detail_mask(image, painted, options)
-    elif edit == "colorize":
+    if edit == "colorize":
         mask = torch.ones_like(painted)  # every pixel takes a colour
     else:
         names = {parameter.keyword for parameter in MASK}
+        if edit == "detail":  # its other bandwidths are those of the filter
+            options = {"reach": options["reach"], "photometric_bandwidth": options["mask_bandwidth"]}
         taken = {name: value for name, value in options.items() if name in names}
         mask = region_mask(image, painted, kept, **taken, generator=seeded())
     outside = DIM * image.mean(1, keepdim=True)  # no colour is like every picture's
@@ -99,21 +98,6 @@ def show(
         painted = painted.maximum(kept.ceil())
     rim = F.max_pool2d(painted, 3, stride=1, padding=1) - painted
     write_photograph(Photograph(torch.where(rim > 0, torch.ones_like(shown), shown)), target)
-
-
-def detail_mask(image: Tensor, region: Tensor, options: dict[str, Any]) -> Tensor:
-    """The mask of sliders in a region: what it leaves of a change of the shading."""
-    order = torch.as_tensor(options.pop("alpha", EDITS["detail"].defaults["alpha"])).shape[-1]
-    options |= {"limits": "none", "threshold": 0.0, "residual": None}
-    shading = torch.ones(order)
-    shading[-1] = 1.5
-
-    def change(*regions: Tensor) -> Tensor:
-        found = enhance(image, shading, *regions, **options, generator=seeded())
-        return (found - image).mean(1, keepdim=True)
-
-    whole = change()
-    return torch.where(whole > 1e-3, change(region) / whole.clamp(min=1e-3), 0.0).clamp(0, 1)
 
 
 def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
