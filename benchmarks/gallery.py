@@ -8,15 +8,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.figures.colours import BLUE, TRUE, reached
 from benchmarks.figures.focus import PORTRAIT, WIDE, default_map
-from benchmarks.figures.scenes import luminance, marked, painted_over, scene, spots, strokes
+from benchmarks.figures.scenes import YELLOW, luminance, marked, painted_over, scene, scribbled, spots, strokes
 from nlfilter_torch import abstract, colorize, defocus, enhance, recolor, region_mask
+from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.io.photographs import Photograph, write_photograph
 from nlfilter_torch.plotting import save_figure, show_images
 
 SIDE = 270  # of a panel
+FRONT = (486, 720)  # of a panel of the first picture
+GAP = 5  # around it
+SUBJECT = ((205, 60, 30, 110), (215, 185, 30, 60), (90, 290, 60, 12), (300, 300, 40, 12))  # a face, a collar, a suit
 SIZE = 640  # of a photograph
 ALPHA = (3.0, 3.0, 4.0, 1.0)
 
@@ -80,6 +86,21 @@ def abstraction() -> dict[str, Tensor]:
     }
 
 
+def front() -> Tensor:
+    """Two photographs with scribbles, beside what becomes of them: recoloured, and out of focus behind the subject."""
+    bike, scale = scene("motorcycle", 741)
+    colours, painted = strokes(bike, scale, ((350, 205, 40, 20), BLUE))
+    portrait = scene("astronaut", 512)[0][..., :346, :]
+    subject = spots(portrait, 1.0, *SUBJECT)
+    yellow = torch.tensor(YELLOW).view(1, 3, 1, 1)
+    rows = [
+        (scribbled(bike, colours, painted), recolor(bike, colours, painted)),
+        (scribbled(portrait, yellow, subject), defocus(portrait, subject)),
+    ]
+    panels = [[F.pad(resize(panel.clamp(0, 1), FRONT), (GAP, GAP, GAP, GAP), value=1) for panel in row] for row in rows]
+    return torch.cat([torch.cat(row, dim=3) for row in panels], dim=2).clamp(0, 1)
+
+
 EDITS: dict[str, Callable[[], dict[str, Tensor]]] = {
     "detail": detail,
     "recolor": recolouring,
@@ -97,6 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
     folder.mkdir(exist_ok=True)
     for name, panels in EDITS.items():
         save_figure(show_images(panels(), columns=3, side=SIDE), folder / f"edit-{name}.png")
+    write_photograph(Photograph(front()), folder / "front.jpg")
 
 
 if __name__ == "__main__":

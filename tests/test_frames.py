@@ -10,6 +10,7 @@ import torch
 from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.detail import options_of
 from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
@@ -216,7 +217,7 @@ def test_frames_by_every_preset(name: str, tmp_path: Path, capsys: pytest.Captur
     arguments = ["frames", str(tmp_path / "film"), str(tmp_path / "out"), "--landmarks", "40", "--references", "1"]
     assert main([*arguments, "--preset", name]) == 0
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").iterdir())]
-    options = preset.options((30, 40)) | {"spatial_bandwidth": None} | {"num_landmarks": 40}
+    options = options_of(preset.step, (30, 40)) | {"spatial_bandwidth": None} | {"num_landmarks": 40}
     wanted = list(filter_frames(stored, torch.tensor(preset.alpha), references=stored[:1], **options))
     for path, frame, before in zip(sorted((tmp_path / "out").iterdir()), wanted, stored, strict=True):
         found = read_photograph(path).pixels

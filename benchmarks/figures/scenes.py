@@ -47,8 +47,13 @@ def strokes(image: Tensor, scale: float, *painted: tuple[Box, tuple[float, float
 def painted_over(image: Tensor, colours: Tensor, mask: Tensor) -> Tensor:
     """The photograph, faded, with the strokes on it and a white rim around them."""
     faded = FADED * image.expand(-1, 3, -1, -1) + (1 - FADED) * reduce_channels(image, "luminance")
+    return scribbled(faded, colours, mask)
+
+
+def scribbled(image: Tensor, colours: Tensor, mask: Tensor) -> Tensor:
+    """An RGB image with strokes on it and a white rim around them."""
     rim = torch.nn.functional.max_pool2d(mask, 5, 1, 2)
-    return torch.where(mask > 0, colours, torch.where(rim > 0, torch.ones_like(faded), faded))
+    return torch.where(mask > 0, colours, torch.where(rim > 0, torch.ones_like(image), image))
 
 
 def marked(image: Tensor, region: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 Edges and tones after Winnemoeller, Olsen and Gooch, "Real-Time Video Abstraction", SIGGRAPH 2006 (the paper's [30]).
 """
 
-import math
 from typing import Any
 
 import torch
@@ -14,6 +13,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
 from nlfilter_torch.edits.parameters import ABSTRACT
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, synthesize
+from nlfilter_torch.operator.features import blur, blur_margin
 
 # The residual of the eigenvectors is multiplied by the power of W's diagonal part r, with this many times the exponent:
 # it vanishes where a pixel has similar ones, stays where it has none, such as on a border, and is whole at power 0.
@@ -123,7 +123,7 @@ def fit_abstract(
 
     if edges == 0 and tones is None:
         return Fitted(flat)
-    return Fitted(flat, lambda _, planes: draw(planes, edges, width, tones), margin=_gaussian_margin(WIDER * width) + 1)
+    return Fitted(flat, lambda _, planes: draw(planes, edges, width, tones), margin=blur_margin(WIDER * width) + 1)
 
 
 def draw(flat: Tensor, edges: float, width: float, tones: int | None) -> Tensor:
@@ -136,7 +136,7 @@ def draw(flat: Tensor, edges: float, width: float, tones: int | None) -> Tensor:
 
 def edge_lines(luminance: Tensor, width: float) -> Tensor:
     """Lines (B, 1, H, W) from a difference of Gaussians: 1 on paper, towards 0 in the middle of a line."""
-    near, far = _gaussian(luminance, width), _gaussian(luminance, WIDER * width)
+    near, far = blur(luminance, width), blur(luminance, WIDER * width)
     difference = 100 * (near - SENSITIVITY * far)
     return 1 + torch.tanh(FALLOFF * difference.clamp(max=0.0))
 
@@ -151,14 +151,3 @@ def quantize(luminance: Tensor, tones: int) -> Tensor:
     steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
     # Steepness is per tone, so that the transition looks alike for any number of them.
     return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)
-
-
-def _gaussian_margin(sigma: float) -> int:
-    return math.ceil(3 * sigma)
-
-
-def _gaussian(image: Tensor, sigma: float) -> Tensor:
-    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
-
-    size = 2 * _gaussian_margin(sigma) + 1
-    return gaussian_blur2d(image, (size, size), (sigma, sigma), border_type="replicate")

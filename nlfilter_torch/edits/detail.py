@@ -20,9 +20,9 @@ from nlfilter_torch.edits.parameters import DETAIL, FILTER, MASK
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.operator.features import pad_border, reduce_channels
+from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 
-CALM, CALM_MARGIN = 2.0, 6  # Gaussian window in pixels in which a picture is calm or not, and how far it reaches
+CALM = 2.0  # Gaussian window in pixels in which a picture is calm or not
 TINY = 1e-12
 
 
@@ -182,7 +182,7 @@ def fit_detail(
         if regions is None:
             if not isinstance(threshold, Tensor) and threshold == 0:
                 return Fitted(lambda pixels: sum_of(added_and_rest(pixels, sliders)))
-            return Fitted(lambda pixels: added_and_rest(pixels, sliders), limited, CALM_MARGIN)
+            return Fitted(lambda pixels: added_and_rest(pixels, sliders), limited, blur_margin(CALM))
 
         def weights(of: Any, name: str) -> Any:
             return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
@@ -196,7 +196,7 @@ def fit_detail(
             changes = torch.cat([added_and_rest(pixels, row) for row in rows], dim=1)
             return blend_changes(changes, masks.masks(pixels))
 
-        return Fitted(blended, limited, CALM_MARGIN)
+        return Fitted(blended, limited, blur_margin(CALM))
 
     # W keeps means: only the last slider changes that of the picture.
     brighter = (
@@ -246,12 +246,8 @@ def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> T
 
 def activity(image: Tensor) -> Tensor:
     """Variance (B, 1, H, W) of the luminance of an image around its pixels."""
-    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
-
-    grey = pad_border(reduce_channels(image, "luminance").mean(1, keepdim=True), CALM_MARGIN)
-    size = 2 * CALM_MARGIN + 1
-    moments = gaussian_blur2d(torch.cat([grey, grey.square()], dim=1), (size, size), (CALM, CALM))
-    mean, square = moments[..., CALM_MARGIN:-CALM_MARGIN, CALM_MARGIN:-CALM_MARGIN].chunk(2, dim=1)
+    grey = reduce_channels(image, "luminance").mean(1, keepdim=True)
+    mean, square = blur(torch.cat([grey, grey.square()], dim=1), CALM).chunk(2, dim=1)
     return (square - mean.square()).clamp(min=0)
 
 

@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
@@ -25,7 +24,7 @@ from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.resizing import enlarged
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
 from nlfilter_torch.filtering.scribbles import fit_strokes
-from nlfilter_torch.operator.features import pad_border
+from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 
 SOLVED = 1 << 17  # pixels
 CHROMA = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
@@ -42,17 +41,7 @@ ODD = 0.1  # share of the scribbled pixels that has to be like a point of the fr
 TINY = 1e-6
 
 
-def _gaussian(planes: Tensor, sigma: float) -> Tensor:
-    """Planes (B, C, H, W) under a Gaussian, two and a half standard deviations wide; reflected at the border."""
-    reach, channels = math.ceil(2.5 * sigma), planes.shape[1]
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(planes) / sigma).square())
-    kernel = (kernel / kernel.sum()).expand(channels, 1, -1)
-    padded = pad_border(planes, reach)
-    rows = F.conv2d(padded, kernel.unsqueeze(3), groups=channels)
-    return F.conv2d(rows, kernel.unsqueeze(2), groups=channels)
-
-
-MARGIN = max(math.ceil(2.5 * AROUND), math.ceil(2.5 * GRAIN) + math.ceil(2.5 * TEXTURE))
+MARGIN = max(blur_margin(AROUND), blur_margin(GRAIN) + blur_margin(TEXTURE))
 
 
 def lab_of(image: Tensor) -> Tensor:
@@ -68,9 +57,9 @@ def region_guide(image: Tensor) -> Tensor:
     colours = lab * lab.new_tensor([LIGHTNESS, CHROMA, CHROMA]).view(1, 3, 1, 1)
     padded = pad_border(lightness, 1)
     rows, columns = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    grain = torch.cat([lightness - _gaussian(lightness, GRAIN), rows / 2, columns / 2], dim=1)
-    strength = (_gaussian(grain.square(), TEXTURE) + 1e-8).sqrt()  # the derivative of the root is finite
-    return torch.cat([colours, _gaussian(colours, AROUND), TEXTURED * strength], dim=1)
+    grain = torch.cat([lightness - blur(lightness, GRAIN), rows / 2, columns / 2], dim=1)
+    strength = (blur(grain.square(), TEXTURE) + 1e-8).sqrt()  # the derivative of the root is finite
+    return torch.cat([colours, blur(colours, AROUND), TEXTURED * strength], dim=1)
 
 
 @full_precision

@@ -6,7 +6,7 @@ presets that have a name.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.recipe import Recipe, in_file
@@ -69,16 +69,6 @@ class Preset:
         from nlfilter_torch.edits.applying import apply_step
 
         return apply_step(self.step, image, generator=generator)
-
-    def options(self, size: tuple[int, int]) -> dict[str, Any]:
-        """What :func:`nlfilter_torch.nonlocal_operator` takes for an image (H, W), in units of the picture.
-
-        >>> PRESETS["crisp"].options((240, 320))["spatial_bandwidth"]
-        20.0
-        """
-        from nlfilter_torch.edits.detail import options_of
-
-        return options_of(self.step, size)
 
     @property
     def step(self) -> Step:

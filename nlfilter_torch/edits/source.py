@@ -5,7 +5,6 @@ pixels once these sums are known. A :class:`Source` has the sums: here of an ima
 batch; in :mod:`nlfilter_torch.tiled.source` of a picture that is read a few rows at a time.
 """
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +25,7 @@ from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import pad_border, reduce_channels
+from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum, compute_grams
 
@@ -68,19 +67,14 @@ class Guide:
     @property
     def blur_margin(self) -> int:
         """The same for the blur alone."""
-        return math.ceil(2.5 * self.blur)
+        return blur_margin(self.blur)
 
     def __call__(self, image: Tensor) -> Tensor:
         """The guide of an image (B, C, H, W) of any size."""
         guide = image if self.look is None else self.look(image)
         if self.blur_margin == 0:
             return guide
-        from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
-
-        margin = self.blur_margin
-        size, padded = 2 * margin + 1, pad_border(guide, margin)
-        blurred = gaussian_blur2d(padded, (size, size), (self.blur, self.blur))
-        return blurred[..., margin:-margin, margin:-margin]
+        return blur(guide, self.blur)
 
 
 class Operator(Protocol):

@@ -3,6 +3,7 @@
 Also the photometric bandwidth that suits an image. Paper: Appendix A, eq. (20).
 """
 
+import math
 from itertools import product
 from typing import Any, Literal
 
@@ -165,6 +166,21 @@ def pad_border(image: Tensor, margin: int) -> Tensor:
     for pad, length in (((margin, margin, 0, 0), width), ((0, 0, margin, margin), height)):
         image = F.pad(image, pad, mode="reflect" if length > margin else "replicate")
     return image
+
+
+def blur_margin(sigma: float) -> int:
+    """How many pixels around a pixel :func:`blur` reads."""
+    return math.ceil(3 * sigma)
+
+
+def blur(planes: Tensor, sigma: float) -> Tensor:
+    """Planes (B, C, H, W) under a Gaussian of that many pixels, reflected at the border."""
+    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
+
+    margin = blur_margin(sigma)
+    size = 2 * margin + 1
+    blurred = gaussian_blur2d(pad_border(planes, margin), (size, size), (sigma, sigma))
+    return blurred[..., margin:-margin, margin:-margin]
 
 
 def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
