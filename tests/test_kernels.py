@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels import columns, definitions_only, grams, tall_skinny
 from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
-from nlfilter_torch.operator import opaque  # noqa: F401, registers two
+from nlfilter_torch.operator import build  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3

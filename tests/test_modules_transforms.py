@@ -20,9 +20,8 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.operator.balancing import Rounds, balance, balance_in_rounds
-from nlfilter_torch.operator.landmarks import choose_landmarks
-from nlfilter_torch.operator.opaque import balance_in_graph, choose_in_graph
+from nlfilter_torch.operator.balancing import Rounds, balance, balance_in_graph, balance_in_rounds
+from nlfilter_torch.operator.landmarks import choose_in_graph, choose_landmarks
 from nlfilter_torch.operator.scaling import Balancing
 from tests.layers import ALPHA, EVERYTHING, OPTIONS, image
 from tests.problems import noise, picture

@@ -30,7 +30,7 @@ IN, OUT = Stroke(LINE, 0.06, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
 BLUE, KEEP = Stroke(LINE, 0.06, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
 FAR = Stroke(((1.8, 1.8),), 0.05, "out")  # covers no pixel
 ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
-DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, time=0.7, landmarks=40)
+DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, reach=0.5, landmarks=40)
 RECOLOR = Step("recolor", (BLUE, KEEP), reach=0.5, tolerance=20.0)
 COLORIZE = Step("colorize", (BLUE,), strength=0.5)
 

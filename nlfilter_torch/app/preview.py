@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared, viewed_stride
 from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, nearby_or_far
-from nlfilter_torch.edits.detail import activity, held_back, split_sliders
+from nlfilter_torch.edits.detail import activity, change_of_mean, held_back, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.recipe import Recipe
@@ -212,8 +212,11 @@ class Preview:
         if mask is not None:
             found = torch.lerp(found, changes(detail.sliders_inside), mask)
         change = held_back(found, self._activity(detail), detail["threshold"] / 255)
-        alone = detail["limits"] == "none" or mask is not None
-        balance = None if alone else balance_in_memory(self.pixels, change, detail["alpha"][-1] - 1)
+        rows = [detail["alpha"], detail.sliders_inside]
+        brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
+        balance = None
+        if detail["limits"] == "soft" and brighter is not None:
+            balance = balance_in_memory(self.pixels, change, brighter)
         return change_luminance(self.pixels, change, detail["limits"], balance)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:

@@ -165,7 +165,8 @@ def fit_detail(
             "spatial_bandwidth": nearness,
             "num_landmarks": num_landmarks,
         }
-        fewer = min(num_landmarks, MASK.defaults["num_landmarks"])
+        most = MASK.defaults["num_landmarks"]
+        fewer = min(num_landmarks, most) if isinstance(num_landmarks, int) else num_landmarks
         compared: dict[str, Any] = {"photometric_bandwidth": mask_bandwidth, "reach": reach, "num_landmarks": fewer}
         if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
             compared["generator"] = options["generator"].clone_state()
@@ -198,10 +199,12 @@ def fit_detail(
 
         return Fitted(blended, limited, blur_margin(CALM))
 
-    # W keeps means: only the last slider changes that of the picture.
-    brighter = (
-        None if regions is not None or alpha.ndim == 4 else sliders[..., -1].to(source.dtype).reshape(-1, 1, 1, 1)
-    )
+    brighter: Tensor | None = None
+    if regions is not None:
+        brighter = None if outside is None else change_of_mean(torch.cat([sliders, outside[None] - 1]))
+    elif alpha.ndim != 4:
+        brighter = sliders[..., -1].reshape(-1, 1, 1, 1)
+    brighter = None if brighter is None else brighter.to(source.dtype)
     return fit_change(source, change, planes, viewing_size, limits, brighter=brighter)
 
 
@@ -213,6 +216,16 @@ def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
     zero = torch.zeros_like(sliders)
     raised = (sliders > 0) & is_detail
     return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
+
+
+def change_of_mean(sliders: Tensor) -> Tensor | None:
+    """By what share sliders less 1, a row (K, k+1) for each part of a picture, change its mean.
+
+    W keeps means, so that only the last slider counts. None if a part is to stay as it is, or the parts differ: the
+    mean is not corrected then.
+    """
+    last = sliders[:, -1]
+    return last[0] if bool((sliders != 0).any(1).all() & (last == last[0]).all()) else None
 
 
 def sum_of(changes: Tensor) -> Tensor:

@@ -100,7 +100,7 @@ def filter_frames(
 
         return Fitted(of, lambda image, found: held_back(found, activity(image), threshold))
 
-    brighter = float(alpha[-1]) - 1
+    brighter = alpha[-1] - 1
 
     def edit(frame: Tensor) -> Tensor:
         check_image(frame, "frames")

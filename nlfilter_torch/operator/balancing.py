@@ -21,9 +21,11 @@ from nlfilter_torch.core.autograd import once_differentiable, outer_product
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.communicator import ALONE, Communicator
+from nlfilter_torch.core.kernels.library import register
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
 from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator import newton
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, shifted_gram, slack
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, Solution, isolated
 
 Found = TypeVar("Found", bound=Balancing)
@@ -237,3 +239,78 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
         scaling, total = following, next_total
     identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
     return Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
+
+
+def _fake_settled(
+    factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
+) -> tuple[Tensor, ...]:
+    batch, landmarks, _ = factor.shape
+    moments = factor.new_empty(Rounds.MOST + 1, batch, landmarks, 1, dtype=torch.float64)
+    inverse = factor.new_empty(batch, landmarks, landmarks, dtype=torch.float64)
+    removed = torch.empty_like(diagonal, dtype=torch.bool)
+    return torch.empty_like(diagonal), moments, factor.new_empty(batch), inverse, removed
+
+
+@register(
+    "settle(Tensor factor, Tensor diagonal, float tolerance, bool completed, bool bound) "
+    "-> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+    None,
+    _fake_settled,
+)
+def settle(
+    factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Balance a kernel: d (B, N), moments, residual (B,), inverse of the Jacobian, and the pixels that it removed.
+
+    The moments, one more than there may be rounds, are those of the rounds and the last one repeated. If eigenvalues
+    shall be ``bound`` and exceed 1, it warns.
+    """
+
+    def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Any, float]:
+        found = solve(KernelMatrix(factor, diagonal), tolerance, completed)
+        warn_of_residual(found.residual, tolerance, factor.dtype, completed=completed)
+        return found, float(found.residual.max()) if factor.device.type == "cpu" else 0.0
+
+    rounds = balance_in_rounds(factor, diagonal, balanced, completed=completed and factor.device.type == "cpu")
+    found, factor, diagonal = rounds.found, rounds.factor, rounds.diagonal
+    if bound and factor.device.type == "cpu":
+        remainder = found.scaling * (found.scaling * diagonal)
+        gram = shifted_gram(factor, found.scaling, remainder, ALONE)
+        if exceeds(gram, found.moment, slack(factor.dtype, rounds.residual)):
+            warn("eigenvalues exceed 1, which compiled programs do not correct; use landmarks='kmeans'")
+    moments = [*rounds.before, *[found.moment] * (Rounds.MOST + 1 - len(rounds.before))]
+    removed = torch.zeros_like(diagonal, dtype=torch.bool) if rounds.removed is None else rounds.removed
+    return found.scaling, torch.stack(moments), found.residual, found.inverse.contiguous(), removed
+
+
+def balance_in_graph(
+    factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
+) -> tuple[Tensor, Tensor, Balancing, tuple[Tensor, ...]]:
+    """Factor and diagonal without isolated pixels, their balancing, and the moments that found these pixels."""
+    scaling, moments, residual, inverse, removed = settle(
+        factor.detach(), diagonal.detach(), tolerance, completed, bound
+    )
+    factor, diagonal = factor * ~removed.unsqueeze(1), torch.where(removed, 1.0, diagonal)
+    scaling = _Settled.apply(factor, diagonal, scaling, moments[-1], inverse, completed)  # type: ignore[no-untyped-call]
+    return factor, diagonal, Balancing(scaling, moments[-1], residual, 0), moments[:-1].unbind()
+
+
+class _Settled(torch.autograd.Function):
+    """A solution d (B, N) of the balancing, which is differentiated in the factor and the diagonal."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, factor: Tensor, diagonal: Tensor, scaling: Tensor, moment: Tensor, inverse: Tensor, completed: bool
+    ) -> Tensor:
+        scaling = scaling.clone()
+        ctx.save_for_backward(factor, diagonal, scaling, moment, inverse)
+        ctx.completed = completed
+        return scaling
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        factor, diagonal, scaling, moment, inverse = ctx.saved_tensors
+        matrix, solution = KernelMatrix(factor, diagonal, None, ALONE), Balancing(scaling, moment, scaling, 0)
+        gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
+        return *gradients, None, None, None, None

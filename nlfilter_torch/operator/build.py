@@ -26,13 +26,12 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.values import is_hidden, refuse_transforms
-from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_rounds, warn_of_residual
+from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_graph, balance_in_rounds, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
-from nlfilter_torch.operator.landmarks import Sampling, choose_landmarks
+from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
-from nlfilter_torch.operator.opaque import balance_in_graph, choose_in_graph
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
+from nlfilter_torch.core.kernels.library import register
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
@@ -231,3 +232,34 @@ def _sums_by_product(points: Tensor, assignment: Tensor, count: int) -> Tensor:
     """The same on accelerators, which would add up in another order every time."""
     members = points.new_zeros(points.shape[0], count, points.shape[2])
     return points @ members.scatter_(1, assignment.unsqueeze(1), 1.0).mT
+
+
+def _fake_choice(features: Tensor, height: int, width: int, count: int, sampling: str) -> tuple[Tensor, ...]:
+    batch, candidates = features.shape[0], candidate_count(height * width, count, sampling)
+    shapes = (candidates,), (batch, 1, count), (batch, candidates)
+    return tuple(features.new_empty(shape, dtype=torch.long) for shape in shapes)
+
+
+@register(
+    "choose(Tensor features, int height, int width, int count, str sampling) -> (Tensor, Tensor, Tensor)",
+    None,
+    _fake_choice,
+)
+def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates (S,), those that clusters start from (B, 1, M) and the cluster of each (B, S)."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = candidate_pixels((height, width), count, sampling, generator).to(features.device)
+    if len(pixels) == count:
+        _, start, assignment = _fake_choice(features, height, width, count, sampling)
+        return pixels, start.zero_(), assignment.zero_()
+    start, assignment = clusters(ALONE.columns(features, pixels), count, generator)
+    return pixels, start, assignment
+
+
+def choose_in_graph(features: Tensor, size: tuple[int, int], count: int, sampling: Sampling) -> Tensor:
+    """:func:`choose_landmarks` as a compiler records it, with the landmarks of a call without a generator."""
+    if count == features.shape[2]:
+        return features
+    pixels, start, assignment = choose(features.detach(), size[0], size[1], count, sampling)
+    subset = ALONE.columns(features, pixels)
+    return subset if pixels.shape[0] == count else means_of_clusters(subset, assignment, start)

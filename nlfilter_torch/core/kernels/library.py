@@ -77,14 +77,14 @@ def definitions_only() -> Iterator[None]:
 
 
 def register(
-    schema: str, compiled: Callable[..., Any], fake: Callable[..., Any], *, differentiable: bool = False
+    schema: str, compiled: Callable[..., Any] | None, fake: Callable[..., Any], *, differentiable: bool = False
 ) -> Callable[[Definition], Definition]:
     """Make a function an operator of ``torch.ops.nlfilter``: it defines what that computes, for every dtype and device.
 
     Args:
         schema: its name and signature.
-        compiled: the same by a kernel in C, for tensors that are float32 and not empty, on processors; None where it
-            leaves the work to the definition.
+        compiled: the same by a kernel in C, for tensors that are float32 and not empty, on processors, which gives None
+            where it leaves the work to the definition; None if there is none.
         fake: uninitialised results, from the shapes of the arguments.
         differentiable: whether the definition is made of differentiable operations. Autograd, in reverse and forward
             mode and of any order, and the transforms of ``torch.func`` then see these operations.
@@ -93,7 +93,7 @@ def register(
 
     def decorate(definition: Definition) -> Definition:
         def on_processors(*arguments: Any) -> Any:
-            found = compiled(*arguments) if level and _suit(arguments) else None
+            found = compiled(*arguments) if compiled is not None and level and _suit(arguments) else None
             return definition(*arguments) if found is None else found
 
         def under_autograd(keys: Any, *arguments: Any) -> Any:
