@@ -3,7 +3,8 @@
 A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
 channel a tone curve's hat functions, the three colours, the distance from the largest of them at each saturation, the
 bands of blurs and the layers of the filter. Which parts a look has, and how strong a ridge keeps them close to the
-identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A curve is kept from falling by a least-squares problem with bounds.
+identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A curve is kept from falling by a
+least-squares problem with bounds.
 """
 
 from collections.abc import Iterable, Sequence
