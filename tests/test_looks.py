@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import skimage.color
 import skimage.data
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.look import bands_of, tone_curve
-from nlfilter_torch.filtering.look_fit import nonnegative
+from nlfilter_torch.filtering.look_fit import MOST, nonnegative, sample
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.tiles import Passes
@@ -28,6 +29,7 @@ ALPHA = (2.2, 1.6, 1.3, 1.02)
 SEPIA = (0.393, 0.769, 0.189, 0.349, 0.686, 0.168, 0.272, 0.534, 0.131)
 BENT = tuple((i / 16) ** 0.7 for i in range(17))
 FEW = Step("look", landmarks=40)
+VIVID = (1.3, 1.2, 1.1, 1.05, 1.0)
 BANDS = (1.5, 1.0, 1.3, 1.0, 1.0, 0.8, 1.1)
 
 
@@ -78,6 +80,10 @@ def test_the_parts_are_what_they_say() -> None:
     sliders = apply_look(CAT, alpha=ALPHA, num_landmarks=40)
     detail = enhance(CAT, torch.tensor(ALPHA), limits="none", threshold=0.0, num_landmarks=40)
     assert torch.allclose(sliders, detail, atol=1e-5)
+    hsv = skimage.color.rgb2hsv(CAT[0].permute(1, 2, 0).double().numpy())
+    hsv[..., 1] *= np.interp(hsv[..., 1], [0, 0.25, 0.5, 0.75, 1], VIVID)
+    by_hand = torch.from_numpy(skimage.color.hsv2rgb(hsv)).permute(2, 0, 1)[None].float()
+    assert torch.allclose(apply_look(CAT, saturation=VIVID), by_hand, atol=1e-5)
     assert torch.allclose(
         apply_look(CAT, matrix=SEPIA, amount=0.5), (CAT + apply_look(CAT, matrix=SEPIA)) / 2, atol=1e-6
     )
@@ -87,8 +93,8 @@ def test_the_parts_are_what_they_say() -> None:
 @pytest.mark.parametrize("channels", [1, 3])
 def test_tiles_are_the_image_in_memory(viewing: float, channels: int, tmp_path: Path) -> None:
     step = Step(
-        "look", alpha=ALPHA, bands=BANDS, red=BENT, green=BENT, blue=BENT, matrix=SEPIA, amount=0.8, landmarks=30,
-        viewing_size=viewing,
+        "look", alpha=ALPHA, bands=BANDS, red=BENT, green=BENT, blue=BENT, matrix=SEPIA, saturation=VIVID, amount=0.8,
+        landmarks=30, viewing_size=viewing,
     )  # fmt: skip
     image = CAT[:, :channels]
     whole = apply_step(step, image)
@@ -107,13 +113,15 @@ def test_gradients_reach_image_and_look() -> None:
     bands = torch.tensor(BANDS, dtype=torch.float64, requires_grad=True)
     curve = torch.tensor(BENT, dtype=torch.float64, requires_grad=True)
     matrix = torch.tensor(SEPIA, dtype=torch.float64, requires_grad=True)
+    vivid = torch.tensor(VIVID, dtype=torch.float64, requires_grad=True)
 
-    def look(image: Tensor, bands: Tensor, curve: Tensor, matrix: Tensor) -> Tensor:
-        return apply_look(image, bands=bands, red=curve, green=curve, blue=BENT, matrix=matrix).sum(1)
+    def look(image: Tensor, bands: Tensor, curve: Tensor, matrix: Tensor, vivid: Tensor) -> Tensor:
+        parts = {"red": curve, "green": curve, "blue": BENT, "matrix": matrix, "saturation": vivid}
+        return apply_look(image, bands=bands, **parts).sum(1)
 
     with torch.no_grad():
         image.add_(1e-3)  # off the knots of the curve, where it has no derivative
-    assert torch.autograd.gradcheck(look, (image, bands, curve, matrix), fast_mode=True)
+    assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid), fast_mode=True)
     apply_look(image, alpha=alpha, num_landmarks=20).square().mean().backward()
     assert alpha.grad is not None
     assert bool((alpha.grad != 0).all())
@@ -179,6 +187,51 @@ def test_edits_of_others_are_explained_on_other_photographs(edit: object) -> Non
     pairs = [(image, in_bytes(edit(image))) for image in (CAT, CUP, SUIT)]
     found = one(fit_look(pairs[:2], step=FEW))
     assert all(explained(*pair, found.apply(pair[0])) > 0.95 for pair in pairs)
+
+
+def test_saturation_in_hsv_is_explained_on_other_photographs() -> None:
+    def saturated(image: Tensor) -> Tensor:
+        hsv = skimage.color.rgb2hsv(image[0].permute(1, 2, 0).numpy())
+        hsv[..., 1] = (1.4 * hsv[..., 1]).clip(0, 1)
+        return in_bytes(torch.from_numpy(skimage.color.hsv2rgb(hsv)).permute(2, 0, 1)[None].float())
+
+    every = slice(0, 512, 5)  # small pictures with colours of all kinds
+    pairs = [
+        (image, saturated(image)) for image in (rgb(name, every, every) for name in ("astronaut", "coffee", "chelsea"))
+    ]
+    found = one(fit_look(pairs[:2], step=FEW))
+    assert found.parts == ("saturation",)
+    assert all(explained(*pair, found.apply(pair[0])) > 0.99 for pair in pairs)
+
+
+def test_sums_of_samples_are_those_of_all_pixels() -> None:
+    generator = torch.Generator().manual_seed(0)
+    whole = torch.rand(300, 400, generator=generator) + 0.1
+    whole[:, :50] = 0
+    places = sample(whole)
+    assert len(places) == MOST
+    assert len(set(places.tolist())) > 0.9 * MOST
+    assert bool((whole.flatten()[places] > 0).all())
+    assert torch.equal(places, places.sort().values)
+    assert float(whole.flatten()[places].mean()) == pytest.approx(float(whole[:, 50:].mean()), abs=2e-3)
+    assert torch.equal(sample(whole[:50]), whole[:50].flatten().nonzero().squeeze(1))
+
+
+def test_a_sampled_pair_and_a_whole_one_have_the_same_look() -> None:
+    large = torch.nn.functional.interpolate(CAT, (320, 400), mode="bicubic").clamp(0, 1)  # 128,000 pixels
+    step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=40, viewing_size=0.0)
+    sliders = one(fit_look([(large, in_bytes(apply_step(step, large)))], step=FEW.changed(viewing_size=0.0)))
+    assert sliders.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
+    curve = one(fit_look([(large, in_bytes(large**0.7))], step=FEW))
+    assert explained(large, large**0.7, curve.apply(large)) > 0.99
+
+
+def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
+    dark = in_bytes(0.1 + 0.25 * CAT)
+    found = one(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
+    curves = found.tensors["curves"]
+    assert found.fitted > 0.9
+    assert float((curves[:, 12:] - torch.linspace(0, 1, 17)[12:]).abs().max()) < 0.08
 
 
 def test_curves_never_fall() -> None:

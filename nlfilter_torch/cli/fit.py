@@ -55,6 +55,7 @@ CALLED = {
     "tone": "a tone curve",
     "curves": "a tone curve for each channel",
     "matrix": "colours",
+    "saturation": "saturation",
 }
 
 
@@ -112,7 +113,7 @@ def fit(
         share = look.fitted
         if len(paths) == 1 and seen is not None and result is not None:
             share = _explained(*seen, result)
-        _report(look, share, path, "other photographs" if len(paths) > 1 else "other parts of it")
+        _report(look, share, path, alone=len(paths) == 1)
     if len(paths) == 1 and seen is not None and result is not None:
         _tell_where(*seen, result)
 
@@ -175,7 +176,7 @@ def _explained(before: "Tensor", after: "Tensor", found: "Tensor") -> float:
     return 1.0 - float(rest / change)
 
 
-def _report(look: "FittedLook", share: float, path: Path, others: str) -> None:
+def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> None:
     """Print what a look is and what it is worth."""
     typer.echo(f"{'explained of the change by':40}{'fitted':>8}{'left out':>10}")
     for parts, (fitted, left_out) in look.explained.items():
@@ -183,7 +184,10 @@ def _report(look: "FittedLook", share: float, path: Path, others: str) -> None:
             name = " + ".join(CALLED[part] for part in parts)
             typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
     typer.echo("alpha: " + ", ".join(f"{slider:.3f}" for slider in look.step["alpha"]))
+    others = "parts of the picture left out of the fit" if alone else "other photographs"
     typer.echo(f"explained: {100 * share:.1f} % of the change, {100 * look.left_out:.1f} % in {others}")
+    if alone:
+        typer.echo("in other photographs: not known from one pair; folders of three pairs or more tell")
     if min(share, look.left_out) < ENOUGH:
         _tell(f"the look explains less than {100 * ENOUGH:.0f} % of the edit; --preview shows what is missing")
     typer.echo(f"preset: {path}")

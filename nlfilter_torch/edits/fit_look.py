@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,13 +10,14 @@ from nlfilter_torch.core.checks import check_image, check_order, check_photograp
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import apply_step, seeded
 from nlfilter_torch.edits.detail import options_of
-from nlfilter_torch.edits.parameters import KNOTS, STRAIGHT
+from nlfilter_torch.edits.parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.recipe import in_file
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL, fit_alpha
+from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL, fit_layers
+from nlfilter_torch.filtering.look import bands_of
 from nlfilter_torch.filtering.look_fit import (
     CHOICES,
     RIDGES,
@@ -26,7 +26,9 @@ from nlfilter_torch.filtering.look_fit import (
     Parts,
     Sums,
     choose,
+    columns_of,
     fit_parts,
+    sample,
     simplest,
     sums_of,
 )
@@ -35,11 +37,12 @@ from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
 
 Pair = tuple[Tensor, ...]
-FOLDS = 5  # into which pairs are put, or parts of pictures
-SQUARES = 8  # along each side of a picture, that go to the folds in turn
+FOLDS = 5  # into which pairs are put
+SQUARES = 3  # parts along each side of a picture that are left out in turn if there is one pair
+STIFF, STIFF_ALONE = 3e-3, 1e-2  # least ridge of tone curves and saturation, of several pairs and of one
 INSIDE = 0.9  # of a mask, from where on a pixel counts for its region
 SLIDERS_ONLY = 0.98  # share that sliders explain of a pair for which they are found to the last digit
-PARTS = ("alpha", "bands", "curves", "matrix")
+PARTS = ("alpha", "bands", "curves", "matrix", "saturation")
 ALIKE = (
     0.5  # correlation of the luminance of a picture before and after an edit, below which they do not belong together
 )
@@ -52,7 +55,8 @@ class FittedLook:
 
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
-        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, and ``matrix``.
+        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, ``matrix`` and
+            ``saturation``.
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
         explained: the same two for every choice of parts that was tried.
@@ -76,7 +80,8 @@ class FittedLook:
         curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands")}
-        return {**named, "curves": curves, "matrix": matrix}
+        saturation = torch.tensor(self.step["saturation"])
+        return {**named, "curves": curves, "matrix": matrix, "saturation": saturation}
 
     def to_json(self) -> str:
         """A file for ``nlfilter-torch apply``: a recipe of one step."""
@@ -95,14 +100,15 @@ def fit_look(
 ) -> FittedLook | tuple[FittedLook, ...]:
     """Find the look that turns photographs into edited ones, whatever program edited them.
 
-    In closed form, from small sums; one pair is in memory at a time. Parts and ridge are chosen by leaving out pairs,
-    or squares of the picture if there is one pair only.
+    In closed form, from small sums over 65,536 pixels of each pair or all of a smaller one; one pair is in memory at a
+    time. Parts and ridge are chosen by leaving out pairs, or ninths of the picture if there is one pair only, which
+    says nothing of other pictures: curves are kept closer to the identity then.
 
     Args:
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
             or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own. Read once.
-        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``curves`` and
-            ``matrix``.
+        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``curves``,
+            ``matrix`` and ``saturation``.
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -123,10 +129,11 @@ def fit_look(
     check_order(order)
     step = Step("look") if step is None else step
     names = check_learn(parts, PARTS, "parts")
-    choices = [choice for choice in CHOICES if names >= {"curves" if name == "tone" else name for name in choice}]
+    choices = [tuple(name for name in some if ("curves" if name == "tone" else name) in names) for some in CHOICES]
+    choices = [some for some in dict.fromkeys(choices) if some]
     if not choices:
         raise ValueError(f"parts must name one of {', '.join(PARTS)}, got none; leave them out for all")
-    layout = Layout(KNOTS, order + 1)
+    layout = Layout(KNOTS, SATURATIONS, order + 1)
     regions: list[_Region] = []
     number = 0
     for pair in pairs:
@@ -165,8 +172,10 @@ class _Region:
 
     def look(self, step: Step, choices: Sequence[Parts]) -> FittedLook:
         """The look, of one of these choices of parts."""
-        folds = self.squares if len(self.folds) == 1 and self.squares else self.folds
-        found = choose(folds, self.layout, choices)
+        if len(self.folds) == 1 and self.squares:
+            found = choose(self.squares, self.layout, choices, STIFF_ALONE)
+        else:
+            found = choose(self.folds, self.layout, choices, STIFF)
         best = simplest(found)
         return FittedLook(
             self._step(best, step),
@@ -195,6 +204,7 @@ class _Region:
             green=green,
             blue=blue,
             matrix=_rounded(matrix.flatten()),
+            saturation=_rounded(1 + values["saturation"][0]),
         )
 
 
@@ -277,49 +287,70 @@ def _add(
     luminance = reduce_channels(before[None], "luminance")
     operator = nonlocal_operator(luminance, **options_of(step, viewed), generator=generator or seeded())
     layout = regions[0].layout
-    layers = detail_layers(operator, luminance, order=layout.sliders - 1)[0, :, 0]
-    folds = torch.zeros(viewed, dtype=torch.long)
-    if number == 0:
-        places = [torch.arange(n) * SQUARES // n for n in viewed]
-        folds = (places[0][:, None] + 2 * places[1]) % FOLDS
+    layers = detail_layers(operator, luminance, order=layout.sliders - 1)[0, :, 0].flatten(1)
+    bands = torch.stack([band[0].flatten(1) for band in bands_of(before[None])], dim=1)
+    bands[:, -1] -= luminance.mean()
+    before, after, free = (planes.flatten(1) for planes in (before, after, free))
     for region, inside in zip(regions, [None] if masks is None else masks, strict=True):
-        weights = free if inside is None else free * ((inside.to(dtype) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
-        if not bool((weights > 0).any()):
+        weights = free
+        if inside is not None:
+            weights = free * ((inside.to(dtype).flatten() - INSIDE) / (1 - INSIDE)).clamp(0, 1)
+        places = sample(weights.amax(0))
+        if len(places) == 0:
             raise ValueError("masks must hold a pixel that is not clipped in every region, got none; select some")
-        parts = sums_of(before, layers, after - before, weights, folds, layout)
-        whole = parts[0]
-        for part in parts[1:]:
-            whole = whole + part
+        share = float((weights.amax(0) > 0).sum()) / len(places)
+        some = _Pixels(before[:, places], after[:, places], layers[:, places], weights[:, places] * share)
+        columns = columns_of(some.before, bands[..., places], some.layers, layout)
+        change = some.after - some.before
+        whole = sums_of(columns, change, some.weights)
         if number == 0:
-            region.squares = [part for part in parts if float(part.count.sum()) > 0]
+            square = _squares(places, viewed[1])
+            inner = [(square == i).nonzero().squeeze(1) for i in range(SQUARES**2)]
+            region.squares = [sums_of(columns[..., i], change[:, i], some.weights[:, i]) for i in inner if len(i) > 0]
         if len(region.folds) < FOLDS:
             region.folds.append(whole)
         else:
             region.folds[number % FOLDS] = region.folds[number % FOLDS] + whole
-        _add_sliders(region, operator, luminance, before, after, weights, whole, rounding)
+        _add_sliders(region, some, whole, rounding)
 
 
-def _add_sliders(
-    region: _Region,
-    operator: Any,
-    luminance: Tensor,
-    before: Tensor,
-    after: Tensor,
-    weights: Tensor,
-    sums: Sums,
-    rounding: float,
-) -> None:
-    """Add sliders that :func:`fit_alpha` finds, to which rounding of the edited picture is no error."""
+def _squares(places: Tensor, width: int) -> Tensor:
+    """Whole numbers of pixels (P,) of a picture, by the part of the rectangle around them."""
+    rows, columns = (
+        (found - found.min()) * SQUARES // (found.max() - found.min() + 1)
+        for found in (places // width, places % width)
+    )
+    return rows * SQUARES + columns
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Some pixels of a pair.
+
+    Attributes:
+        before: (3, P).
+        after: (3, P).
+        layers: of luminance before, (k+1, P).
+        weights: (3, P).
+    """
+
+    before: Tensor
+    after: Tensor
+    layers: Tensor
+    weights: Tensor
+
+
+def _add_sliders(region: _Region, pixels: _Pixels, sums: Sums, rounding: float) -> None:
+    """Add sliders of least squares to which rounding of the edited picture is no error."""
     if region.sliders is None:
         return
     if sums.explained(fit_parts(sums, ("alpha",), region.layout, RIDGES[0])) < SLIDERS_ONLY:
         region.sliders = None
         return
     # Sliders add the same to every channel, each of which is rounded by itself.
-    luminance = luminance.expand(-1, 3, -1, -1)
-    edited = luminance + (after - before)[None]
-    mask = (weights.amin(0) > 0)[None, None].to(luminance)
-    alpha = fit_alpha(operator, luminance, edited, order=region.layout.sliders - 1, mask=mask, rounding=rounding)[0]
+    layers = pixels.layers.repeat(1, 3)
+    before, after, weights = (planes.flatten() for planes in (pixels.before, pixels.after, pixels.weights))
+    alpha = fit_layers(layers, before, after, weights, rounding)
     place = region.layout.place("alpha")
     gram = sums.gram[:, place, place].sum(0)
     gram = gram + 1e-9 * gram.diagonal().max() * torch.eye(len(gram), dtype=gram.dtype)

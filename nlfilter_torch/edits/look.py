@@ -1,4 +1,4 @@
-"""A look: detail sliders, gains of blurs, tone curves and a colour matrix, as found by :func:`fit_look`."""
+"""A look: detail sliders, gains of blurs, tone curves, a colour matrix and saturation, as found by :func:`fit_look`."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -29,6 +29,7 @@ def apply_look(
     green: Numbers = LOOK.defaults["green"],
     blue: Numbers = LOOK.defaults["blue"],
     matrix: Numbers = LOOK.defaults["matrix"],
+    saturation: Numbers = LOOK.defaults["saturation"],
     amount: float | Tensor = LOOK.defaults["amount"],
     viewing_size: float = LOOK.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
@@ -47,6 +48,8 @@ def apply_look(
         green: likewise, as many.
         blue: likewise.
         matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
+        saturation: how many times as far each channel is to be from the largest one of its pixel, (K,) or (B, K), for
+            colours whose saturation in HSV is at equal steps from 0 to 1.
         amount: a number or a tensor of shape () or (B,); 1 is the look, 0 the image.
         viewing_size: in megapixels; the details of a larger image are those of its reduction to this size; 0 is the
             size of the image.
@@ -78,6 +81,7 @@ def apply_look(
         green=green,
         blue=blue,
         matrix=matrix,
+        saturation=saturation,
         amount=amount,
         viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
@@ -96,6 +100,7 @@ def fit_look_edit(
     green: Numbers = LOOK.defaults["green"],
     blue: Numbers = LOOK.defaults["blue"],
     matrix: Numbers = LOOK.defaults["matrix"],
+    saturation: Numbers = LOOK.defaults["saturation"],
     amount: float | Tensor = LOOK.defaults["amount"],
     viewing_size: float = LOOK.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
@@ -108,7 +113,7 @@ def fit_look_edit(
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
     LOOK["amount"].check_argument(amount, source.batch)
     LOOK["viewing_size"].check_argument(viewing_size)
-    sliders, gains = (_numbers(value, source) for value in (alpha, bands))
+    sliders, gains, factors = (_numbers(value, source) for value in (alpha, bands, saturation))
     channels = [_numbers(value, source) for value in (red, green, blue)]
     if len({channel.shape[-1] for channel in channels}) > 1:
         lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
@@ -119,7 +124,8 @@ def fit_look_edit(
     if colours.shape[-1] != 9:
         raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
     colours = colours.unflatten(-1, (3, 3))
-    for name, value in (("alpha", sliders), ("bands", gains), ("curves", curves), ("matrix", colours)):
+    parts = {"alpha": sliders, "bands": gains, "curves": curves, "matrix": colours, "saturation": factors}
+    for name, value in parts.items():
         check_part(value, name, source.batch)
     strength = torch.as_tensor(amount).to(source.dtype).reshape(-1, 1, 1, 1)
 
@@ -147,7 +153,7 @@ def fit_look_edit(
 
     def result(image: Tensor, moved: Tensor) -> Tensor:
         coloured = image.expand(-1, 3, -1, -1)
-        shown = pointwise(coloured, curves, colours) - coloured
+        shown = pointwise(coloured, curves, colours, factors) - coloured
         shown = reduce_channels(shown, "luminance") if image.shape[1] == 1 else shown
         return image + strength * (moved - image + shown)
 

@@ -520,6 +520,7 @@ ABSTRACT = Edit(
 )
 
 KNOTS = 17  # of a tone curve
+SATURATIONS = 5  # that have a factor of their own
 STRAIGHT = tuple(i / (KNOTS - 1) for i in range(KNOTS))
 
 
@@ -578,6 +579,17 @@ LOOK = Edit(
             idle=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
             metavar="RR,RG,...,BB",
             length=9,
+        ),
+        Parameter(
+            "saturation",
+            "sliders",
+            (1.0,) * SATURATIONS,
+            "How many times as far red, green and blue are to be from the largest of them, as saturation in HSV: a "
+            "factor for each of five equal steps from grey to pure colours. 1 leaves them as they are.",
+            *GAINS,
+            "gain",
+            idle=(1.0,) * SATURATIONS,
+            metavar="A,B,...,E",
         ),
         Parameter(
             "amount",

@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import (
     check_tensor,
     check_values,
 )
-from nlfilter_torch.core.communicator import Communicator
+from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_hidden
@@ -123,6 +123,34 @@ def fit_alpha(
     if loss is not None:
         change = problem.descend(change, loss, target.double(), mask)
     return (1.0 + change).to(image.dtype)
+
+
+@torch.no_grad()
+def fit_layers(layers: Tensor, image: Tensor, target: Tensor, weights: Tensor, rounding: float) -> Tensor:
+    """:func:`fit_alpha` for some values of an image and the layers that are added to it, which need not add up to it.
+
+    Args:
+        layers: (k+1, P).
+        image: values (P,) before the edit.
+        target: (P,) after it.
+        weights: (P,), not all 0.
+        rounding: half the step between the values of ``target``.
+
+    Returns:
+        alpha, (k+1,), in float64.
+    """
+    aim = target.double()[None]
+    problem = _Problem(
+        layers=layers.double()[None],
+        edit=aim - image.double()[None],
+        dead_zone=_dead_zone(aim, rounding) if rounding > 0.0 else None,
+        weights=(weights.double() / weights.double().sum())[None],
+        ridge=0.0,
+        shared=False,
+        precision=layers.dtype,
+        among=ALONE,
+    )
+    return 1.0 + problem.fit()[0]
 
 
 def _check_not_negative(value: float, name: str) -> None:

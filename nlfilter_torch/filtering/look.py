@@ -1,4 +1,4 @@
-"""A look: sliders of the filter and of blurs, a tone curve for each channel, and a colour matrix, added up.
+"""A look: sliders of the filter and of blurs, tone curves, a colour matrix and saturation, added up.
 
 Each part gives a change of the image, and the result is the image plus all changes, so that it is linear in every
 parameter but the image: looks are fitted to edits by least squares.
@@ -16,8 +16,9 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
-NAMES = ("alpha", "bands", "curves", "matrix")
-DIMENSIONS = {"alpha": 1, "bands": 1, "curves": 2, "matrix": 2}  # of one image
+DARKEST = 1 / 255  # that has a saturation
+NAMES = ("alpha", "bands", "curves", "matrix", "saturation")
+DIMENSIONS = {"alpha": 1, "bands": 1, "curves": 2, "matrix": 2, "saturation": 1}  # of one image
 
 
 def filter_look(
@@ -27,6 +28,7 @@ def filter_look(
     bands: Tensor | None = None,
     curves: Tensor | None = None,
     matrix: Tensor | None = None,
+    saturation: Tensor | None = None,
     operator: NonlocalOperator | None = None,
 ) -> Tensor:
     """An image under a look, each part of which may be left out.
@@ -39,6 +41,8 @@ def filter_look(
         curves: (3, K) or (B, 3, K), what red, green and blue become at K equal steps from 0 to 1.
         matrix: (3, 3) or (B, 3, 3) that colours are multiplied by; its change, like that of the curves, is that of the
             image itself.
+        saturation: (K,) or (B, K), how many times as far each channel is to be from the largest one of its pixel, for
+            colours whose saturation in HSV is at K equal steps from 0 to 1.
         operator: W, which ``alpha`` needs.
 
     Returns:
@@ -54,11 +58,11 @@ def filter_look(
         True
     """
     check_image(image, "image", channels=3)
-    parts = {"alpha": alpha, "bands": bands, "curves": curves, "matrix": matrix}
+    parts = {"alpha": alpha, "bands": bands, "curves": curves, "matrix": matrix, "saturation": saturation}
     given = {name: value for name, value in parts.items() if value is not None}
     for name, value in given.items():
         check_part(value, name, image.shape[0])
-    result = pointwise(image, curves, matrix)
+    result = pointwise(image, curves, matrix, saturation)
     if bands is not None:
         mean = reduce_channels(image, "luminance").mean((2, 3), keepdim=True)
         result = result + band_change(image, bands, mean)
@@ -72,7 +76,13 @@ def filter_look(
 def check_part(value: Tensor, name: str, batch: int) -> None:
     """Raise unless a part of a look has its shape."""
     check_tensor(value, name)
-    shapes = {"alpha": "(k+1,)", "bands": f"({BLURS + 1},)", "curves": "(3, K)", "matrix": "(3, 3)"}
+    shapes = {
+        "alpha": "(k+1,)",
+        "bands": f"({BLURS + 1},)",
+        "curves": "(3, K)",
+        "matrix": "(3, 3)",
+        "saturation": "(K,)",
+    }
     shape, one = tuple(value.shape), DIMENSIONS[name]
     last = shape[-one:]
     fits = {
@@ -80,6 +90,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         "bands": lambda: last == (BLURS + 1,),
         "curves": lambda: last[0] == 3 and last[1] >= 2,
         "matrix": lambda: last == (3, 3),
+        "saturation": lambda: last[0] >= 2,
     }
     if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
         raise ValueError(
@@ -87,15 +98,31 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         )
 
 
-def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None) -> Tensor:
-    """The image (B, 3, H, W) plus what tone curves and matrix change."""
+def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None, saturation: Tensor | None) -> Tensor:
+    """The image (B, 3, H, W) plus what tone curves, matrix and saturation change."""
     result = image
     if curves is not None:
         result = tone_curve(image, curves)
     if matrix is not None:
         change = matrix - torch.eye(3).to(matrix)
         result = result + (change.to(image) @ image.flatten(2)).view_as(image)
+    if saturation is not None:
+        factors = (saturation.to(image) - 1).reshape(-1, saturation.shape[-1], 1, 1)
+        result = result + below_largest(image) * (factors * saturation_hats(image, saturation.shape[-1])).sum(1, True)
     return result
+
+
+def below_largest(image: Tensor) -> Tensor:
+    """How far each channel of an image (B, 3, H, W) is from the largest one of its pixel."""
+    return image - image.amax(1, keepdim=True)
+
+
+def saturation_hats(image: Tensor, count: int) -> Tensor:
+    """How much of each of some equal steps from 0 to 1 there is in the saturation in HSV, (B, K, H, W)."""
+    largest, least = image.amax(1, keepdim=True), image.amin(1, keepdim=True)
+    share = ((largest - least) / largest.clamp(min=DARKEST)).clamp(0, 1)
+    steps = torch.arange(count).to(image).view(-1, 1, 1)
+    return (1 - (share * (count - 1) - steps).abs()).clamp(min=0)
 
 
 def tone_curve(image: Tensor, curves: Tensor) -> Tensor:

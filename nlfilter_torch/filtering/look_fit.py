@@ -1,9 +1,10 @@
 """The look that explains edits best, from small sums over pixels. See :mod:`nlfilter_torch.filtering.look`.
 
 A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
-channel a tone curve's hat functions, the three colours, the bands of blurs and the layers of the filter. Which parts a
-look has, and how strong a ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the
-picture if there are few. A curve is kept from falling by a least-squares problem with bounds.
+channel a tone curve's hat functions, the three colours, the distance from the largest of them at each saturation, the
+bands of blurs and the layers of the filter. Which parts a look has, and how strong a ridge keeps them close to the
+identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A curve is kept from falling by a
+least-squares problem with bounds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,8 +14,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from nlfilter_torch.filtering.look import BLURS, bands_of
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.filtering.look import BLURS, below_largest, saturation_hats
 
 Parts = tuple[str, ...]
 
@@ -22,25 +22,28 @@ Parts = tuple[str, ...]
 CHOICES: tuple[Parts, ...] = (
     ("alpha",),
     ("matrix",),
+    ("saturation",),
     ("tone",),
     ("bands",),
+    ("matrix", "saturation"),
     ("tone", "matrix"),
     ("bands", "matrix"),
     ("curves",),
-    ("curves", "matrix"),
     ("tone", "bands"),
     ("alpha", "bands"),
+    ("curves", "matrix", "saturation"),
     ("tone", "matrix", "bands"),
-    ("alpha", "tone", "matrix"),
-    ("alpha", "tone", "matrix", "bands"),
-    ("curves", "matrix", "bands"),
-    ("alpha", "curves", "matrix", "bands"),
+    ("alpha", "tone", "matrix", "saturation"),
+    ("alpha", "tone", "matrix", "saturation", "bands"),
+    ("curves", "matrix", "saturation", "bands"),
+    ("alpha", "curves", "matrix", "saturation", "bands"),
 )
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 ROUGH = 10.0  # weight of a curve's bends beside that of its distance from the identity
-SLACK, FAINT = 1.1, 0.002  # a simpler look may leave so many times as much, and so much of the change more
+SLACK, FAINT = 1.1, 0.0003  # a simpler look may leave so many times as much, and so much of the change more
 SMALL = 1.0  # weight of the mean change of pairs beside that of one, whose share it is divided by
-BLOCK = 1 << 14  # pixels whose products are summed up at once
+MILD = 10.0  # times a ridge is at least as large as the share that looks leave
+MOST = 1 << 16  # pixels of a pair that sums are taken over
 
 
 @dataclass(frozen=True)
@@ -49,16 +52,24 @@ class Layout:
 
     Attributes:
         knots: K of a tone curve.
+        factors: of saturation.
         sliders: of the filter.
     """
 
     knots: int
+    factors: int
     sliders: int
 
     @property
     def lengths(self) -> dict[str, int]:
         """Columns of each kind, in their order."""
-        return {"curves": self.knots, "matrix": 3, "bands": BLURS + 1, "alpha": self.sliders}
+        return {
+            "curves": self.knots,
+            "matrix": 3,
+            "saturation": self.factors,
+            "bands": BLURS + 1,
+            "alpha": self.sliders,
+        }
 
     @property
     def columns(self) -> int:
@@ -118,56 +129,43 @@ class Sums:
         return 1.0 - self.left(coefficients) / max(float(self.power.sum()), 1e-30)
 
 
-def sums_of(image: Tensor, layers: Tensor, change: Tensor, weights: Tensor, fold: Tensor, layout: Layout) -> list[Sums]:
-    """The sums of a pair, one for each number in ``fold``.
+def sample(weights: Tensor) -> Tensor:
+    """Pixels (P,) that sums are taken over: all that have a weight (H, W), or one at random of each of many runs."""
+    places = weights.flatten().nonzero().squeeze(1)
+    if len(places) <= MOST:
+        return places
+    random = torch.rand(MOST, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
+
+
+def columns_of(image: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
+    """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
-        image: (3, H, W), before the edit.
-        layers: of its luminance, (k+1, H, W).
-        change: (3, H, W).
-        weights: of each channel's pixels, (3, H, W).
-        fold: whole numbers (H, W).
+        image: pixels (3, P) before the edit.
+        local: their bands, (3, 7, P).
+        layers: of luminance, (k+1, P).
         layout: of the columns.
     """
-    mean = reduce_channels(image[None], "luminance").mean()
-    bands = [band[0] for band in bands_of(image[None])]
-    bands[-1] = bands[-1] - mean
-    numbers = range(int(fold.max()) + 1)
-    found: list[Sums | None] = [None for _ in numbers]
-    columns, steps = image.shape[2], max(1, BLOCK // image.shape[2])
-    knots = torch.arange(layout.knots).to(image).view(-1, 1)
-    for start in range(0, image.shape[1], steps):
-        rows = slice(start, min(start + steps, image.shape[1]))
-        pixels = (rows.stop - rows.start) * columns
-        colours, parts = image[:, rows].reshape(3, pixels), layers[:, rows].reshape(-1, pixels)
-        for channel in range(3):
-            hats = (1 - (colours[channel].clamp(0, 1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
-            local = torch.stack([band[channel, rows].reshape(pixels) for band in bands])
-            design = torch.cat([hats, colours, local, parts]).double()  # its columns nearly depend on each other
-            weight, moved = weights[channel, rows].flatten().double(), change[channel, rows].flatten().double()
-            places = fold[rows].flatten()
-            for number in numbers:
-                some = slice(None) if len(numbers) == 1 else (places == number).nonzero().squeeze(1)
-                columns_here, moved_here = design[:, some], moved[some]
-                weighed = columns_here * weight[some]
-                total = _channel(
-                    channel,
-                    weighed @ columns_here.mT,
-                    weighed @ moved_here,
-                    (weight[some] * moved_here) @ moved_here,
-                    weight[some].sum(),
-                )
-                known = found[number]
-                found[number] = total if known is None else known + total
-    return [part for part in found if part is not None]
+    colours = image.double()  # the columns nearly depend on each other
+    knots = torch.arange(layout.knots).to(colours).view(-1, 1)
+    hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
+    spread = [values.double().expand(3, -1, -1) for values in (colours, layers)]
+    steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
+    below = below_largest(colours[None])[0].unsqueeze(1) * steps
+    return torch.cat([hats, spread[0], below, local.double(), spread[1]], dim=1)
 
 
-def _channel(channel: int, *values: Tensor) -> Sums:
-    """Sums of one channel alone."""
-    spread = [torch.zeros(3, *value.shape, dtype=torch.float64) for value in values]
-    for whole, value in zip(spread, values, strict=True):
-        whole[channel] = value.double()
-    return Sums(*spread)
+def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
+    """The sums of columns (3, F, P), the change (3, P) and weights (3, P) of some pixels."""
+    columns, change, weights = (values.double() for values in (columns, change, weights))
+    weighed = columns * weights.unsqueeze(1)
+    return Sums(
+        weighed @ columns.mT,
+        (weighed @ change.unsqueeze(2)).squeeze(2),
+        (weights * change.square()).sum(1),
+        weights.sum(1),
+    )
 
 
 @dataclass(frozen=True)
@@ -189,36 +187,66 @@ class Found:
     risk: float
 
 
-def choose(folds: Sequence[Sums], layout: Layout, choices: Iterable[Parts] = CHOICES) -> dict[Parts, Found]:
-    """The best ridge for each choice of parts, by leaving out each of the folds in turn."""
+def choose(folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stiff: float) -> dict[Parts, Found]:
+    """The best ridge for each choice of parts, by leaving out each of the folds in turn.
+
+    What a look leaves of an edit depends on the picture, and so do parameters that were found beside it: the more is
+    left, the stronger ridges are at least.
+
+    Args:
+        folds: sums of pairs, or of parts of a picture.
+        layout: of the columns.
+        choices: of parts.
+        stiff: see :func:`fit_parts`.
+    """
+    found = _choose(folds, layout, choices, stiff, RIDGES)
+    left = min(look.risk for look in found.values())
+    if left <= stiff:
+        return found
+    ridges = tuple(ridge for ridge in RIDGES if ridge >= left / MILD) or RIDGES[-1:]
+    return _choose(folds, layout, choices, left, ridges)
+
+
+def _choose(
+    folds: Sequence[Sums], layout: Layout, choices: Iterable[Parts], stiff: float, ridges: Sequence[float]
+) -> dict[Parts, Found]:
     total = reduce(Sums.__add__, folds)
     power = max(float(total.power.sum()), 1e-30)
     found: dict[Parts, Found] = {}
     powers = torch.stack([sums.power.sum() for sums in folds])
-    ridges = torch.tensor(RIDGES, dtype=torch.float64).view(-1, 1, 1, 1)
     for parts in choices:
         spread = layout.spread(parts)
         products = [_products(sums, spread) for sums in folds]
         grams, crosses = (torch.stack(values) for values in zip(*products, strict=True))
         without, aims = grams.sum(0) - grams, crosses.sum(0) - crosses
-        weights = torch.stack([_penalty(gram, parts, layout) for gram in without])
-        solved = torch.linalg.solve(without + ridges * weights + _floor(without), aims.expand(len(ridges), -1, -1))
+        ridged = torch.stack(
+            [torch.stack([gram + _penalty(gram, parts, layout, ridge, stiff) for gram in without]) for ridge in ridges]
+        )
+        solved = torch.linalg.solve(ridged + _floor(without), aims.expand(len(ridges), -1, -1))
         changes = torch.einsum("rfp,fpq,rfq->rf", solved, grams, solved)
         changes = changes - 2 * torch.einsum("rfp,fp->rf", solved, crosses)
         shares = ((changes + powers) / (powers + SMALL * powers.mean().clamp(min=1e-30))).mean(1)
         best = int(shares.argmin())
-        coefficients = fit_parts(total, parts, layout, RIDGES[best])
+        coefficients = fit_parts(total, parts, layout, ridges[best], stiff)
         found[parts] = Found(
             parts, coefficients, total.explained(coefficients), -float(changes[best].sum()) / power, float(shares[best])
         )
     return found
 
 
-def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float) -> Tensor:
-    """Coefficients (3, F) of the look of some parts that explains most, under a ridge."""
+def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: float = 0.0) -> Tensor:
+    """Coefficients (3, F) of the look of some parts that explains most.
+
+    Args:
+        sums: of pairs.
+        parts: of the look.
+        layout: of the columns.
+        ridge: weight of the distance from the identity.
+        stiff: least such weight for tone curves and saturation, which few pictures have every value of.
+    """
     spread = layout.spread(parts)
     gram, cross = _products(sums, spread)
-    return spread @ _solve(gram + ridge * _penalty(gram, parts, layout) + _floor(gram), cross, parts, layout)
+    return spread @ _solve(gram + _penalty(gram, parts, layout, ridge, stiff) + _floor(gram), cross, parts, layout)
 
 
 def simplest(found: dict[Parts, Found]) -> Found:
@@ -232,19 +260,20 @@ def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:
     return gram, torch.einsum("cfp,cf->p", spread, sums.cross)
 
 
-def _penalty(gram: Tensor, parts: Parts, layout: Layout) -> Tensor:
+def _penalty(gram: Tensor, parts: Parts, layout: Layout, ridge: float, stiff: float) -> Tensor:
     """Weights (P, P) of the distance of parameters from the identity, relative to what the columns weigh."""
-    penalty = torch.diag(gram.diagonal())
+    penalty = torch.diag(ridge * gram.diagonal())
     start = 0
+    bent = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
     for part in parts:
-        curves = {"tone": 1, "curves": 3}.get(part, 0)
+        curves, length = bent.get(part, (0, 0))
         for _ in range(curves):
-            place = slice(start, start + layout.knots)
-            bends = torch.eye(layout.knots, dtype=gram.dtype).diff(n=2, dim=0)
-            level = gram.diagonal()[place].mean()
-            straight = torch.eye(layout.knots, dtype=gram.dtype)
+            place = slice(start, start + length)
+            straight = torch.eye(length, dtype=gram.dtype)
+            bends = straight.diff(n=2, dim=0)
+            level = max(ridge, stiff) * gram.diagonal()[place].mean()
             penalty[place, place] = level * (ROUGH * bends.mT @ bends + straight)
-            start += layout.knots
+            start += length
         if not curves:
             start += layout.lengths[part] * (3 if part == "matrix" else 1)
     return penalty

@@ -17,13 +17,14 @@ NEAR = 1 / 12  # spatial bandwidth, as a share of the short side, of looks that 
 
 
 class Look(nn.Module):
-    """Image to the image under a look: sliders, gains of blurs, tone curves and a colour matrix, added up.
+    """Image to the image under a look: what its parts, from sliders to a colour matrix, change of it is added up.
 
     Paper: eq. (12) for the sliders. Starts from the identity, or from what :func:`fit_look` found.
 
     Args:
-        parts: values to start from, by the names ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K) and ``matrix``
-            (3, 3), as :meth:`FittedLook.tensors` gives them; those that are left out are the identity.
+        parts: values to start from, by the names ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K), ``matrix``
+            (3, 3) and ``saturation`` (K,), as :meth:`FittedLook.tensors` gives them; those that are left out are the
+            identity.
         learn: names of the parts that are learned; the others are buffers.
         knots: K, for curves that start from the identity.
         **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
@@ -43,6 +44,7 @@ class Look(nn.Module):
     bands: Tensor
     curves: Tensor
     matrix: Tensor
+    saturation: Tensor
 
     def __init__(
         self,
@@ -61,6 +63,7 @@ class Look(nn.Module):
             "bands": torch.ones(BLURS + 1),
             "curves": torch.linspace(0, 1, knots).expand(3, -1),
             "matrix": torch.eye(3),
+            "saturation": torch.ones(5),
         } | given
         for name, value in start.items():
             check_part(value, name, 1)
