@@ -121,6 +121,17 @@ def _segment_module(spectrum: nlf.Spectrum, regions: Tensor, **options: Any) -> 
     return nlf.SegmentMask(**options)(spectrum, regions)
 
 
+def _look(**options: Any) -> Tensor:
+    image = options.pop("image")
+    return nlf.Look(**options)(image)
+
+
+def _fitted_look(before: Tensor, **options: Any) -> Tensor:
+    found = nlf.fit_look([(before, before.square())], **options)
+    assert isinstance(found, nlf.FittedLook)
+    return torch.tensor([found.fitted, found.left_out])
+
+
 def _first(scene: Scene) -> Tensor:
     return scene.image(3)[:1]
 
@@ -237,6 +248,19 @@ FUNCTIONS = {
         | {"method": _one_of("regression", "kmeans"), "strength": _number(0, 1), "time": _number(0.1, 5)}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
+    "apply_look": Function(
+        nlf.apply_look,
+        {"image": _image(1, 3)},
+        FILTER
+        | {"alpha": lambda scene: 4 * scene.noise(scene.order + 1), "bands": lambda scene: 2 * scene.noise(7)}
+        | {"matrix": lambda scene: scene.noise(9), "amount": _number(0, 2)},
+    ),
+    "fit_look": Function(
+        _fitted_look,
+        {"before": lambda scene: scene.noise(1, 3, 24, 24)},
+        ORDER | {"parts": _one_of(("curves",), ("alpha", "matrix"))},
+    ),
+    "Look": Function(_look, {"image": _image(3)}, {"learn": _one_of((), ("matrix",)), "knots": _count(2, 20)}),
     "NonlocalFilter": Function(
         _layer, LIST | {"image": _image(1, 3)}, RESIDUAL | FILTER | GUIDED | {"learn": _one_of((), ("alpha",))}
     ),
