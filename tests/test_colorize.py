@@ -1,7 +1,6 @@
 """Colourising: colours come back from strokes, and luminance stays what it was."""
 
 import numpy as np
-import pytest
 import torch
 
 from nlfilter_torch import colorize
@@ -43,28 +42,6 @@ def test_a_line_between_equal_greys_keeps_their_colours_apart() -> None:
     # By similarity alone a quarter of the right would be red.
     assert (redder[:, :28] > 0).float().mean() > 0.97
     assert (redder[:, 32:] < 0).float().mean() > 0.97
-
-
-def test_colour_is_weakened_where_the_estimates_disagree_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    grey = torch.full((1, 1, 40, 60), 0.5, dtype=torch.float64)
-    grey[..., 20:22] = grey[..., 40:42] = 0.1
-    left, middle = box(10, 6, size=(40, 60)).double(), box(26, 26, size=(40, 60)).double()
-    red = paint(0.8, 0.4, 0.4, left)
-
-    def chroma(doubt: float, blue: float) -> torch.Tensor:
-        monkeypatch.setattr("nlfilter_torch.edits.colorize.DOUBT", doubt)
-        other = paint(0.8 - 0.4 * blue, 0.4, 0.4 + 0.4 * blue, middle)
-        found = colorize(grey, red + other, left + middle, num_landmarks=40, spatial_bandwidth=200.0)
-        return split_luminance(found)[1].norm(dim=1)
-
-    # One colour: both extend it alike, as it is. Two: those alike in grey get the mean, those connected the nearest.
-    wanted = split_luminance(paint(0.8, 0.4, 0.4, torch.ones(1, 1, 1, 1, dtype=torch.float64)))[1].norm()
-    bright = grey[:, 0] > 0.3
-    torch.testing.assert_close(chroma(0.3, 0.0)[bright], wanted.expand(int(bright.sum())), atol=1e-5, rtol=0)
-    full, weakened = chroma(0.0, 1.0), chroma(0.3, 1.0)
-    assert (weakened <= full + 1e-6).all()
-    assert weakened[..., 24:38].mean() < 0.98 * full[..., 24:38].mean()
-    assert (weakened > 0.98 * full)[left[:, 0] > 0].all()
 
 
 def test_one_pixel_and_all_pixels_may_be_painted() -> None:

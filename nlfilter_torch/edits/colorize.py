@@ -2,7 +2,7 @@
 
 Two estimates of the chroma are mixed: the regression on the strokes knows which pixels are alike, however far apart,
 and :class:`LocalValues` which are connected without a border between them. They err in different places, so that their
-mean is better than either of them, and where they disagree, weaker colour is nearer the truth on the average.
+mean is better than either of them.
 """
 
 import math
@@ -55,8 +55,6 @@ class Stage:
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
 SHARE = 0.5  # of the local values on a stroke
-DOUBT = 0.3  # weight of the squared difference of the two estimates, against the squared chroma, that weakens it
-LEAST_CHROMA = 1e-3  # added to chroma there
 
 
 @full_precision
@@ -78,8 +76,8 @@ def colorize(
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first far, then
     what is left of it near the strokes, and mixes it with chroma that spreads from neighbour to neighbour up to edges,
-    half and half where strokes determine the latter. Where the two disagree, chroma is weakened. ``"kmeans"`` is the
-    paper's way: the image is cut into as many pieces as there are colours, by :func:`segment_mask`.
+    half and half where strokes determine the latter. ``"kmeans"`` is the paper's way: the image is cut into as many
+    pieces as there are colours, by :func:`segment_mask`.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
@@ -202,11 +200,7 @@ def fit_colorize(
     def coloured(some: Any) -> Tensor:
         grey, alike = luminance(some), far(some) + near(some)
         connected, influence = local(grey, some.first)
-        apart = with_green(connected) - influence * alike
-        chroma = alike + SHARE * apart
-        squared, doubt = (part.square().sum(1, keepdim=True) for part in (chroma, apart))
-        squared = squared + LEAST_CHROMA**2
-        return merge_luminance(grey, squared / (squared + DOUBT * doubt) * chroma)
+        return merge_luminance(grey, alike + SHARE * (with_green(connected) - influence * alike))
 
     return Fitted(coloured)
 
