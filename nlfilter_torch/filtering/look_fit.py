@@ -39,7 +39,8 @@ CHOICES: tuple[Parts, ...] = (
     ("alpha", "curves", "matrix", "saturation", "bands"),
 )
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-ROUGH = 10.0  # weight of a curve's bends beside that of its distance from the identity
+#: Weight of a curve's bends beside that of its distance from the identity, all that counts for factors of saturation.
+ROUGHNESS = {"tone": 10.0, "curves": 10.0, "saturation": 0.0}
 SLACK, FAINT = 1.1, 0.0003  # a simpler look may leave so many times as much, and so much of the change more
 SMALL = 1.0  # weight of the mean change of pairs beside that of one, whose share it is divided by
 MILD = 10.0  # times a ridge is at least as large as the share that looks leave
@@ -272,7 +273,8 @@ def _penalty(gram: Tensor, parts: Parts, layout: Layout, ridge: float, stiff: fl
             straight = torch.eye(length, dtype=gram.dtype)
             bends = straight.diff(n=2, dim=0)
             level = max(ridge, stiff) * gram.diagonal()[place].mean()
-            penalty[place, place] = level * (ROUGH * bends.mT @ bends + straight)
+            rough = ROUGHNESS[part]
+            penalty[place, place] = level * (rough * bends.mT @ bends + straight)
             start += length
         if not curves:
             start += layout.lengths[part] * (3 if part == "matrix" else 1)
