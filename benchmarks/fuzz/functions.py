@@ -127,7 +127,8 @@ def _look(**options: Any) -> Tensor:
 
 
 def _fitted_look(before: Tensor, **options: Any) -> Tensor:
-    found = nlf.fit_look([(before, before.square())], **options)
+    after = before.square() if isinstance(before, Tensor) else before
+    found = nlf.fit_look([(before, after)], **options)
     assert isinstance(found, nlf.FittedLook)
     return torch.tensor([found.fitted, found.left_out])
 

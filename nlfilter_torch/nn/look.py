@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.core.checks import check_image
+from nlfilter_torch.core.checks import check_count, check_image
 from nlfilter_torch.filtering.look import BLURS, NAMES, check_part, filter_look
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import nonlocal_operator
@@ -58,6 +58,7 @@ class Look(nn.Module):
         names = check_learn(learn, NAMES)
         given = {} if parts is None else dict(parts)
         check_learn(list(given), NAMES, "parts")
+        check_count(knots, "knots", least=2)
         start = {
             "alpha": torch.ones(4),
             "bands": torch.ones(BLURS + 1),
