@@ -78,10 +78,10 @@ def named(node: ast.expr) -> str:
 
 
 def declares(node: ast.AST, name: str) -> bool:
-    """Whether a node is ``Parameter("name", ...)``."""
+    """Whether a node is ``Parameter("name", ...)``, or the call of a function that makes one."""
     return (
         isinstance(node, ast.Call)
-        and named(node.func) == "Parameter"
+        and named(node.func) in ("Parameter", "_curve")
         and isinstance(node.args[0], ast.Constant)
         and node.args[0].value == name
     )
