@@ -16,6 +16,7 @@ from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.source import Fitted, Source, edited
 
 TINY = 1e-12  # keeps the derivative of a root finite
+DOUBTFUL = 0.1  # masks nearer to 0 or 1 count as these: a faint tint far away is seen, an edge less soft is not
 SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
 
 
@@ -143,7 +144,8 @@ class Recoloring:
 
     def shares(self, masks: Tensor) -> Tensor:
         """How much of a pixel takes each colour, (B, K, H, W), under masks likewise."""
-        shares = masks * self.counts[..., None, None]
+        certain = ((masks - DOUBTFUL) / (1 - 2 * DOUBTFUL)).clamp(0.0, 1.0)
+        shares = certain * self.counts[..., None, None]
         return shares / shares.sum(1, keepdim=True).clamp(min=1.0)
 
     def __call__(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
