@@ -15,7 +15,9 @@ from nlfilter_torch.edits.source import Fitted, Source, edited
 
 Aperture = Literal["disc", "gaussian"]
 
-BLURRED, SHARP = 0.1, 0.4  # a mask below BLURRED is all background, above SHARP all subject: a doubt is kept sharp
+# A mask below BLURRED is all background, above SHARP all subject. A blurred part of a subject disturbs more than a
+# sharp part of the background: doubts are kept sharp, and a subject reaches further than other regions.
+BLURRED, SHARP, REACH = 0.1, 0.4, 0.75
 LEAST = 1e-5  # weight of the subject in the blur of what is behind it
 
 
@@ -98,7 +100,7 @@ def fit_defocus(
     scribbles = source.scribbles(focus_region, None, "focus_region")
     options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
     spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
-    found = fit_regions(source, [scribbles], [], spatial_bandwidth=spatial_bandwidth, **options)
+    found = fit_regions(source, [scribbles], [], reach=REACH, spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, masks: Tensor) -> Tensor:
         return blur_behind(image, focus_of(masks), reach, aperture)
