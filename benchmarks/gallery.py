@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.figures.colours import BLUE, TRUE, reached
-from benchmarks.figures.focus import PORTRAIT, WIDE, default_map
+from benchmarks.figures.focus import WIDE, default_map
 from benchmarks.figures.scenes import YELLOW, luminance, marked, painted_over, scene, scribbled, spots, strokes
 from nlfilter_torch import abstract, colorize, defocus, enhance, recolor, region_mask
 from nlfilter_torch.edits.resizing import resize
@@ -68,7 +68,7 @@ def focusing() -> dict[str, Tensor]:
     """A portrait."""
     image, scale = scene("astronaut", SIZE)
     image = image[..., : round(image.shape[-1] / WIDE), :]
-    region = spots(image, scale, PORTRAIT[0], PORTRAIT[6])  # the face and the suit
+    region = spots(image, scale, *SUBJECT)
     return {
         "Spots to stay sharp": marked(image, region),
         "What stays sharp": default_map(image, region),
