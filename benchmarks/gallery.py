@@ -20,7 +20,7 @@ from nlfilter_torch.io.photographs import Photograph, write_photograph
 from nlfilter_torch.plotting import save_figure, show_images
 
 SIDE = 270  # of a panel
-FRONT = (486, 720)  # of a panel of the first picture
+FRONT = (432, 640)  # of a panel of the first picture
 GAP = 5  # around it
 SUBJECT = ((205, 60, 30, 110), (215, 185, 30, 60), (90, 290, 60, 12), (300, 300, 40, 12))  # a face, a collar, a suit
 SIZE = 640  # of a photograph

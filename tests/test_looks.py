@@ -98,10 +98,8 @@ def test_tiles_are_the_image_in_memory(viewing: float, channels: int, tmp_path: 
     )  # fmt: skip
     image = CAT[:, :channels]
     whole = apply_step(step, image)
-    passes = Passes(memory=1 << 30, tile_rows=13, kind="float32")
-    rows = [
-        values for _, values in edit_rows(passes, image[0].permute(1, 2, 0).numpy(), Recipe((step,)), "it", tmp_path)
-    ]
+    passes = Passes(memory=1 << 30, tile_rows=13, kind="float32", folder=tmp_path)
+    rows = [values for _, values in edit_rows(passes, image[0].permute(1, 2, 0).numpy(), Recipe((step,)), "it")]
     tiled = torch.cat([torch.from_numpy(part) for part in rows]).permute(2, 0, 1)[None]
     assert (tiled - whole).abs().max() < 2e-3
     assert (whole - image).abs().mean() > 0.02

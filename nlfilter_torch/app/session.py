@@ -262,10 +262,10 @@ class Session:
     def _in_tiles(recipe: Recipe, photograph: Photograph, folder: Path, report: Report) -> Tensor:
         """The edited pixels, from as much memory as an edit takes without being asked."""
         rows = photograph.pixels[0].permute(1, 2, 0).numpy()
-        passes = Passes(str(rows.dtype), memory=modest_memory(), report=report)
+        passes = Passes(str(rows.dtype), memory=modest_memory(), report=report, folder=folder)
         channels = 3 if recipe.gives_colour else rows.shape[2]
         pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-        for part, values in edit_rows(passes, rows, recipe, "the photograph", folder):
+        for part, values in edit_rows(passes, rows, recipe, "the photograph"):
             pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         return pixels
 

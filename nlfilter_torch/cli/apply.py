@@ -47,7 +47,7 @@ def apply(
         return recipe.apply(photograph.pixels)
 
     def by_rows(job: Job) -> Rows:
-        return edit_rows(job.passes(full), job.picture.rows, recipe, source, Path(target).parent)
+        return edit_rows(job.passes(full, Path(target).parent), job.picture.rows, recipe, source)
 
     editing.edit_file(
         source,

@@ -20,7 +20,7 @@ from nlfilter_torch.io.photographs import (
 from nlfilter_torch.io.rows import StoredPicture, check_place, is_zarr, modest_memory, open_picture, write_picture
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import Rows
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.tiled.tiles import Passes, Statistics
 
 MOST = 1e6  # gigabytes that anyone may have
 
@@ -67,9 +67,10 @@ class Job:
         """(H, W)."""
         return self.picture.shape[0], self.picture.shape[1]
 
-    def passes(self, full: bool) -> Passes:
-        """Over the photograph, from every pixel or from a sample of them."""
-        return Passes(self.kind, "full" if full else "sample", memory=max(self.memory, 1), report=self.report)
+    def passes(self, full: bool, folder: Path) -> Passes:
+        """Over the photograph, from every pixel or from a sample of them; what comes between them is in a folder."""
+        statistics: Statistics = "full" if full else "sample"
+        return Passes(self.kind, statistics, memory=max(self.memory, 1), report=self.report, folder=folder)
 
     def open(self, path: Path) -> StoredPicture:
         """Another picture, read by rows as long as the job takes."""

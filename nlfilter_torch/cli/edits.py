@@ -235,11 +235,15 @@ def edit_photograph(
             return edited
 
     def by_rows(job: Job) -> Rows:
-        tiled = Tiled(Picture(job.picture.rows, source), job.passes(full), str(given.get("strokes") or "--region"))
+        tiled = Tiled(
+            Picture(job.picture.rows, source),
+            job.passes(full, Path(target).parent),
+            str(given.get("strokes") or "--region"),
+        )
         drawn = scribbles.of_edit(step, job.size, given, job.open)
         tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
         noise = measured(drawn[1], tiled) if name == "denoise" else None
-        rows = tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)), Path(target).parent)
+        rows = tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)))
         yield from rows if noise is None else noise.watched(rows, job.picture.rows)
 
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))

@@ -94,11 +94,11 @@ def mask(
         check_place(place, kind, plain, allowed)
         with ExitStack() as files:
             job = editing.Job(picture, kind, allowed - picture.cached, report, files)
-            tiled = Tiled(Picture(picture.rows, source), job.passes(full), "--region")
+            tiled = Tiled(Picture(picture.rows, source), job.passes(full, place.parent), "--region")
             drawn = selected_by(job.size, job.open)
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
             fitted = fit_mask(tiled, *drawn, **arguments(job.size))
-            write_picture(place, _first_channel(tiled.rows(fitted, place.parent)), kind, plain)
+            write_picture(place, _first_channel(tiled.rows(fitted)), kind, plain)
 
 
 def _first_channel(rows: "Rows") -> Iterator[Any]:

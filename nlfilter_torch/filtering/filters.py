@@ -366,7 +366,8 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
     check_eigenvalues(eigenvalues)
     check_alpha(alpha, dimensions=(1, 2))
     if alpha.ndim == 2 and alpha.shape[0] != 1:
-        check_shape(alpha, (eigenvalues.shape[0], alpha.shape[1]), "alpha", "give a row for each row of eigenvalues")
+        rows = eigenvalues.shape[0] if eigenvalues.ndim else 1
+        check_shape(alpha, (rows, alpha.shape[1]), "alpha", "give a row for each row of eigenvalues")
     weights = alpha.to(eigenvalues)
     gain = weights[..., -1:]  # Horner's scheme from the coarsest layer down
     for i in range(weights.shape[-1] - 2, -1, -1):

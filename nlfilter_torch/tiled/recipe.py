@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -66,7 +65,7 @@ class ColouredRows(CoveredRows):
         return found
 
 
-def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, folder: Path) -> Rows:
+def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Rows:
     """The rows (h, W, S) of the picture under :meth:`Recipe.apply`, in order.
 
     Args:
@@ -74,7 +73,6 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
         source: as of :func:`stream_detail`.
         recipe: the edit.
         name: of the source, for error messages.
-        folder: with room for the intermediate picture between two steps.
 
     Raises:
         ValueError: if a step needs the whole picture at once, or does not suit the picture.
@@ -84,19 +82,19 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str, fold
     steps = recipe.acting
     with ExitStack() as stack:
         for step in steps[:-1]:
-            rows = step_rows(step, replace(passes, kind="float32"), source, name, folder)
+            rows = step_rows(step, replace(passes, kind="float32"), source, name)
             clipped = ((part, values.clip(0, 1)) for part, values in rows)
-            source = stack.enter_context(intermediate(clipped, picture.size, folder))
+            source = stack.enter_context(intermediate(clipped, picture.size, passes.folder))
         if steps:
-            yield from step_rows(steps[-1], passes, source, name, folder)
+            yield from step_rows(steps[-1], passes, source, name)
         else:
             yield from passes.work_out(
                 picture, lambda tile: tile.inner, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1])
             )
 
 
-def step_rows(step: Step, passes: Passes, source: RowSource, name: str, folder: Path) -> Rows:
+def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """The rows that a step makes of a picture."""
     tiled = Tiled(Picture(source, name), passes)
     scribbles = scribbles_of(step, tiled.size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)
-    yield from tiled.rows(fit_step(step, tiled, *scribbles), folder)
+    yield from tiled.rows(fit_step(step, tiled, *scribbles))

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -300,12 +299,11 @@ class Tiled:
         """How it is read where the output is numbers as they are computed."""
         return replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
 
-    def rows(self, fitted: Fitted, folder: Path | None = None, *, plain: bool = False) -> Rows:
+    def rows(self, fitted: Fitted, *, plain: bool = False) -> Rows:
         """The rows (h, W, S) of the picture under an edit, in order.
 
         Args:
             fitted: to this source.
-            folder: with room for planes that an edit makes before it finishes them; None is the system's.
             plain: whether they are numbers as they are computed, without transparency.
         """
         passes = self.plain if plain else self.passes
@@ -335,7 +333,7 @@ class Tiled:
             transparent=False,
             stage="Comparing",
         )
-        with intermediate(before, self.size, folder) as planes:
+        with intermediate(before, self.size, self.passes.folder) as planes:
             stored = Picture(planes, self.picture.name, planes=planes.shape[2])
 
             def finished(tile: Tile) -> Tensor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -37,6 +38,7 @@ class Passes:
         tile_rows: rows of a tile, see :meth:`rows_together`; None is as many as fit in memory.
         memory: bytes that may be used.
         report: called with the progress.
+        folder: with room for planes between two passes; None is the system's for temporary files.
     """
 
     kind: str
@@ -45,6 +47,7 @@ class Passes:
     tile_rows: int | None = None
     memory: int = 1 << 30
     report: Report = in_silence
+    folder: Path | None = None
 
     @staticmethod
     def of(
