@@ -19,6 +19,7 @@ from nlfilter_torch.core.checks import (
     check_patch_size,
     check_photograph,
     check_positive,
+    check_tensor,
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
@@ -111,6 +112,7 @@ def colorize(
         (True, True)
     """
     check_photograph(grey, "grey", channels=1)
+    check_tensor(strokes, "strokes")
     return edited(
         grey,
         fit_colorize,

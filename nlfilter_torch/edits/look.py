@@ -113,14 +113,14 @@ def fit_look_edit(
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
     LOOK["amount"].check_argument(amount, source.batch)
     LOOK["viewing_size"].check_argument(viewing_size)
-    sliders, gains, factors = (_numbers(value, source) for value in (alpha, bands, saturation))
-    channels = [_numbers(value, source) for value in (red, green, blue)]
+    given = {"alpha": alpha, "bands": bands, "saturation": saturation, "red": red, "green": green, "blue": blue}
+    sliders, gains, factors, *channels = (_numbers(value, name, source) for name, value in given.items())
     if len({channel.shape[-1] for channel in channels}) > 1:
         lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
         raise ValueError(f"red, green and blue must be equally many numbers, got {lengths}; add or drop some")
     batch = max(channel.shape[0] if channel.ndim == 2 else 1 for channel in channels)
     curves = torch.stack([channel.expand(batch, -1) for channel in channels], dim=1)
-    colours = _numbers(matrix, source)
+    colours = _numbers(matrix, "matrix", source)
     if colours.shape[-1] != 9:
         raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
     colours = colours.unflatten(-1, (3, 3))
@@ -163,10 +163,15 @@ def fit_look_edit(
     return Fitted(fitted.pixels, lambda image, found: result(image, finish(image, found)), fitted.margin, fitted.step)
 
 
-def _numbers(value: Numbers, source: Source) -> Tensor:
-    return (
-        torch.as_tensor(value).to(source.dtype) if isinstance(value, Tensor) else torch.tensor(value).to(source.dtype)
-    )
+def _numbers(value: Numbers, name: str, source: Source) -> Tensor:
+    """A part of a look as a tensor of at least one dimension."""
+    try:
+        numbers = value if isinstance(value, Tensor) else torch.tensor(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be a list of numbers or a tensor, got {value!r}; pass numbers") from error
+    if numbers.ndim == 0:
+        raise ValueError(f"{name} must be several numbers, got a single one; pass a list or a tensor of them")
+    return numbers.to(source.dtype)
 
 
 def _acts(gains: Tensor) -> bool:

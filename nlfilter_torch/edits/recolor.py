@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.checks import check_photograph, check_tensor
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, region_means, split_luminance
 from nlfilter_torch.edits.components import Scribbles
@@ -68,6 +68,7 @@ def recolor(
         (True, True)
     """
     check_photograph(image, "image", channels=3)
+    check_tensor(strokes, "strokes")
     return edited(
         image,
         fit_recolor,

@@ -20,7 +20,6 @@ from nlfilter_torch.core.checks import (
     check_instance,
     check_positive,
     check_same_size,
-    check_tensor,
     check_unit_range,
     check_values,
 )
@@ -80,8 +79,8 @@ def propagate_strokes(
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     among = spectrum.among
     batch = spectrum.factor.shape[0]
-    check_tensor(strokes, "strokes")
-    check_tensor(stroke_mask, "stroke_mask")
+    check_image(strokes, "strokes")
+    check_image(stroke_mask, "stroke_mask")
     images = batch if batch > 1 else max(strokes.shape[0], stroke_mask.shape[0])
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
