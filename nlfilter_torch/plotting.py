@@ -82,7 +82,7 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) 
     axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["black"], linewidths=1)
     _draw(axes[1], "Similarity to the region (white: similar)", weight[..., 0])
     faded = np.broadcast_to(0.6 + 0.25 * picture.mean(-1, keepdims=True), picture.shape)
-    _draw(axes[2], "Pixels that an edit would change", weight * picture + (1 - weight) * faded)
+    _draw(axes[2], "Pixels that the mask selects", weight * picture + (1 - weight) * faded)
     return figure
 
 

@@ -400,6 +400,8 @@ def test_the_command_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, caps
     assert main(["fit", before, after, look, "--landmarks", "40", "--mask", mask]) == 0
     assert float(capsys.readouterr().out.split("explained: ")[1].split(" %")[0]) > 95
     assert (tmp_path / "look-1.json").exists()
+    assert main(["fit", before, after, look, "--mask", mask, "--preview", str(tmp_path / "seen.png")]) == 2
+    assert "--preview shows a single look, but --mask asks for 1" in capsys.readouterr().err
 
 
 def test_the_command_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,34 +88,39 @@ def fit(
     paths = _paths(before, after)
     if mask and len(paths) > 1:
         raise ValueError(f"--mask is for one pair of photographs, got {len(paths)}; fit them one by one")
+    if mask and (preview is not None or left is not None):
+        unused = "--map" if preview is None else "--preview"
+        raise ValueError(f"{unused} shows a single look, but --mask asks for {len(mask)}; leave one of them out")
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
     for path in (*results, *(path for path in (preview, left) if path is not None)):
         check_file(path)
     memory = working_bytes(step["landmarks"], step["patch_size"])
+    judged = not mask and (len(paths) == 1 or preview is not None or left is not None)
+    first: list[tuple[Tensor, Tensor]] = []  # images that are judged
     with steps(len(paths) + 1) as begin:
 
         def pairs() -> "Iterator[tuple[Tensor, ...]]":
             for pair in paths:
                 begin(f"Comparing {pair[1].name}")
-                yield (*_read(*pair, memory), *([] if not mask else [_masks(mask, pair[0])]))
+                images = _read(*pair, memory)
+                if judged and not first:
+                    first.append(images)
+                yield (*images, *([] if not mask else [_masks(mask, pair[0])]))
 
         found = fit_look(pairs(), order=layers - 1, step=step)
         begin("Judging")
         looks = found if isinstance(found, tuple) else (found,)
-        seen = None if mask or (len(paths) > 1 and preview is None and left is None) else _read(*paths[0], memory)
-        result = None if seen is None else looks[0].apply(seen[0]).clamp(0, 1)
-        if seen is not None and result is not None:
-            _draw(*seen, result, preview, left)
+        seen = [(*images, looks[0].apply(images[0]).clamp(0, 1)) for images in first]  # of the first pair, if judged
+        for images in seen:
+            _draw(*images, preview, left)
         for look, path in zip(looks, results, strict=True):
             with open_beside(path) as stream:
                 stream.write(look.to_json().encode())
     for look, path in zip(looks, results, strict=True):
-        share = look.fitted
-        if len(paths) == 1 and seen is not None and result is not None:
-            share = _explained(*seen, result)
-        _report(look, share, path, alone=len(paths) == 1)
-    if len(paths) == 1 and seen is not None and result is not None:
-        _tell_where(*seen, result)
+        alone = len(paths) == 1
+        _report(look, _explained(*seen[0]) if alone and seen else look.fitted, path, alone=alone)
+    if len(paths) == 1 and seen:
+        _tell_where(*seen[0])
 
 
 def _paths(before: str, after: str) -> list[tuple[Path, Path]]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nlfilter_torch.cli.scribbles import Overlay, Strokes
 from nlfilter_torch.edits.applying import seeded
+from nlfilter_torch.edits.defocus import REACH
 from nlfilter_torch.edits.mask import lab_of, region_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.io.photographs import Photograph, write_photograph
@@ -88,6 +89,8 @@ def show(
         if edit == "detail":  # its other bandwidths are those of the filter
             options = {"reach": options["reach"], "photometric_bandwidth": options["mask_bandwidth"]}
         taken = {name: value for name, value in options.items() if name in names}
+        if edit == "defocus":
+            taken["reach"] = REACH
         mask = region_mask(image, painted, kept, **taken, generator=seeded())
     outside = DIM * image.mean(1, keepdim=True)  # no colour is like every picture's
     shown = torch.lerp(outside.expand_as(image), image, mask)

@@ -32,13 +32,8 @@ def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor
         down, right = _shift(before, after)
         if (down, right) == (0, 0):
             return before, after, ""
-        rows, columns = (slice(max(0, -n), length - max(0, n)) for n, length in zip((down, right), size, strict=True))
-        moved, kept = (slice(max(0, n), length - max(0, -n)) for n, length in zip((down, right), size, strict=True))
-        return (
-            before[..., rows, columns],
-            after[..., moved, kept],
-            f"{edited} is shifted by {down} pixels down and {right} to the right",
-        )
+        done = f"{edited} is shifted by {down} pixels down and {right} to the right"
+        return *_overlap(before, after, down, right), done
     ratio = (other[1] / other[0]) / (size[1] / size[0])
     resized = resize(after, (size[0], size[1])).clamp(0, 1) if abs(math.log(ratio)) < SAME_SHAPE else None
     place, likeness = (0, 0), -1.0
@@ -76,10 +71,17 @@ def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
     limit = FAR * min(first.shape)
     if (down, right) == (0, 0) or max(abs(down), abs(right)) > limit:
         return 0, 0
-    height, width = first.shape
-    moved = first[max(0, -down) : height - max(0, down), max(0, -right) : width - max(0, right)]
-    kept = second[max(0, down) : height - max(0, -down), max(0, right) : width - max(0, -right)]
-    return (down, right) if _correlation(moved, kept) > _correlation(first, second) + 0.01 else (0, 0)
+    likeness = _correlation(*_overlap(first, second, down, right))
+    return (down, right) if likeness > _correlation(first, second) + 0.01 else (0, 0)
+
+
+def _overlap(first: Tensor, second: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
+    """The part (..., h, w) that two pictures share, the second of which is shifted by so many pixels."""
+    height, width = first.shape[-2:]
+    return (
+        first[..., max(0, -down) : height - max(0, down), max(0, -right) : width - max(0, right)],
+        second[..., max(0, down) : height - max(0, -down), max(0, right) : width - max(0, -right)],
+    )
 
 
 def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:

@@ -17,7 +17,7 @@ Aperture = Literal["disc", "gaussian"]
 
 # A mask below BLURRED is all background, above SHARP all subject. A blurred part of a subject disturbs more than a
 # sharp part of the background: doubts are kept sharp, and a subject reaches further than other regions.
-BLURRED, SHARP, REACH = 0.1, 0.4, 0.75
+BLURRED, SHARP, REACH = 0.15, 0.4, 0.72
 LEAST = 1e-5  # weight of the subject in the blur of what is behind it
 
 

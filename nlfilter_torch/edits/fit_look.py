@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_order, check_photograph, check_same_size
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.applying import apply_step, seeded
 from nlfilter_torch.edits.detail import options_of
 from nlfilter_torch.edits.parameters import KNOTS, SATURATIONS, STRAIGHT
@@ -17,7 +17,7 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL, fit_layers
-from nlfilter_torch.filtering.look import bands_of
+from nlfilter_torch.filtering.look import NAMES, bands_of
 from nlfilter_torch.filtering.look_fit import (
     CHOICES,
     RIDGES,
@@ -42,10 +42,7 @@ SQUARES = 3  # parts along each side of a picture that are left out in turn if t
 STIFF, STIFF_ALONE = 3e-3, 1e-2  # least ridge of tone curves and saturation, of several pairs and of one
 INSIDE = 0.9  # of a mask, from where on a pixel counts for its region
 SLIDERS_ONLY = 0.98  # share that sliders explain of a pair for which they are found to the last digit
-PARTS = ("alpha", "bands", "curves", "matrix", "saturation")
-ALIKE = (
-    0.5  # correlation of the luminance of a picture before and after an edit, below which they do not belong together
-)
+ALIKE = 0.5  # correlation of the luminance before and after an edit; less do not belong together
 SHADES = 256
 
 
@@ -93,7 +90,7 @@ class FittedLook:
 def fit_look(
     pairs: Iterable[Pair],
     *,
-    parts: Collection[str] = PARTS,
+    parts: Collection[str] = NAMES,
     order: int = 3,
     step: Step | None = None,
     generator: torch.Generator | None = None,
@@ -128,11 +125,11 @@ def fit_look(
     """
     check_order(order)
     step = Step("look") if step is None else step
-    names = check_learn(parts, PARTS, "parts")
+    names = check_learn(parts, NAMES, "parts")
     choices = [tuple(name for name in some if ("curves" if name == "tone" else name) in names) for some in CHOICES]
     choices = [some for some in dict.fromkeys(choices) if some]
     if not choices:
-        raise ValueError(f"parts must name one of {', '.join(PARTS)}, got none; leave them out for all")
+        raise ValueError(f"parts must name one of {', '.join(NAMES)}, got none; leave them out for all")
     layout = Layout(KNOTS, SATURATIONS, order + 1)
     regions: list[_Region] = []
     number = 0
@@ -273,7 +270,7 @@ def _add(
     generator: torch.Generator | None,
 ) -> None:
     """Add the sums of an image (3, H, W) before and after an edit."""
-    dtype = torch.float64 if before.dtype == torch.float64 else torch.float32
+    dtype = working_dtype(before)
     before, after = before.to(dtype), after.to(dtype)
     free = ((after > 0) & (after < 1)).to(dtype)
     size = (before.shape[-2], before.shape[-1])

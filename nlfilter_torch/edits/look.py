@@ -13,7 +13,7 @@ from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.parameters import LOOK
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.filtering.look import BAND_MARGIN, band_change, check_part, pointwise
+from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise
 from nlfilter_torch.operator.features import reduce_channels
 
 Numbers = Tensor | Sequence[float]
@@ -94,18 +94,18 @@ def apply_look(
 def fit_look_edit(
     source: Source,
     *,
-    alpha: Numbers = LOOK.defaults["alpha"],
-    bands: Numbers = LOOK.defaults["bands"],
-    red: Numbers = LOOK.defaults["red"],
-    green: Numbers = LOOK.defaults["green"],
-    blue: Numbers = LOOK.defaults["blue"],
-    matrix: Numbers = LOOK.defaults["matrix"],
-    saturation: Numbers = LOOK.defaults["saturation"],
-    amount: float | Tensor = LOOK.defaults["amount"],
-    viewing_size: float = LOOK.defaults["viewing_size"],
-    photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
-    spatial_bandwidth: float | Tensor | str | None = LOOK.defaults["spatial_bandwidth"],
-    num_landmarks: int = LOOK.defaults["num_landmarks"],
+    alpha: Numbers,
+    bands: Numbers,
+    red: Numbers,
+    green: Numbers,
+    blue: Numbers,
+    matrix: Numbers,
+    saturation: Numbers,
+    amount: float | Tensor,
+    viewing_size: float,
+    photometric_bandwidth: float | Tensor | str,
+    spatial_bandwidth: float | Tensor | str | None,
+    num_landmarks: int,
     **options: Any,
 ) -> Fitted:
     """:func:`apply_look` for any source."""
@@ -131,7 +131,7 @@ def fit_look_edit(
 
     def change(viewed: Source) -> Fitted:
         moved: Planes | None = None
-        if _acts(sliders):
+        if acts(sliders):
             filter_options = options | {
                 "photometric_bandwidth": photometric_bandwidth,
                 "spatial_bandwidth": nearby_or_far(spatial_bandwidth, LOOK["spatial_bandwidth"].share, viewed.size),
@@ -144,7 +144,7 @@ def fit_look_edit(
         def pixels(some: Pixels) -> Tensor:
             return torch.zeros_like(some.image) if moved is None else moved(some).expand_as(some.image)
 
-        if not _acts(gains):
+        if not acts(gains):
             return Fitted(pixels)
         mean = viewed.mean(luminance)
         return Fitted(pixels, lambda image, found: found + band_change(image, gains, mean), BAND_MARGIN)
@@ -160,7 +160,7 @@ def fit_look_edit(
     if fitted.finish is None:
         return Fitted(lambda pixels: result(pixels.image, fitted.pixels(pixels)))
     finish = fitted.finish
-    return Fitted(fitted.pixels, lambda image, found: result(image, finish(image, found)), fitted.margin, fitted.step)
+    return Fitted(fitted.pixels, lambda image, found: result(image, finish(image, found)), fitted.margin)
 
 
 def _numbers(value: Numbers, name: str, source: Source) -> Tensor:
@@ -172,8 +172,3 @@ def _numbers(value: Numbers, name: str, source: Source) -> Tensor:
     if numbers.ndim == 0:
         raise ValueError(f"{name} must be several numbers, got a single one; pass a list or a tensor of them")
     return numbers.to(source.dtype)
-
-
-def _acts(gains: Tensor) -> bool:
-    """Whether gains change anything, or may once they are learned."""
-    return gains.requires_grad or bool((gains != 1).any())

@@ -30,11 +30,8 @@ class Fitted:
         pixels: the edited pixels, or planes that ``finish`` makes these from.
         finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
         margin: how many.
-        step: ``finish`` works on every so many pixels, counted from the first of what it is given, which tiles and
-            ``margin`` are therefore multiples of.
     """
 
     pixels: Planes
     finish: Callable[[Tensor, Tensor], Tensor] | None = None
     margin: int = 0
-    step: int = 1

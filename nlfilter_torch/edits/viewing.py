@@ -95,7 +95,6 @@ def fit_change(
             fitted.pixels,
             lambda image, found: change_luminance(image, finish(image, found), limits, balance),
             fitted.margin,
-            fitted.step,
         )
     reduced = source.resized(small)
     fitted, balance = balanced(reduced, change(reduced))

@@ -98,6 +98,11 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         )
 
 
+def acts(gains: Tensor) -> bool:
+    """Whether gains change anything, or may once they are learned."""
+    return gains.requires_grad or bool((gains != 1).any())
+
+
 def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None, saturation: Tensor | None) -> Tensor:
     """The image (B, 3, H, W) plus what tone curves, matrix and saturation change."""
     result = image

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_count, check_image
-from nlfilter_torch.filtering.look import BLURS, NAMES, check_part, filter_look
+from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -87,11 +87,11 @@ class Look(nn.Module):
         check_image(image, "image", channels=3)
         check_learn(list(parts), NAMES, "parts")
         used = {name: parts.get(name, getattr(self, name)) for name in NAMES}
-        if not (used["alpha"].requires_grad or bool((used["alpha"] != 1).any())):
+        if not acts(used["alpha"]):
             del used["alpha"]
         elif operator is None:
             near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
             operator = nonlocal_operator(reduce_channels(image, "luminance"), **near | self.options)
-        if not (used["bands"].requires_grad or bool((used["bands"] != 1).any())):
+        if not acts(used["bands"]):
             del used["bands"]
         return filter_look(image, operator=operator, **used)
