@@ -118,7 +118,7 @@ def test_other_channels_are_denoised_one_by_one(channels: int) -> None:
 
 
 def test_bright_pictures_are_denoised_as_their_scaled_selves() -> None:
-    image = noisy(CAT, 0.1)
+    image = noisy(CAT[..., :64, :64], 0.1)  # a single tile
     image = 2 * image / image.max()
     with torch.no_grad():
         torch.testing.assert_close(

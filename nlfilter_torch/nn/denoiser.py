@@ -83,7 +83,7 @@ class NonlocalDenoiser(nn.Module):
         """Remove noise.
 
         Args:
-            noisy: (B, C, H, W) in [0, 1] but for the noise, or one image (C, H, W). Three channels are colours; channels
+            noisy: (B, C, H, W) in [0, 1] but for the noise, or one image (C, H, W). Three channels are colours; those
                 of another number are denoised one by one.
             noise: its standard deviation in units of the image, as the network expects it: a number, (B,), or a map
                 (B, 1 or C, H, W). Where it is 0 the image stays as it is.
