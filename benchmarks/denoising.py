@@ -193,7 +193,7 @@ def network(path: Path | None, *, plain: bool = False) -> Method:
 
     def run(case: Case) -> Tensor:
         with torch.no_grad():
-            denoised: Tensor = denoiser(case.noisy, case.noise)
+            denoised: Tensor = denoiser(case.noisy, case.noise, turns=4)
         return denoised
 
     return run

@@ -30,12 +30,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import Crops
 from nlfilter_torch.io.photographs import open_beside
-from nlfilter_torch.nn.denoiser import WIDTH, NonlocalDenoiser
+from nlfilter_torch.nn.denoiser import PLANES, WIDTH, NonlocalDenoiser
 from nlfilter_torch.plotting import save_figure
 
-BATCH = 8  # crops in a step
-SIDE = 96  # pixels of a crop
-RATE = 1.5e-3  # of Adam
+BATCH = 6  # crops in a step
+SIDE = 64  # pixels of a crop
+POINTS = 85  # pixels for each landmark
+RATE = 2e-3  # of Adam
+BANDWIDTH_RATE = 5.0  # times that for bandwidths, which are single numbers and learn as logarithms
 WARM_UP = 200  # steps over which the rate rises
 FALL = 0.4  # last share of the steps, over which it falls to nothing along half a cosine
 LARGEST_GRADIENT = 0.5  # its norm
@@ -45,17 +47,19 @@ ASIDE, ASIDE_SEED = 24, 1_000_000  # crops of either kind that are set aside
 
 
 class PlainDenoiser(NonlocalDenoiser):
-    """The denoiser without the filter: a convolution in its place, of more weights than the filter's."""
+    """The denoiser without the filter: a convolution in place of guide and sliders, of more weights than these."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        del self.guide, self.merge, self.log_reach
-        self.instead = nn.Conv2d(WIDTH, WIDTH, 3, padding=4, dilation=4)
-        self.register_buffer("log_reach", torch.zeros(1), persistent=False)
+    def __init__(self, *, points: int = POINTS) -> None:
+        super().__init__(points=points)
+        del self.log_bandwidths
+        self.guide = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
+        self.last = nn.Conv2d(WIDTH, PLANES, 1)
+        self.register_buffer("log_bandwidths", torch.zeros(2), persistent=False)
 
-    def link(self, features: Tensor, points: Tensor) -> Tensor:
-        """What the convolution finds nearby."""
-        return self.instead(F.leaky_relu(features, 0.1))
+    def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
+        """What the convolutions take for the picture."""
+        found: Tensor = self.last(F.leaky_relu(self.guide(F.leaky_relu(features, 0.1)), 0.1))
+        return planes + found.to(planes)
 
 
 def loss_of(denoised: Tensor, clean: Tensor) -> Tensor:
@@ -75,7 +79,7 @@ def new_denoiser(*, plain: bool, seed: int) -> NonlocalDenoiser:
     """A denoiser with weights drawn from a seed."""
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.manual_seed(seed)
-        return PlainDenoiser() if plain else NonlocalDenoiser()
+        return (PlainDenoiser if plain else NonlocalDenoiser)(points=POINTS)
 
 
 class Training:
@@ -94,7 +98,9 @@ class Training:
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed).to(memory_format=torch.channels_last)
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=rate)
+        named = dict(self.model.named_parameters())
+        bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []
+        self.optimizer = torch.optim.Adam([{"params": [*named.values()]}, {"params": bandwidths}], lr=rate)
         self.rate, self.half = rate, half
         self.crops = Crops(side, seed)
         aside = Crops(side, ASIDE_SEED)
@@ -112,7 +118,8 @@ class Training:
     def step(self, steps: int) -> None:
         """One step of so many."""
         number = len(self.losses)
-        self.optimizer.param_groups[0]["lr"] = self.rate * rate_at(number, steps)
+        for group, factor in zip(self.optimizer.param_groups, (1.0, BANDWIDTH_RATE), strict=True):
+            group["lr"] = factor * self.rate * rate_at(number, steps)
         clean, noisy, told = self.crops.batch(BATCH, grey=number % 2 == 0)
         loss = loss_of(self.denoise(self.model, noisy, told), clean)
         self.optimizer.zero_grad()
@@ -193,10 +200,8 @@ def curve(losses: Sequence[float]) -> Figure:
 def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments, checked before anything is trained."""
     parser = argparse.ArgumentParser(description="Train the denoiser.")
-    parser.add_argument("--steps", type=int, default=20000, help=f"of {BATCH} crops each; default %(default)s")
-    parser.add_argument(
-        "--side", type=int, default=SIDE, help="of crops, an even number of pixels; default %(default)s"
-    )
+    parser.add_argument("--steps", type=int, default=9500, help=f"of {BATCH} crops each; default %(default)s")
+    parser.add_argument("--side", type=int, default=SIDE, help="of crops, in pixels; default %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of weights, crops and noise; default %(default)s")
     parser.add_argument("--rate", type=float, default=RATE, help="of Adam; default %(default)s")
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
@@ -207,8 +212,8 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if options.steps < 1:
         parser.error(f"--steps must be at least 1, got {options.steps}; 2000 give a first impression")
-    if not 16 <= options.side <= 128 or options.side % 2:
-        parser.error(f"--side must be an even number from 16 to 128, got {options.side}; {SIDE} does well")
+    if not 16 <= options.side <= 128:
+        parser.error(f"--side must be 16 to 128, got {options.side}; {SIDE} does well")
     if options.seed < 0:
         parser.error(f"--seed must not be negative, got {options.seed}; 0 will do")
     if not 0 < options.rate < 1:

@@ -33,7 +33,7 @@ def test_photographs_come_closer(channels: int, level: int, gain: float) -> None
     clean = CAT[:, :channels]
     image = noisy(clean, level / 255)
     with torch.no_grad():
-        found = TRAINED_ONE(image, level / 255)
+        found = TRAINED_ONE(image, level / 255, turns=4)
     assert decibels(found, clean) > decibels(image, clean) + gain
     assert torch.equal(denoise(image, noise_level=level / 255), found)
 
@@ -98,6 +98,18 @@ def test_images_of_a_batch_are_denoised_as_alone() -> None:
             alone = TRAINED_ONE(images[i : i + 1], levels[i])
             torch.testing.assert_close(both[i : i + 1], alone, rtol=0, atol=1e-4)
             torch.testing.assert_close(TRAINED_ONE(images[i], levels[i].view(1, 1, 1).expand(1, 96, 128)), alone[0])
+
+
+def test_turns_are_averaged_and_better() -> None:
+    image = noisy(CAT, 0.1)
+    with torch.no_grad():
+        found = {turns: TRAINED_ONE(image, 0.1, turns=turns) for turns in (1, 2, 4)}
+        half = TRAINED_ONE(image.rot90(2, (2, 3)), 0.1).rot90(2, (2, 3))
+    scores = [decibels(found[turns], CAT) for turns in (1, 2, 4)]
+    assert scores == sorted(scores)
+    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # of other tiles
+    with pytest.raises(ValueError, match="turns must be 1, 2 or 4, got 3"):
+        TRAINED_ONE(image, 0.1, turns=3)
 
 
 def test_numbers_and_maps_of_the_noise_agree() -> None:
@@ -166,7 +178,8 @@ def test_precisions() -> None:
     assert (cast - wanted).abs().max() < 0.05
     double = denoise(image.double(), noise_level=0.1)
     assert double.dtype == torch.float64
-    torch.testing.assert_close(double.float(), wanted, rtol=0, atol=1e-3)
+    # Rounding may assign a pixel to another landmark.
+    assert (double - denoise(image, noise_level=0.1)).abs().mean() < 1e-3
 
 
 def test_noise_that_grows_with_the_light_is_found() -> None:
@@ -256,7 +269,9 @@ def test_files_that_are_damaged_or_of_something_else_name_themselves(tmp_path: P
         with pytest.raises(ValueError, match=r"weights\.safetensors is damaged"):
             NonlocalDenoiser.trained(path)
     save_file(PlainDenoiser().state_dict(), path)
-    with pytest.raises(ValueError, match=r"must hold log_reach of shape \(1,\), but .*weights.safetensors has none"):
+    with pytest.raises(
+        ValueError, match=r"must hold log_bandwidths of shape \(2,\), but .*weights.safetensors has none"
+    ):
         NonlocalDenoiser.trained(path)
     half = {name: value.half() for name, value in TRAINED_ONE.state_dict().items()}
     save_file(half, path)

@@ -18,13 +18,14 @@ from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source, edited
 from nlfilter_torch.filtering.filters import weigh_layers
-from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, in_tiles, noise_map
+from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, noise_map
 from nlfilter_torch.operator.build import nonlocal_operator
 
 Method = Literal["network", "rule"]
 
 GUIDE_BLUR = 0.7  # pixels; the guide's own noise would link pixels by it
 ORDER = 2
+TURNS = 4  # of the image, whose results are averaged
 QUIET = 0.1 / 255  # a noise level below what eight bits resolve: nothing to do
 
 
@@ -137,7 +138,7 @@ def _by_network(source: Source, noise: float | Tensor | Noise, strength: float |
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
         level = torch.where(level < QUIET, torch.zeros_like(level), level)
-        return image - in_tiles(image, level, _network(image).noise_in)
+        return image - _network(image).removed(image, level, TURNS)
 
     return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
 

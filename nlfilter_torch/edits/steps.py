@@ -96,6 +96,8 @@ class Step:
     def bytes_per_pixel(self, *, masked: bool = False) -> int:
         """Memory in bytes that it needs for each pixel of an image; ``masked`` if it has a region without strokes."""
         names = {parameter.name for parameter in self.declared}
+        if "method" in names and self["method"] == "network":
+            return working_bytes(0, 0)  # its tiles are small
         landmarks = self["landmarks"] if "landmarks" in names else 0
         patch_size = (
             max(self["patch_size"], 5) if "patch_size" in names else 0

@@ -1,4 +1,4 @@
-"""A denoiser around the filter: a small network computes guide, sliders and values, the filter links alike places."""
+"""A denoiser around the filter: a small network computes guide and sliders, the filter takes means of alike pixels."""
 
 import math
 from collections.abc import Callable
@@ -8,22 +8,30 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_values
+from nlfilter_torch.core.checks import (
+    check_count,
+    check_image,
+    check_photograph,
+    check_same_size,
+    check_values,
+    described,
+)
 from nlfilter_torch.core.precision import as_given
-from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
 
 TRAINED = Path(__file__).with_name("denoiser.safetensors")
 
-WIDTH, FEATURES, VALUES, ORDER = 48, 16, 20, 1  # planes of the network, the guide and the values; k of the sliders
-DILATIONS = (1, 2, 3)  # of the convolutions before the filter, and in reverse after it
-PLANES = 12  # of 2x2 pixels, which the network sees as one point
-POINTS = 48  # for each landmark
-START = 12.0  # spatial bandwidth, in points, before training
+WIDTH, FEATURES, ORDER = 36, 20, 3  # planes of the network and of the guide; k of the sliders
+DILATIONS = (1, 2, 3, 4, 3, 2)  # of the convolutions before the filter: 33x33 pixels are in sight
+PLANES, LEVELS = 3, 2  # of colours, and of the noise in them
+POINTS = 96  # pixels for each landmark
+BANDWIDTHS = (0.15, 12.0)  # of the guide, and in pixels, before training
+FAINT = 1 / 255  # noise below which less and less is filtered
 BRIGHTEST = 2.0  # magnitude that larger images are scaled down to, as the network has seen none
 
-SIDE, STEP = 128, 96  # of tiles, and from one to the next, in pixels
+SIDE, STEP = 128, 112  # of tiles, and from one to the next, in pixels
 FRAME = 16  # pixels that an image is extended by, so that no border is in sight of it
 TOGETHER = 8  # tiles worked on at once
 
@@ -31,13 +39,19 @@ TOGETHER = 8  # tiles worked on at once
 class NonlocalDenoiser(nn.Module):
     """Noisy to denoised, in grey or colour, for noise of known strength that may differ from pixel to pixel.
 
-    The network sees 2x2 pixels as one point. Its first half computes, at every point, a guide, from which
-    :func:`operator_from_features` builds W, values, and sliders, by which :func:`polynomial_filter` filters values and
-    pixels; the second half turns all of this into the noise that is subtracted. Colours are split into luminance and
-    two differences, so that one network serves grey images, whose differences are free of noise. Larger images are
-    worked on in tiles that overlap, at places that do not depend on the size of the image.
+    A network of convolutions computes, at every pixel, a guide, from which :func:`operator_from_features` builds W, and
+    sliders, by which pixels become means of those that the guide finds alike: this removes most of the noise. Two more
+    convolutions correct what is left. Colours are split into luminance and two differences, so that one network serves
+    grey images, whose differences are free of noise. Larger images are worked on in tiles that overlap, at places that
+    do not depend on the size of the image.
 
     A new one knows nothing; :meth:`trained` is the one of the package.
+
+    Args:
+        points: pixels for each landmark.
+
+    Raises:
+        TypeError, ValueError: if ``points`` is not a positive integer.
 
     Example:
         >>> noisy = 0.5 + 0.1 * torch.randn(1, 1, 32, 32, generator=torch.Generator().manual_seed(0))
@@ -48,15 +62,15 @@ class NonlocalDenoiser(nn.Module):
         True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, points: int = POINTS) -> None:
         super().__init__()
-        self.first = _convolution(PLANES + 2, WIDTH)
+        check_count(points, "points")
+        self.points = points
+        self.first = _convolution(PLANES + LEVELS, WIDTH)
         self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in DILATIONS)
-        self.guide = nn.Conv2d(WIDTH, FEATURES + VALUES + ORDER + 1, 1)
-        self.log_reach = nn.Parameter(torch.tensor([math.log(START)]))
-        self.merge = nn.Conv2d(VALUES + PLANES, WIDTH, 1)
-        self.after = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in reversed(DILATIONS))
-        self.last = _convolution(WIDTH, PLANES)
+        self.guide = _convolution(WIDTH, FEATURES + LEVELS * (ORDER + 1))
+        self.log_bandwidths = nn.Parameter(torch.tensor([math.log(bandwidth) for bandwidth in BANDWIDTHS]))
+        self.after = nn.ModuleList([_convolution(WIDTH + 2 * PLANES, WIDTH), _convolution(WIDTH, PLANES)])
 
     @classmethod
     def trained(
@@ -79,7 +93,7 @@ class NonlocalDenoiser(nn.Module):
         denoiser.load_state_dict({name: value.to(device, dtype) for name, value in weights.items()}, assign=True)
         return denoiser.eval()
 
-    def forward(self, noisy: Tensor, noise: float | Tensor) -> Tensor:
+    def forward(self, noisy: Tensor, noise: float | Tensor, *, turns: int = 1) -> Tensor:
         """Remove noise.
 
         Args:
@@ -87,6 +101,8 @@ class NonlocalDenoiser(nn.Module):
                 of another number are denoised one by one.
             noise: its standard deviation in units of the image, as the network expects it: a number, (B,), or a map
                 (B, 1 or C, H, W). Where it is 0 the image stays as it is.
+            turns: 1, 2 or 4: the result is the mean of as many, each of the image turned by another angle. More take
+                longer, and are better by 0.1 or 0.2 dB.
 
         Returns:
             Of the shape and dtype of ``noisy``. Differentiable in it, in the noise and in the weights.
@@ -96,18 +112,34 @@ class NonlocalDenoiser(nn.Module):
         """
         if isinstance(noisy, Tensor) and noisy.ndim == 3:
             one = isinstance(noise, Tensor) and noise.ndim == 3
-            return self(noisy.unsqueeze(0), noise.unsqueeze(0) if one else noise).squeeze(0)  # type: ignore[union-attr]
+            each = noise.unsqueeze(0) if one else noise  # type: ignore[union-attr]
+            return self(noisy.unsqueeze(0), each, turns=turns).squeeze(0)
         check_photograph(noisy, "noisy")
-        dtype = self.log_reach.dtype
+        dtype = self.log_bandwidths.dtype
         levels = noise_map(noise, noisy).to(dtype)
         image = noisy.to(dtype)
-        return as_given(image - in_tiles(image, levels, self.noise_in), noisy)
+        return as_given(image - self.removed(image, levels, turns), noisy)
+
+    def removed(self, image: Tensor, noise: Tensor, turns: int) -> Tensor:
+        """What is subtracted from an image (B, C, H, W), of noise (B, 1 or C, H, W), in the dtype of the weights."""
+        if turns not in (1, 2, 4):
+            raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is quickest")
+        quarters = range(0, 4, 4 // turns)
+
+        def mean(tile: Tensor, levels: Tensor) -> Tensor:
+            found = [
+                self.noise_in(*(planes.rot90(n, (2, 3)) for planes in (tile, levels))).rot90(-n, (2, 3))
+                for n in quarters
+            ]
+            return torch.stack(found).mean(0)
+
+        return in_tiles(image, noise, mean)
 
     def noise_in(self, noisy: Tensor, noise: Tensor) -> Tensor:
         """What is to be subtracted, all at once: this is trained on crops, and runs on tiles.
 
         Args:
-            noisy: (B, C, H, W) of even height and width.
+            noisy: (B, C, H, W).
             noise: (B, 1 or C, H, W).
         """
         if noisy.shape[1] not in (1, 3):
@@ -115,33 +147,33 @@ class NonlocalDenoiser(nn.Module):
             return self.noise_in(*each).view_as(noisy)
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
         planes, levels = split_colours(noisy / scale, noise / scale)
-        points = F.pixel_unshuffle(planes, 2)
-        middle = planes.new_tensor([0.5, 0.0, 0.0]).repeat_interleave(4).view(1, -1, 1, 1)
-        seen = torch.cat([2 * (points - middle), 10 * F.avg_pool2d(levels, 2)], dim=1)
+        middle = planes.new_tensor([0.5, 0.0, 0.0]).view(1, -1, 1, 1)
+        seen = torch.cat([2 * (planes - middle), 10 * levels], dim=1)
         features = self.first(seen.contiguous(memory_format=torch.channels_last))
         for layer in self.before:
             features = features + layer(_bent(features))
-        features = features + self.link(features, points)
+        levels = levels[:, (0, 1, 1)]
+        found = (planes - self.smooth(features, planes)) * (levels / FAINT).clamp(max=1.0)
+        left = torch.cat([_bent(features), 2 * (planes - found - middle), 2 * found], dim=1)
         for layer in self.after:
-            features = features + layer(_bent(features))
-        found = F.pixel_shuffle(self.last(_bent(features)).to(planes), 2)
-        return join_colours(levels[:, (0, 1, 1)] * found, noisy.shape[1]) * scale
+            left = layer(left if left.shape[1] > WIDTH else _bent(left))
+        return join_colours(found + levels * left.to(planes), noisy.shape[1]) * scale
 
-    def link(self, features: Tensor, points: Tensor) -> Tensor:
-        """What alike places have in common: values and pixels (B, 12, h, w), filtered, as planes of the network."""
-        height, width = points.shape[-2:]
-        guide, values, logits = self.guide(features).to(points).split([FEATURES, VALUES, ORDER + 1], dim=1)
+    def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
+        """Means of alike pixels (B, 3, H, W): filtered by the guide and the sliders that features say."""
+        height, width = planes.shape[-2:]
+        guide, logits = self.guide(_bent(features)).to(planes).split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
-        places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / self.log_reach.exp()
+        alike, near = self.log_bandwidths.exp()
+        places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / near
         operator = operator_from_features(
-            torch.cat([guide.flatten(2), places.expand(len(guide), -1, -1)], dim=1),
+            torch.cat([guide.flatten(2) / alike, places.expand(len(guide), -1, -1)], dim=1),
             size=(height, width),
-            num_landmarks=max(1, height * width // POINTS),
+            num_landmarks=max(1, height * width // self.points),
         )
-        # Running sums of shares: the sliders rise to 1 for the smooth layer, so that values become means.
-        sliders = logits.softmax(1).cumsum(1)
-        merged: Tensor = self.merge(polynomial_filter(operator, torch.cat([values, points], dim=1), sliders))
-        return merged
+        # Running sums of shares: the sliders rise to 1 for the smooth layer, so that a pixel becomes a mean of others.
+        sliders = logits.unflatten(1, (ORDER + 1, LEVELS)).softmax(1).cumsum(1)[:, :, (0, 1, 1)]
+        return (sliders * detail_layers(operator, planes, order=ORDER)).sum(1)
 
 
 def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tensor:
@@ -195,7 +227,7 @@ def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], 
     """
     height, width = image.shape[-2:]
     below, right = (
-        FRAME + n % 2 if n + 2 * FRAME < SIDE else -(-(n + 2 * FRAME - SIDE) // STEP) * STEP + SIDE - n - FRAME
+        FRAME if n + 2 * FRAME < SIDE else -(-(n + 2 * FRAME - SIDE) // STEP) * STEP + SIDE - n - FRAME
         for n in (height, width)
     )
     padding = (FRAME, right, FRAME, below)
