@@ -98,13 +98,9 @@ figures: $(VENV)/.installed-test
 docs: $(VENV)/.installed-test
 	$(BIN)/python -m sphinx -E -W --keep-going -b html -d out/doctrees docs out/docs
 
-# Every notebook from the script it is paired with; those with pictures, run, are put into out/notebooks.
+# Every notebook from the script it is paired with, run, with small pictures, in some minutes.
 notebooks: $(VENV)/.installed-test
-	rm -f notebooks/*.ipynb
-	$(BIN)/jupytext --to ipynb notebooks/*.py
-	mkdir -p out/notebooks
-	cp notebooks/*.ipynb out/notebooks
-	$(BIN)/jupyter execute --inplace out/notebooks/*.ipynb
+	$(BIN)/python -m benchmarks.notebooks notebooks
 
 clean:
 	rm -rf $(VENV) out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis

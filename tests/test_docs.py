@@ -77,7 +77,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
-    pages = list(site.glob("*.html"))
+    pages = list(site.rglob("*.html"))
     assert len(pages) > len(DOCS)
     for page in pages:
         loaded = Loaded()
@@ -90,9 +90,13 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
 
 
 def test_the_reference_has_every_public_name(site: Path) -> None:
-    reference = (site / "reference.html").read_text(encoding="utf-8")
+    """On the page of its topic, which the first page of the reference links."""
+    first = (site / "reference.html").read_text(encoding="utf-8")
+    pages = {page.stem: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
     for name in nlfilter_torch.__all__:
-        assert f'id="nlfilter_torch.{name}"' in reference, name
+        topics = [topic for topic, text in pages.items() if f'id="nlfilter_torch.{name}"' in text]
+        assert len(topics) == 1, name
+        assert f'href="reference/{topics[0]}.html#nlfilter_torch.{name}"' in first, name
 
 
 def test_the_start_page_leads_to_every_page(site: Path) -> None:

@@ -3,17 +3,22 @@
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import skimage.data
 import torch
 
 from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.cli import main
+from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.detail import options_of
 from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.tiled.film import FilmEdit
+from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import build, noise, picture
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05], dtype=torch.float64)
@@ -187,6 +192,11 @@ def test_bad_fits_and_frames() -> None:
 # --- the command
 
 
+def rows_of(pixels: torch.Tensor) -> np.ndarray:
+    """(1, C, H, W) as (H, W, C)."""
+    return pixels[0].permute(1, 2, 0).contiguous().numpy()
+
+
 def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film = pan(4, 6, 40, 50)
     (tmp_path / "film").mkdir()
@@ -200,16 +210,16 @@ def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().out.splitlines()[0] == f"4 frames in {tmp_path / 'out'}"
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.tif", "3.png"]
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").glob("[0-9]*"))]
-    options = {"photometric_bandwidth": 20 / 255, "num_landmarks": 40}  # the defaults of detail
-    wanted = filter_frames(stored, torch.tensor([3.0, 3.0, 1.0]), references=[stored[0], stored[3]], **options)
-    for path, frame in zip(sorted((tmp_path / "out").iterdir()), wanted, strict=True):
+    recipe = Recipe((Step("detail", alpha=(3.0, 3.0, 1.0), landmarks=40),))
+    edit = FilmEdit(recipe, [rows_of(stored[0]), rows_of(stored[3])], Passes("float32"))
+    for path, frame in zip(sorted((tmp_path / "out").iterdir()), stored, strict=True):
         found = read_photograph(path)
-        assert (found.pixels - frame.clamp(0, 1)).abs().max() < 0.6 / 255
+        assert np.abs(rows_of(found.pixels) - edit(rows_of(frame)).clip(0, 1)).max() < 0.6 / 255
         assert found.depth == ("uint16" if path.suffix == ".tif" else "uint8")
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
-def test_frames_by_every_preset(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_by_every_preset(name: str, tmp_path: Path) -> None:
     film, preset = pan(2, 6, 30, 40), PRESETS[name]
     (tmp_path / "film").mkdir()
     for i, frame in enumerate(film):
@@ -217,15 +227,12 @@ def test_frames_by_every_preset(name: str, tmp_path: Path, capsys: pytest.Captur
     arguments = ["frames", str(tmp_path / "film"), str(tmp_path / "out"), "--landmarks", "40", "--references", "1"]
     assert main([*arguments, "--preset", name]) == 0
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").iterdir())]
-    options = options_of(preset.step, (30, 40)) | {"spatial_bandwidth": None} | {"num_landmarks": 40}
-    wanted = list(filter_frames(stored, torch.tensor(preset.alpha), references=stored[:1], **options))
-    for path, frame, before in zip(sorted((tmp_path / "out").iterdir()), wanted, stored, strict=True):
-        found = read_photograph(path).pixels
-        assert (found - frame.clamp(0, 1)).abs().max() < 0.6 / 255
-        assert (found - before).abs().max() > 1 / 255
-    (tmp_path / "look.json").write_text('{"version": 1, "steps": [{"edit": "tone"}]}')
-    assert main([*arguments, "--preset", str(tmp_path / "look.json")]) == 2
-    assert "--preset must be a file with one step, of detail and without strokes" in capsys.readouterr().err
+    paths = sorted((tmp_path / "out").iterdir())
+    step = preset.step.changed(landmarks=40, spatial_bandwidth="none")
+    wanted = apply_step(step, stored[0])  # the frame that the filter was fitted to
+    assert (read_photograph(paths[0]).pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
+    for path, before in zip(paths, stored, strict=True):
+        assert (read_photograph(path).pixels - before).abs().max() > 1 / 255
 
 
 def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,5 +249,5 @@ def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "must be another folder than that of the frames" in refused(tmp_path / "film", tmp_path / "film")
     assert "does not exist; make it first" in refused(tmp_path / "film", tmp_path / "no" / "where")
     assert "is a file, not a folder" in refused(tmp_path / "film", tmp_path / "film" / "a.png")
-    assert "references must have the height and width of the first" in refused(tmp_path / "film", tmp_path / "out")
+    assert "must have the size and the colours of the other frames" in refused(tmp_path / "film", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -85,8 +85,8 @@ def option_value(parameter: Parameter, value: Any) -> Any:
     return f"{value:.9g}" if parameter.words and isinstance(value, int | float) else value
 
 
-def option(parameter: Parameter) -> Any:
-    """The annotation of an option."""
+def option(parameter: Parameter, panel: str | None = None) -> Any:
+    """The annotation of an option, in a part of the help that has a title."""
     kind: Any = Literal[parameter.choices] if parameter.choices else TYPES[parameter.kind]
     limits: dict[str, Any] = {}
     if parameter.words:
@@ -100,6 +100,7 @@ def option(parameter: Parameter) -> Any:
         *(f"--{name.replace('_', '-')}" for name in names),
         metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
         help=parameter.help,
+        rich_help_panel=panel,
         **limits,
     )
     return Annotated[kind | None if parameter.optional else kind, decorated]
@@ -129,13 +130,23 @@ def signature(edit: Edit) -> inspect.Signature:
     )
 
 
-def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of detail of these names, in place of its ``**given``."""
+def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of detail of these names, and those of more edits, in place of its ``**given``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         found = inspect.signature(function, eval_str=True).parameters.values()
         own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in found if p.kind != p.VAR_KEYWORD]
-        signature = inspect.Signature([*own, *_declared(EDITS["detail"][name] for name in names)])
+        declared = {name: option(EDITS["detail"][name]) for name in names}
+        defaults = {name: EDITS["detail"][name] for name in names}
+        for edit in more:
+            for parameter in edit:
+                if parameter.is_option and parameter.name not in declared:
+                    declared[parameter.name] = option(parameter, f"Options of {edit.name}")
+                    defaults[parameter.name] = parameter
+        added = [
+            _argument(name, of, option_value(defaults[name], defaults[name].default)) for name, of in declared.items()
+        ]
+        signature = inspect.Signature([*own, *added])
         setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
         return function
 
@@ -163,7 +174,7 @@ def step_of(edit: Edit, given: dict[str, Any]) -> Step:
         value = given[parameter.name]
         if parameter.kind == "sliders":
             value = options.parse_sliders(value, f"--{parameter.name}")
-        elif parameter.words:
+        elif parameter.words or (parameter.kind == "number" and isinstance(value, str)):
             value = value if value is None else options.parse_number(value, parameter)
         values[parameter.name] = value
     return Step(edit.name, **values)

@@ -1,20 +1,37 @@
 """``nlfilter-torch frames``: one edit for all frames of a film, without flicker."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import PresetName, step_of, with_options
-from nlfilter_torch.core.memory import working_bytes
+from nlfilter_torch.cli.edits import plain_step, preset_option, step_of, with_options
 from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.presets import PRESETS, find_recipe
+from nlfilter_torch.edits.recipe import Recipe
+
+if TYPE_CHECKING:
+    from nlfilter_torch.tiled.film import FilmEdit
+
+#: Edits without scribbles.
+UNPAINTED = tuple(edit for edit in EDITS.values() if not edit.needs)
+OWN = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
+PIXEL = 100  # bytes for each pixel of a frame, besides those of the edit, which works in tiles
 
 Frames = Annotated[
-    Path, typer.Argument(metavar="FRAMES", help="A folder of photographs, taken in the order of their names.")
+    Path,
+    typer.Argument(
+        metavar="FRAMES", help="A film (.mp4 or .mov), or a folder of photographs, taken in the order of their names."
+    ),
 ]
 Edited = Annotated[
-    Path, typer.Argument(metavar="OUTDIR", help="The folder for the edited ones; it is made if it is not there.")
+    Path,
+    typer.Argument(
+        metavar="OUT",
+        help="The edited film (.mp4 or .mov), or the folder for the edited photographs; it is made if it is not there.",
+    ),
 ]
 References = Annotated[
     int,
@@ -24,67 +41,150 @@ References = Annotated[
         help="Number of frames, spread over the film, that the filter learns from. More for scenes that change.",
     ),
 ]
+EditName = Annotated[
+    str,
+    typer.Option(
+        "--edit",
+        metavar="|".join(edit.name for edit in UNPAINTED),
+        help="What to do: the edit of the command of that name.",
+    ),
+]
+Preset = Annotated[
+    str | None,
+    preset_option(
+        f"One of {', '.join(PRESETS)}, or a file of any edits without scribbles, such as `nlfilter-torch fit` and the "
+        "editor make. Options that are given count for more than a preset of detail; other edits take none.",
+        plain=False,
+    ),
+]
 
 
-@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance")))
+@with_options(*OWN, more=UNPAINTED)
 def frames(
-    folder: Frames,
+    context: typer.Context,
+    source: Frames,
     target: Edited,
+    edit: EditName = "detail",
     references: References = 3,
     seed: options.Seed = 0,
-    preset: PresetName = None,
+    preset: Preset = None,
+    memory: options.Memory = None,
     **given: Any,
 ) -> None:
-    """Edit the details of all frames of a film alike, so that nothing flickers.
+    """Edit all frames of a film alike, so that nothing flickers.
 
-    The sliders are those of `nlfilter-torch detail`; the filter is made once, and each frame is edited with it. Every
-    file keeps its name, type, depth, transparency, colour profile and notes of the camera.
+    The filter is made once, from frames spread over the film, and each frame is edited with it. Since things move,
+    distance counts only where --spatial-bandwidth is given. Films keep their sound, frame rate, time stamps, rotation
+    and colour properties (needs the extra `films`). Photographs in a folder keep their names, types, depths,
+    transparency, colour profiles and notes of the camera.
 
-    By sliders: `nlfilter-torch frames shots edited --alpha 2,2,2,1`
+    By sliders: `nlfilter-torch frames film.mp4 edited.mp4 --alpha 2,2,2,1`
 
     By the name of a look, or a file: `nlfilter-torch frames shots edited --preset crisp`
-    """
-    step = step_of(EDITS["detail"], given)
 
+    Another edit: `nlfilter-torch frames film.mp4 edited.mp4 --edit denoise --noise-level 8`
+    """
+    recipe = chosen_recipe(context, edit, preset, given)
+
+    from nlfilter_torch.cli.editing import allowed_memory
+    from nlfilter_torch.io.films import is_film
+    from nlfilter_torch.tiled.film import FilmEdit, film_steps
+    from nlfilter_torch.tiled.tiles import Passes
+
+    film_steps(recipe)
+    passes = Passes("float32", memory=allowed_memory(memory))
+
+    def fit(samples: list[Any]) -> FilmEdit:
+        return FilmEdit(recipe, samples, passes, seed=seed)
+
+    work = edit_film if is_film(source) and not source.is_dir() else edit_folder
+    count = work(source, target, references, fit)
+    typer.echo(f"{count} frames in {target}")
+
+
+def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: dict[str, Any]) -> Recipe:
+    """The edit that options describe.
+
+    Raises:
+        ValueError: if there are options of other edits.
+    """
+    sources = {option: context.get_parameter_source(option) for option in (*given, "edit")}
+    typed = [option for option, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+    if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
+        if typed:
+            raise ValueError(
+                f"--{typed[0].replace('_', '-')} must be left out where --preset holds another edit than detail, got "
+                f"it with {preset}; write it into the file"
+            )
+        return recipe
+    if name not in {edit.name for edit in UNPAINTED}:
+        names = ", ".join(edit.name for edit in UNPAINTED)
+        raise ValueError(f"--edit must be one of {names}, got {name!r}; others need scribbles, or are unknown")
+    if preset is not None and name != "detail":
+        raise ValueError(f"--edit must be left out where there is a preset, got {name} with {preset}; drop one of them")
+    declared = {parameter.name for parameter in EDITS[name]}
+    other = next((option for option in typed if option not in declared and option != "edit"), None)
+    if other is not None:
+        edits = " or ".join(edit.name for edit in UNPAINTED if other in {p.name for p in edit})
+        raise ValueError(
+            f"--{other.replace('_', '-')} must come with --edit {edits}, got it with {name}; leave it out, or name that"
+        )
+    mine = given if name == "detail" else {option: given[option] for option in typed if option != "edit"}
+    return Recipe((step_of(EDITS[name], mine),))
+
+
+def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
+    """Edit a film; the number of its frames."""
+    from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.io.films import check_film_output, open_film, write_film
+
+    check_film_output(target)
+    with open_film(source) as film, steps(film.count + 1) as begin:
+        begin("Learning from some frames")
+        edit = fit(film.sample(references))
+        return write_film(film, target, edit, lambda number: begin(f"Frame {number + 1} of {film.count}"))
+
+
+def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
+    """Edit the photographs of a folder; their number."""
     import torch
 
     from nlfilter_torch.cli.folders import pictures
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.edits.applying import seeded
-    from nlfilter_torch.edits.detail import options_of
-    from nlfilter_torch.edits.frames import filter_frames
-    from nlfilter_torch.io.photographs import Photograph, check_folder, check_output, read_photograph, write_photograph
+    from nlfilter_torch.io.photographs import check_folder, check_output, read_photograph, write_photograph
 
-    paths = pictures(folder, "frames")
-    if target.exists() and target.resolve() == folder.resolve():
+    if source.is_file():
+        raise ValueError(f"{source} must be a film that ends in .mp4 or .mov, or a folder; convert it")
+    paths = pictures(source, "frames")
+    if target.exists() and target.resolve() == source.resolve():
         raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
     check_folder(target)
-    needed = (1 + min(references, len(paths))) * working_bytes(step["landmarks"], step["patch_size"])
+    first: tuple[int, ...] = ()
+
+    def read(path: Path) -> tuple[Any, Any]:
+        nonlocal first
+        photograph = read_photograph(path, bytes_per_pixel=PIXEL)
+        rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
+        first = first or rows.shape
+        if rows.shape != first:
+            wanted, got = (
+                f"{height}x{width} and {colours} channel(s)" for height, width, colours in (first, rows.shape)
+            )
+            raise ValueError(
+                f"{path} must have the size and the colours of the other frames, {wanted}, got {got}; convert it"
+            )
+        return photograph, rows
+
     with steps(len(paths) + 1) as begin:
         begin("Learning from some frames")
         spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
-        samples = [read_photograph(paths[i], bytes_per_pixel=needed).pixels for i in spread]
-        films: list[Photograph] = []  # the one that is being edited
-
-        def read(path: Path) -> torch.Tensor:
+        edit = fit([read(paths[i])[1] for i in spread])
+        for number, path in enumerate(paths):
             begin(path.name)
-            films[:] = [read_photograph(path, bytes_per_pixel=needed)]
-            check_output(target.parent / path.name, films[0])
-            return films[0].pixels
-
-        edited = filter_frames(
-            map(read, paths),
-            torch.tensor(step["alpha"]),
-            references=samples,
-            residual=step["residual"],
-            channels=step["channels"],
-            threshold=step["threshold"] / 255,
-            limits=step["limits"],
-            viewing_size=step["viewing_size"],
-            **options_of(step.changed(spatial_bandwidth=step["spatial_bandwidth"] or "none"), (0, 0)),
-            generator=seeded(seed),
-        )
-        target.mkdir(exist_ok=True)
-        for path, pixels in zip(paths, edited, strict=True):
-            write_photograph(films[0].with_pixels(pixels), target / path.name)
-    typer.echo(f"{len(paths)} frames in {target}")
+            photograph, rows = read(path)
+            check_output(target.parent / path.name, photograph)
+            edited = torch.from_numpy(edit(rows)).permute(2, 0, 1)[None]
+            if number == 0:
+                target.mkdir(exist_ok=True)
+            write_photograph(photograph.with_pixels(edited), target / path.name)
+    return len(paths)

@@ -46,7 +46,7 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
 
 
 def parse_number(text: str, parameter: Parameter) -> float | str:
-    """The value of an option that takes a positive number or a word.
+    """The value of an option that takes a positive number, or a word of the parameter.
 
     >>> from nlfilter_torch.edits.parameters import EDITS
     >>> [parse_number(text, EDITS["detail"]["bandwidth"]) for text in ("51", "auto")]
@@ -59,12 +59,12 @@ def parse_number(text: str, parameter: Parameter) -> float | str:
     except ValueError:
         value = math.nan
     name, unit = f"--{parameter.name.replace('_', '-')}", UNITS[parameter.unit][0]
-    words = " or ".join(parameter.words)
+    words = "".join(f", or {word}" for word in parameter.words)
     if not 0 < value < math.inf:
-        raise ValueError(f"{name} must be a positive number of {unit}, such as 20, or {words}, got {text!r}")
+        raise ValueError(f"{name} must be a positive number of {unit}, such as 20{words}, got {text!r}")
     if not parameter.low <= value <= parameter.high:
         raise ValueError(
-            f"{name} must be from {parameter.low:g} to {parameter.high:.0f} {unit}, or {words}, got {text!r}; "
+            f"{name} must be from {parameter.low:g} to {parameter.high:.0f} {unit}{words}, got {text!r}; "
             "20 suits most photographs"
         )
     return value

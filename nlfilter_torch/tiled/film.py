@@ -1,0 +1,266 @@
+"""One edit for all frames of a film: fitted to some frames, and applied to each of them a few rows at a time.
+
+What an edit takes from the whole picture (landmarks, sums, means, the strength of the noise) it takes from the
+references, in an order that does not depend on the picture. The first time the answers are kept; for every other frame
+they are given again, so that equal spots are edited equally in all of them.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.applying import fit_step, seeded
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.source import Fitted, Guide, Planes
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.operator.build import operator_from_features
+from nlfilter_torch.operator.features import estimate_bandwidth, reduce_channels, unit_window
+from nlfilter_torch.operator.kernel import GuideFeatures
+from nlfilter_torch.operator.landmarks import stratified
+from nlfilter_torch.operator.scaling import PixelScaling
+from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.tiled.operator import TiledOperator, first_plane
+from nlfilter_torch.tiled.sampling import CHUNK, KeptColumns, Pilot
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import GuidePicture, Picture
+from nlfilter_torch.tiled.statistics import Block, Sums
+from nlfilter_torch.tiled.tiles import Passes
+
+LEARNT_FROM = 1 << 16  # pixels of all references together; twice or half as many are as close to all pixels
+FAR = 1e6  # a spatial bandwidth in pixels at which distance does not count
+Answer = TypeVar("Answer")
+Rows = NDArray[np.float32]
+
+
+@dataclass(eq=False)
+class References:
+    """Frames that an edit is fitted to, and what it asked of them so far, in order."""
+
+    pictures: list[Picture]
+    answers: list[Any] = field(default_factory=list)
+
+    def forget_pixels(self) -> None:
+        """Leave only the answers: nothing more will be asked."""
+        self.pictures = []
+        for answer in self.answers:
+            if isinstance(answer, References):
+                answer.forget_pixels()
+            elif isinstance(answer, LearntFilter):
+                answer.blocks = []
+
+
+@dataclass(eq=False)
+class LearntFilter:
+    """The filter of all references: its kernel and balancing, and blocks of the pixels that it was made from."""
+
+    pilot: Pilot
+    balancing: PixelScaling
+    blocks: list[Block]
+
+
+class FrameOperator(TiledOperator):
+    """The filter of the references, for the pixels of a frame."""
+
+    frame: "Frame"
+
+    @property
+    def pairs(self) -> RitzPairs:
+        """The spectrum."""
+
+        def found() -> RitzPairs:
+            sums = self._summed_up(first_plane, 1, self.over("Summing up"))
+            return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
+
+        return self.frame.answer(found)
+
+    def sums(self, planes: Planes, order: int) -> Sums:
+        """The sums over the references for the first ``order`` powers of W."""
+        return self.frame.answer(lambda: self._summed_up(planes, order, self.over("Summing up")))
+
+    def mean(self, planes: Planes) -> Tensor:
+        """Means over the references."""
+        return self.frame.answer(lambda: TiledOperator.mean(self, planes))
+
+
+class Frame(Tiled):
+    """A frame as the source of an edit that is fitted to the references.
+
+    Args:
+        picture: the frame.
+        passes: how it is read.
+        references: of its size.
+    """
+
+    def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
+        super().__init__(picture, passes)
+        self.references, self.asked = references, 0
+
+    def answer(self, work: Callable[[], Answer]) -> Answer:
+        """What is known about the references already, or what a function finds out about them."""
+        if self.asked == len(self.references.answers):
+            with torch.no_grad():
+                self.references.answers.append(work())
+        self.asked += 1
+        return cast(Answer, self.references.answers[self.asked - 1])
+
+    def each_reference(self) -> Iterator["Frame"]:
+        """The references, under the filters of this frame."""
+        for picture in self.references.pictures:
+            other = Frame(picture, self.passes, self.references)
+            other.operators, other.floats = self.operators, self.floats
+            yield other
+
+    @full_precision
+    def operator(self, guide: Guide) -> FrameOperator:
+        """The filter of the references."""
+        learnt = self.answer(lambda: learn_filter(self.references.pictures, guide))
+        found = FrameOperator(
+            GuidePicture(self.picture, guide),
+            learnt.pilot,
+            self.passes.report,
+            count=None,
+            full=True,
+            kernel=learnt.pilot.kernel,
+            bounded=False,
+            workers=self.passes.workers(learnt.pilot.balancing.shape[1]),
+            kept=KeptColumns(1, 0),
+        )
+        found.frame, found._balancing, found._sample = self, learnt.balancing, learnt.blocks
+        self.operators.append(found)
+        self.floats += learnt.pilot.kernel.landmarks.shape[1]
+        return found
+
+    def resized(self, size: tuple[int, int]) -> "Frame":
+        """The frame and the references in a smaller size."""
+
+        def reduced() -> References:
+            return References([Tiled.resized(other, size).picture for other in self.each_reference()])
+
+        references = self.answer(reduced)
+        return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
+
+    def held(self, fitted: Fitted) -> Fitted:
+        """The edit as it is, since means are taken over other pictures than the one that it is needed for again."""
+        return fitted
+
+    def mean(self, planes: Planes) -> Tensor:
+        """Means over the references."""
+        return self.answer(lambda: mean_of([Tiled.mean(other, planes) for other in self.each_reference()]))
+
+    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means over the references."""
+        return self.answer(lambda: mean_of([Tiled.mean_of(other, fitted, function) for other in self.each_reference()]))
+
+    def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
+        """Means over the references of their medians."""
+        return self.answer(lambda: mean_of([Tiled.medians(other, response, margin) for other in self.each_reference()]))
+
+
+def mean_of(values: Sequence[Tensor]) -> Tensor:
+    """The mean of tensors of one shape."""
+    return torch.stack(list(values)).mean(0)
+
+
+def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
+    """The filter of several pictures of one size, from an even sample of the pixels of each.
+
+    Every pixel has the coordinates that it has in its own picture. Weights are such that all pictures together count as
+    one of them.
+    """
+    options = dict(guide.options)
+    channels, bandwidth = options.pop("guide_channels", "luminance"), options.pop("photometric_bandwidth", "auto")
+    window = unit_window(options.pop("patch_size", 5), None).to(pictures[0].dtype)
+    spatial, generator = options.pop("spatial_bandwidth", None), options.pop("generator", None)
+    generator = seeded() if generator is None else generator
+    if isinstance(bandwidth, str):
+        looked_at = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
+        bandwidth = mean_of([estimate_bandwidth(looked, guide_channels=channels) for looked in looked_at])
+    recipe = GuideFeatures(window, bandwidth, spatial, channels)
+    each = min(pictures[0].pixels, max(1, LEARNT_FROM // len(pictures)))
+    drawn = torch.Generator().manual_seed(generator.initial_seed() % (1 << 63))
+    features, images = [], []
+    for picture in pictures:
+        image = whole(picture)
+        places = stratified(picture.pixels, each, drawn)
+        features.append(recipe(guide(image))[:, :, places])
+        images.append(image.flatten(2)[:, :, places])
+    points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)
+    weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
+    options["num_landmarks"] = min(options.get("num_landmarks", 100), points.shape[2])
+    built = operator_from_features(points, size=(points.shape[2],), weights=weights[0], generator=generator, **options)
+    pixels = (built.factor, built.diagonal, colours, weights)
+    cuts = zip(*(part.split(CHUNK, dim=-1) for part in pixels), strict=True)
+    blocks = [Block(factor, diagonal, image, weight) for factor, diagonal, image, weight in cuts]
+    empty = Block(built.factor[..., :0], built.diagonal[..., :0], colours[..., :0], weights[..., :0])
+    kernel = replace(built.kernel, features=recipe)
+    return LearntFilter(Pilot(kernel, empty, built.balancing.moment, 0), built.balancing, blocks)
+
+
+def whole(picture: Picture) -> Tensor:
+    """All pixels (1, C, H, W)."""
+    return picture.tile(0, picture.size[0], 0).pixels
+
+
+def film_steps(recipe: Recipe) -> tuple[Step, ...]:
+    """The steps of an edit as a film takes them: where things are in the picture does not count unless it is asked for.
+
+    Things move, and what is far from its place in all references would not be edited as it is there.
+
+    Raises:
+        ValueError: if a step has strokes, or needs them.
+    """
+    for step in recipe.steps:
+        if step.strokes or step.declared.needs:
+            raise ValueError(f"edits of a film must be without strokes, got {step.edit} with some; remove that step")
+    return tuple(
+        step.changed(spatial_bandwidth="none" if "none" in step.declared["spatial_bandwidth"].words else FAR)
+        if step["spatial_bandwidth"] is None
+        else step
+        for step in recipe.acting
+    )
+
+
+class FilmEdit:
+    """A whole edit, fitted to some frames of a film.
+
+    Args:
+        recipe: steps without strokes.
+        references: frames (H, W, C) of one size.
+        passes: how frames are read; the output is of its kind.
+        seed: of the randomness of every step.
+
+    Raises:
+        ValueError: if a step has strokes, or references differ in size.
+    """
+
+    def __init__(self, recipe: Recipe, references: Sequence[Rows], passes: Passes, *, seed: int = 0) -> None:
+        self.steps, self.passes, self.seed = film_steps(recipe), replace(passes, kind="float32"), seed
+        self.references: list[References] = []
+        self.size = references[0].shape[:2]
+        pictures = [Picture(reference, "reference") for reference in references]
+        for number, step in enumerate(self.steps):
+            learnt = References(pictures)
+            self.references.append(learnt)
+            last = number + 1 == len(self.steps)
+            edited = [self.edit(step, picture, learnt) for picture in (pictures[:1] if last else pictures)]
+            learnt.forget_pixels()
+            pictures = [Picture(rows.clip(0, 1), "reference") for rows in edited]
+
+    def edit(self, step: Step, picture: Picture, references: References) -> Rows:
+        """A frame (H, W, C) under a step."""
+        frame = Frame(picture, self.passes, references)
+        rows = frame.rows(fit_step(step, frame, (), {}, generator=seeded(self.seed)), plain=True)
+        return np.concatenate([values for _, values in rows])
+
+    def __call__(self, frame: Rows) -> Rows:
+        """A frame (H, W, C) under the edit; values may leave [0, 1]."""
+        for step, references in zip(self.steps, self.references, strict=True):
+            source = frame if step is self.steps[0] else frame.clip(0, 1)
+            frame = self.edit(step, Picture(source, "frame"), references)
+        return frame
