@@ -35,7 +35,6 @@ from nlfilter_torch.plotting import save_figure
 
 BATCH = 6  # crops in a step
 SIDE = 64  # pixels of a crop
-POINTS = 85  # pixels for each landmark
 RATE = 2e-3  # of Adam
 BANDWIDTH_RATE = 5.0  # times that for bandwidths, which are single numbers and learn as logarithms
 WARM_UP = 200  # steps over which the rate rises
@@ -49,8 +48,8 @@ ASIDE, ASIDE_SEED = 24, 1_000_000  # crops of either kind that are set aside
 class PlainDenoiser(NonlocalDenoiser):
     """The denoiser without the filter: a convolution in place of guide and sliders, of more weights than these."""
 
-    def __init__(self, *, points: int = POINTS) -> None:
-        super().__init__(points=points)
+    def __init__(self) -> None:
+        super().__init__()
         del self.log_bandwidths
         self.guide = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
         self.last = nn.Conv2d(WIDTH, PLANES, 1)
@@ -79,7 +78,7 @@ def new_denoiser(*, plain: bool, seed: int) -> NonlocalDenoiser:
     """A denoiser with weights drawn from a seed."""
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.manual_seed(seed)
-        return (PlainDenoiser if plain else NonlocalDenoiser)(points=POINTS)
+        return PlainDenoiser() if plain else NonlocalDenoiser()
 
 
 class Training:

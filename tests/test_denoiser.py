@@ -175,7 +175,7 @@ def test_precisions() -> None:
             cast = TRAINED_ONE(image, 0.1)
     assert half.dtype == torch.bfloat16
     assert cast.dtype == torch.float32
-    assert (cast - wanted).abs().max() < 0.05
+    assert (cast - wanted).abs().mean() < 0.005
     double = denoise(image.double(), noise_level=0.1)
     assert double.dtype == torch.float64
     # Rounding may assign a pixel to another landmark.

@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import (
-    check_count,
     check_image,
     check_photograph,
     check_same_size,
@@ -26,12 +25,12 @@ TRAINED = Path(__file__).with_name("denoiser.safetensors")
 WIDTH, FEATURES, ORDER = 36, 20, 3  # planes of the network and of the guide; k of the sliders
 DILATIONS = (1, 2, 3, 4, 3, 2)  # of the convolutions before the filter: 33x33 pixels are in sight
 PLANES, LEVELS = 3, 2  # of colours, and of the noise in them
-POINTS = 96  # pixels for each landmark
+PIXELS = 85  # for each landmark
 BANDWIDTHS = (0.15, 12.0)  # of the guide, and in pixels, before training
 FAINT = 1 / 255  # noise below which less and less is filtered
 BRIGHTEST = 2.0  # magnitude that larger images are scaled down to, as the network has seen none
 
-SIDE, STEP = 128, 112  # of tiles, and from one to the next, in pixels
+SIDE, STEP = 96, 80  # of tiles, and from one to the next, in pixels
 FRAME = 16  # pixels that an image is extended by, so that no border is in sight of it
 TOGETHER = 8  # tiles worked on at once
 
@@ -47,12 +46,6 @@ class NonlocalDenoiser(nn.Module):
 
     A new one knows nothing; :meth:`trained` is the one of the package.
 
-    Args:
-        points: pixels for each landmark.
-
-    Raises:
-        TypeError, ValueError: if ``points`` is not a positive integer.
-
     Example:
         >>> noisy = 0.5 + 0.1 * torch.randn(1, 1, 32, 32, generator=torch.Generator().manual_seed(0))
         >>> denoiser = NonlocalDenoiser.trained()
@@ -62,10 +55,8 @@ class NonlocalDenoiser(nn.Module):
         True
     """
 
-    def __init__(self, *, points: int = POINTS) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        check_count(points, "points")
-        self.points = points
         self.first = _convolution(PLANES + LEVELS, WIDTH)
         self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in DILATIONS)
         self.guide = _convolution(WIDTH, FEATURES + LEVELS * (ORDER + 1))
@@ -169,7 +160,7 @@ class NonlocalDenoiser(nn.Module):
         operator = operator_from_features(
             torch.cat([guide.flatten(2) / alike, places.expand(len(guide), -1, -1)], dim=1),
             size=(height, width),
-            num_landmarks=max(1, height * width // self.points),
+            num_landmarks=max(1, height * width // PIXELS),
         )
         # Running sums of shares: the sliders rise to 1 for the smooth layer, so that a pixel becomes a mean of others.
         sliders = logits.unflatten(1, (ORDER + 1, LEVELS)).softmax(1).cumsum(1)[:, :, (0, 1, 1)]
