@@ -31,8 +31,8 @@ from PIL import (  # noqa: F401
 )
 from torch import Tensor
 
+from nlfilter_torch.io import cameras, tiff
 from nlfilter_torch.io import exif as exif_tags
-from nlfilter_torch.io import tiff
 from nlfilter_torch.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
 from nlfilter_torch.tiled.sources import Picture, stored_as
 
@@ -104,7 +104,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     Args:
         path: A PNG, JPEG, TIFF, WebP or AVIF file, recognised by its content: grey or RGB, with or without alpha, 8 or
             16 bits, 10 or 12 (AVIF, read as 16) or floats (TIFF). The first page of a TIFF or picture of a JPEG is
-            read.
+            read. RAW and HEIC files as well, with the extras ``raw`` and ``heic``; RAW, by its suffix, as 16 bits.
         bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for a
             file of 64-bit floats.
         memory: Bytes that may be used; None is the free memory.
@@ -161,7 +161,10 @@ def first_bytes(path: Path) -> bytes:
 def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tuple[Pixels, bytes | None, bytes | None]:
     """Upright channels (H, W, S) as they are stored, profile and EXIF; see :func:`read_photograph`."""
     head = first_bytes(path)
-    if tiff.is_tiff(head):
+    if cameras.is_raw(path) or cameras.is_heic(head):
+        read = cameras.read_raw if cameras.is_raw(path) else cameras.read_heic
+        channels, orientation, icc, exif = read(path, lambda size: check_memory(path, *size, bytes_per_pixel, memory))
+    elif tiff.is_tiff(head):
         channels, orientation, icc, exif = tiff.read(
             path, lambda size, double: check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
         )
