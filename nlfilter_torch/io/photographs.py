@@ -9,30 +9,22 @@ import secrets
 import shutil
 import sys
 import time
-import warnings
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-import imagecodecs
 import numpy as np
 import psutil
 import torch
 from numpy.typing import NDArray
-from PIL import (  # noqa: F401
-    AvifImagePlugin,
-    Image,
-    ImageFile,
-    PngImagePlugin,
-    UnidentifiedImageError,
-    WebPImagePlugin,
-)
+from PIL import Image
 from torch import Tensor
 
 from nlfilter_torch.io import cameras, tiff
 from nlfilter_torch.io import exif as exif_tags
+from nlfilter_torch.io.by_pillow import read_by_pillow
 from nlfilter_torch.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
 from nlfilter_torch.tiled.sources import Picture, stored_as
 
@@ -170,7 +162,7 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tu
         )
     else:
         deep_png = head.startswith(b"\x89PNG") and head[24:25] == b"\x10"  # the bit depth in the header
-        channels, orientation, icc, exif = _read_by_pillow(
+        channels, orientation, icc, exif = read_by_pillow(
             path, deep_png, lambda size: check_memory(path, *size, bytes_per_pixel, memory)
         )
     return exif_tags.upright(channels, orientation), icc, exif
@@ -375,57 +367,3 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
 def _size(count: int) -> str:
     """A number of bytes with its unit."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
-
-
-def _read_by_pillow(
-    path: Path, deep_png: bool, check_size: Callable[[tuple[int, int]], None]
-) -> tuple[Pixels, int, bytes | None, bytes | None]:
-    """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG, WebP or AVIF file."""
-    with tiff.decoding(path):
-        try:
-            with warnings.catch_warnings():
-                # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
-                image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
-        except Image.DecompressionBombError as error:
-            raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
-        except UnidentifiedImageError as error:
-            sentence = f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these"
-            raise tiff.UnhandledImage(sentence) from error
-        with image:
-            frames = getattr(image, "n_frames", 1)
-            if frames > 1 and image.format != "MPO":
-                raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
-            check_size(image.size)
-            orientation, exif = exif_tags.split(image.getexif)
-            # Pillow would reduce 16 bits to 8, and 10 or 12.
-            if deep_png:
-                channels = imagecodecs.png_decode(path.read_bytes())
-            elif image.format == "AVIF" and (bits := _bits_of_avif(path)) > 8:
-                channels = imagecodecs.avif_decode(path.read_bytes())
-                channels = np.rint(channels * (65535 / (2**bits - 1))).astype(np.uint16)
-            else:
-                channels = np.asarray(_plain_mode(image, path))
-            return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
-
-
-def _bits_of_avif(path: Path) -> int:
-    """Bits of a channel, from the configuration of the codec, which is among the first boxes."""
-    with path.open("rb") as stream:
-        head = stream.read(1 << 16)
-    place = head.find(b"av1C") + 6  # after the version, the profile and the level
-    flags = head[place] if 6 <= place < len(head) else 0
-    return (12 if flags & 0x20 else 10) if flags & 0x40 else 8
-
-
-def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
-    """The image in one of the modes L, LA, RGB, RGBA."""
-    transparent = "transparency" in image.info
-    modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
-    modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
-    if image.mode not in modes:
-        sentence = f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB"
-        raise tiff.UnhandledImage(sentence)
-    image.load()
-    return image.convert(modes[image.mode])
