@@ -25,6 +25,7 @@ from rich.table import Table
 from skimage.filters import unsharp_mask
 from torch import Tensor
 
+from benchmarks.photographs import LETTERS
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.plotting import save_figure, show_images
@@ -116,7 +117,7 @@ def main() -> None:
             table.add_row(name, method, *(f"{figure:.2f}" for figure in figures))
         window = (..., slice(top, top + SIDE), slice(left, left + SIDE))
         panels = {"before": image} | results
-        figure = show_images({title: panel[window] for title, panel in panels.items()}, side=SIDE)
+        figure = show_images({title: panel[window] for title, panel in panels.items()}, side=SIDE, letters=LETTERS)
         save_figure(figure, folder / f"detail-{name}.png")
     Console(width=110).print(table)
 

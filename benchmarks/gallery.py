@@ -14,6 +14,7 @@ from torch import Tensor
 from benchmarks.figures.colours import BLUE, TRUE, reached
 from benchmarks.figures.focus import WIDE, default_map
 from benchmarks.figures.scenes import YELLOW, luminance, marked, painted_over, scene, scribbled, spots, strokes
+from benchmarks.photographs import LETTERS
 from nlfilter_torch import abstract, colorize, defocus, enhance, recolor, region_mask
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.io.photographs import Photograph, write_photograph
@@ -117,7 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
     folder = parser.parse_args(arguments).folder
     folder.mkdir(exist_ok=True)
     for name, panels in EDITS.items():
-        save_figure(show_images(panels(), columns=3, side=SIDE), folder / f"edit-{name}.png")
+        save_figure(show_images(panels(), columns=3, side=SIDE, letters=LETTERS), folder / f"edit-{name}.png")
     write_photograph(Photograph(front()), folder / "front.jpg")
 
 

@@ -12,7 +12,7 @@ from kornia.color import rgb_to_grayscale
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.photographs import photograph
+from benchmarks.photographs import LETTERS, photograph
 from nlfilter_torch import (
     abstract,
     adjust_tone,
@@ -57,7 +57,9 @@ def presets(name: str, window: tuple[int, int, int]) -> Figure:
     """Every preset on one photograph."""
     image = photograph(name)
     panels = {"before": image} | {title: preset.apply(image) for title, preset in PRESETS.items()}
-    return show_images({title: crop(panel, window) for title, panel in panels.items()}, columns=3, side=250)
+    return show_images(
+        {title: crop(panel, window) for title, panel in panels.items()}, columns=3, side=250, letters=LETTERS
+    )
 
 
 def presets_portrait() -> Figure:
@@ -160,7 +162,9 @@ def single_sliders() -> Figure:
             alpha[number] = value
             title = f"({', '.join(f'{a:g}' for a in alpha.tolist())})"
             panels[title] = edit_luminance(image, lambda planes, a=alpha: polynomial_filter(operator, planes, a))
-    return show_images({title: crop(panel, WHISKERS) for title, panel in panels.items()}, columns=3, side=240)
+    return show_images(
+        {title: crop(panel, WHISKERS) for title, panel in panels.items()}, columns=3, side=240, letters=LETTERS
+    )
 
 
 def edits() -> Figure:
@@ -192,7 +196,7 @@ def edits() -> Figure:
         "with noise of 20 levels": image + noise,
         "denoise": denoise(image + noise),
     }
-    return show_images(panels, columns=4, side=260)
+    return show_images(panels, columns=3, side=260, letters=LETTERS)
 
 
 def layers() -> Figure:

@@ -14,6 +14,8 @@ from nlfilter_torch.io.photographs import read_photograph
 
 LOADERS = {"motorcycle": lambda: skimage.data.stereo_motorcycle()[0]}
 
+LETTERS = 27  # height of captions in pixels: phones show pictures of three columns at less than half their size
+
 
 @cache
 def photograph(name: str, height: int | None = None, width: int | None = None) -> torch.Tensor:

@@ -5,6 +5,7 @@ the length in pixels of the longer side of each picture.
 """
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,18 +22,37 @@ from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.operator.spectrum import Spectrum
 
 DPI = 100
+POINTS = 72  # in an inch, as DPI pixels
 SIDE = 512  # pixels along the longer side of a picture
 LABEL = 35  # pixels above a picture for its title
+BREADTH, LINE = 0.6, 1.2  # of a letter and a line, over the height of letters
 GAP = 15  # pixels between pictures
 FAR = 0.995  # colour scales end at this quantile, so that one outlier does not compress the others
 
 
-def show_images(images: Mapping[str, Tensor], *, columns: int | None = None, side: int = SIDE) -> Figure:
-    """Titled pictures side by side, each (1, C, H, W) or (C, H, W) in [0, 1]."""
+def show_images(
+    images: Mapping[str, Tensor], *, columns: int | None = None, side: int = SIDE, letters: int | None = None
+) -> Figure:
+    """Titled pictures side by side.
+
+    Args:
+        images: each (1, C, H, W) or (C, H, W) in [0, 1], by its title.
+        columns: Pictures in a row; None is all.
+        side: Length in pixels of the longer side of each picture.
+        letters: Height of the titles in pixels, which are broken into lines as wide as the pictures; None is one line
+            of letters so small that it fits.
+    """
     pictures = {title: _picture(image) for title, image in images.items()}
-    figure, axes = _panels(next(iter(pictures.values())).shape, len(pictures), columns, side)
-    for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
-        _draw(axis, title, picture)
+    shape = next(iter(pictures.values())).shape
+    if letters is None:
+        titles, label = list(pictures), LABEL
+    else:
+        width = shape[1] * side / max(shape[:2])
+        titles = ["\n".join(textwrap.wrap(title, max(6, int(width / (letters * BREADTH))))) for title in pictures]
+        label = round(letters * (0.8 + LINE * max(title.count("\n") + 1 for title in titles)))
+    figure, axes = _panels(shape, len(pictures), columns, side, label)
+    for axis, title, picture in zip(axes, titles, pictures.values(), strict=True):
+        _draw(axis, title, picture, letters=letters)
     return figure
 
 
@@ -135,24 +155,35 @@ def _limit(values: NDArray[Any]) -> float:
     return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
 
 
-def _panels(shape: tuple[int, ...], count: int, columns: int | None, side: int) -> tuple[Figure, list[Axes]]:
+def _panels(
+    shape: tuple[int, ...], count: int, columns: int | None, side: int, label: int = LABEL
+) -> tuple[Figure, list[Axes]]:
     """A figure of ``count`` panels for pictures of that height and width, placed to the pixel."""
     across = min(columns or count, count)
     down = math.ceil(count / across)
     height, width = (round(length * side / max(shape[:2])) for length in shape[:2])
-    full = (across * (width + GAP) + GAP, down * (height + LABEL) + GAP)  # width, height in pixels
+    full = (across * (width + GAP) + GAP, down * (height + label) + GAP)  # width, height in pixels
     figure = Figure(figsize=(full[0] / DPI, full[1] / DPI), dpi=DPI)
     axes = []
     for number in range(count):
         row, column = divmod(number, across)
-        left, bottom = GAP + column * (width + GAP), full[1] - (row + 1) * (height + LABEL)
+        left, bottom = GAP + column * (width + GAP), full[1] - (row + 1) * (height + label)
         axes.append(figure.add_axes((left / full[0], bottom / full[1], width / full[0], height / full[1])))
     return figure, axes
 
 
-def _draw(axis: Axes, title: str, picture: NDArray[Any], *, limit: float | None = None, colours: str = "gray") -> None:
+def _draw(
+    axis: Axes,
+    title: str,
+    picture: NDArray[Any],
+    *,
+    limit: float | None = None,
+    colours: str = "gray",
+    letters: int | None = None,
+) -> None:
     """One titled picture, with the colour scale ±limit if given and [0, 1] otherwise."""
     lowest, highest = (0.0, 1.0) if limit is None else (-limit, limit)
     axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
-    axis.set_title(title, fontsize=min(11.0, max(6.0, axis.get_window_extent().width / 28)))  # fits 36 letters
+    fitting = min(11.0, max(6.0, axis.get_window_extent().width / 28))  # fits 36 letters
+    axis.set_title(title, fontsize=fitting if letters is None else letters * POINTS / DPI)
     axis.set_axis_off()

@@ -318,7 +318,7 @@ def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
     page = opened.page
     (folder / "notes.png").write_text("dear diary")
     opened.open(folder / "notes.png")
-    expect(page.get_by_text("notes.png is not a PNG, JPEG, TIFF or WebP image")).to_be_visible()
+    expect(page.get_by_text("notes.png is not a PNG, JPEG, TIFF, WebP or AVIF image")).to_be_visible()
 
     def chunk(name: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))

@@ -81,7 +81,7 @@ def test_files_that_are_no_images_leave_all_as_it_was(session: Session, tmp_path
     opened, recipe = session.opened, session.recipe
     copy = tmp_path / "copy"
     copy.write_bytes(b"dear diary")
-    with pytest.raises(ValueError, match=r"^notes\.txt is not a PNG, JPEG, TIFF or WebP image"):
+    with pytest.raises(ValueError, match=r"^notes\.txt is not a PNG, JPEG, TIFF, WebP or AVIF image"):
         session.open(copy, "notes.txt")
     copy.write_bytes(b"")
     with pytest.raises(ValueError, match=r"^empty\.png is empty"):

@@ -306,7 +306,7 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
     assert "none is no folder; name the one" in refused(capsys, tmp_path / "none", target)
-    assert "holds no PNG, JPEG, TIFF or WebP file" in refused(capsys, tmp_path / "empty", target)
+    assert "holds no PNG, JPEG, TIFF, WebP or AVIF file" in refused(capsys, tmp_path / "empty", target)
     assert "must be another folder than that of the photographs" in refused(capsys, source, source)
     assert "is a file, not a folder" in refused(capsys, source, tmp_path / "file")
     assert "does not exist; make it first" in refused(capsys, source, tmp_path / "no" / "where")

@@ -213,7 +213,7 @@ def test_wrong_inputs(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     sentences = {
         "none.png": "none.png does not exist; check the name and the folder",
         "empty.png": "empty.png is empty; copy it again from where it came",
-        "text.jpg": "text.jpg is not a PNG, JPEG, TIFF or WebP image; convert it to one of these",
+        "text.jpg": "text.jpg is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these",
         "half.png": "half.png is damaged or cut short (",
     }
     for name, sentence in sentences.items():
@@ -230,8 +230,8 @@ def test_outputs_that_cannot_be(photo: Path, tmp_path: Path, capsys: pytest.Capt
     before = set(tmp_path.iterdir())
     for source, target, sentence in (
         ("in.png", "nowhere/out.png", "does not exist; make it first"),
-        ("in.png", "out.gif", "out.gif must end in .png, .jpg, .webp or .tif, got '.gif'"),
-        ("rgba.png", "out.jpg", "JPEG has no alpha channel; write a PNG, TIFF or WebP file"),
+        ("in.png", "out.gif", "out.gif must end in .png, .jpg, .webp, .avif or .tif, got '.gif'"),
+        ("rgba.png", "out.jpg", "JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"),
         ("deep.png", "out.jpg", "JPEG has no 16 bits a channel; write a PNG or TIFF file or choose a depth of 8 bits"),
         ("float.tif", "out.png", "PNG has no floats a channel; write a TIFF file or choose a depth of 16 bits"),
     ):

@@ -102,7 +102,7 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
         ("folder.zarr", "new.zarr", "is no array of zarr"),
         ("none.zarr", "new.zarr", "is no array of zarr"),
         ("in.zarr", "no/new.zarr", "does not exist; make it first"),
-        ("in.zarr", "new.gif", "must end in .png, .jpg, .webp or .tif"),
+        ("in.zarr", "new.gif", "must end in .png, .jpg, .webp, .avif or .tif"),
     ):
         assert detail(tmp_path / source, tmp_path / target) == 2
         assert message in capsys.readouterr().err

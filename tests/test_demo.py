@@ -66,6 +66,20 @@ def test_grey_images_and_rows(tmp_path: Path) -> None:
     assert (figure[90:110, 15:25] == 255).all()  # 1.5 is clipped
 
 
+def test_large_titles_take_several_lines(tmp_path: Path) -> None:
+    """As high as they are asked to be, above the pictures and no wider than these."""
+    white = torch.ones(1, 3, 100, 200)
+    for title, lines in (("one", 1), ("several words in a row, on some lines", 4)):
+        figure = rendered(show_images({title: white, "b": white}, side=200, letters=27), tmp_path)
+        above = figure.shape[0] - 100 - 15
+        assert 27 * lines <= above <= 27 * 1.2 * (lines + 1)
+        ink = np.argwhere(figure.min(-1) < 128)
+        assert ink[:, 0].max() < above  # the pictures are white
+        assert ink[:, 0].max() - ink[:, 0].min() >= 27 * (lines - 1) + 15
+        assert ink[:, 1].min() >= 0
+        assert not (figure[:, 215:230].min(-1) < 128).any()  # between the two
+
+
 @pytest.mark.parametrize("constant", [False, True])
 def test_figures_of_any_image(tmp_path: Path, constant: bool) -> None:
     """A constant image has empty layers and few eigenvectors; its figures are drawn all the same."""

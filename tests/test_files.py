@@ -127,6 +127,43 @@ def test_jpeg_keeps_metadata_and_looks(tmp_path: Path, channels: int) -> None:
     assert tags(found.exif) == tags(wanted.exif)
 
 
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_avif_keeps_metadata_and_looks(tmp_path: Path, channels: int) -> None:
+    """Grey photographs are stored in colour."""
+    ramp = np.linspace(0, 255, 64 * 64).reshape(64, 64, 1).repeat(channels, -1).round().astype(np.uint8)
+    wanted = photograph(ramp, icc=PROFILE, exif=exif_block())
+    write_photograph(wanted, tmp_path / "out.avif")
+    found = read_photograph(tmp_path / "out.avif")
+    assert found.depth == "uint8"
+    assert (found.pixels - wanted.pixels).abs().max() < 6 / 255
+    assert (found.alpha is None) == (channels < 4)
+    assert found.alpha is None or (found.alpha - wanted.alpha).abs().max() < 6 / 255
+    assert found.icc == PROFILE
+    assert tags(found.exif) == tags(wanted.exif)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_deep_avif_is_read_at_sixteen_bits(tmp_path: Path, bits: int) -> None:
+    values = (np.linspace(0, 1, 64 * 48 * 3).reshape(48, 64, 3) * (2**bits - 1)).round()
+    stored = imagecodecs.avif_encode(values.astype(np.uint8 if bits == 8 else np.uint16), level=100, bitspersample=bits)
+    (tmp_path / "in.avif").write_bytes(stored)
+    found = read_photograph(tmp_path / "in.avif")
+    assert found.depth == ("uint8" if bits == 8 else "uint16")
+    wanted = torch.from_numpy(values / (2**bits - 1)).permute(2, 0, 1)[None].float()
+    assert (found.pixels - wanted).abs().max() < 3 / 2**bits
+
+
+def test_avif_is_turned_upright(tmp_path: Path) -> None:
+    values = np.zeros((32, 48, 3), np.uint8)
+    values[:16, :24] = 255
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.fromarray(values).save(tmp_path / "in.avif", exif=exif)
+    found = read_photograph(tmp_path / "in.avif").pixels
+    assert found.shape == (1, 3, 48, 32)
+    assert found[0, 0, 12, 24] > 0.9 > 0.1 > found[0, 0, 12, 8]
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_exif_orientation_is_applied_and_reset(tmp_path: Path, orientation: int, suffix: str) -> None:
@@ -257,8 +294,8 @@ def bad_file(folder: Path, kind: str) -> Path:
         ("missing", "does not exist"),
         ("folder", "is a folder"),
         ("empty", "is empty"),
-        ("text", "is not a PNG, JPEG, TIFF or WebP image"),
-        ("gif", "is not a PNG, JPEG, TIFF or WebP image"),
+        ("text", "is not a PNG, JPEG, TIFF, WebP or AVIF image"),
+        ("gif", "is not a PNG, JPEG, TIFF, WebP or AVIF image"),
         ("truncated PNG", "is damaged or cut short"),
         ("truncated 16 bit PNG", "is damaged or cut short"),
         ("truncated JPEG", "is damaged or cut short"),
@@ -317,9 +354,9 @@ def test_a_decompression_bomb_is_too_large(tmp_path: Path, monkeypatch: pytest.M
     ("name", "depth", "channels", "sentence"),
     [
         ("nowhere/out.png", "uint8", 3, "because the folder .* does not exist; make it first"),
-        ("out.gif", "uint8", 3, r"must end in .png, .jpg, .webp or .tif, got '.gif'"),
+        ("out.gif", "uint8", 3, r"must end in .png, .jpg, .webp, .avif or .tif, got '.gif'"),
         ("out", "uint8", 3, r"must end in .*, got ''"),
-        ("out.jpg", "uint8", 4, "JPEG has no alpha channel; write a PNG, TIFF or WebP file"),
+        ("out.jpg", "uint8", 4, "JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"),
         (
             "out.jpeg",
             "uint16",
@@ -327,6 +364,7 @@ def test_a_decompression_bomb_is_too_large(tmp_path: Path, monkeypatch: pytest.M
             "JPEG has no 16 bits a channel; write a PNG or TIFF file or choose a depth of 8 bits",
         ),
         ("out.webp", "uint16", 3, "WebP has no 16 bits a channel"),
+        ("out.avif", "uint16", 3, "AVIF has no 16 bits a channel"),
         ("out.png", "float32", 3, "PNG has no floats a channel; write a TIFF file or choose a depth of 16 bits"),
     ],
 )

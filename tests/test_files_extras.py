@@ -19,12 +19,13 @@ XMP = (
 UPRIGHT = XMP.replace(b'Orientation="6"', b'Orientation="1"').replace(b">3<", b">1<")
 EXTRAS = Extras(UPRIGHT, (240.0, 300.0))
 KINDS = [("a.jpg", "uint8"), ("a.png", "uint8"), ("a.png", "uint16"), ("a.tif", "uint16"), ("a.webp", "uint8")]
+KINDS += [("a.avif", "uint8")]
 
 
 def check(path: Path) -> None:
     found = read_extras(path)
     assert found.xmp == UPRIGHT
-    if path.suffix != ".webp":  # has no such field
+    if path.suffix not in (".webp", ".avif"):  # have no such field
         assert found.dpi == pytest.approx((240, 300), abs=0.02)
 
 

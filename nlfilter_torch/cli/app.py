@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 Image = Annotated[
-    Path | None, typer.Argument(metavar="[IMAGE]", help="A photograph to begin with: PNG, JPEG, TIFF or WebP.")
+    Path | None, typer.Argument(metavar="[IMAGE]", help="A photograph to begin with: PNG, JPEG, TIFF, WebP or AVIF.")
 ]
 Out = Annotated[
     Path | None,

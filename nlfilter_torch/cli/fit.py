@@ -48,7 +48,7 @@ ENOUGH = 0.8  # share that is to be explained
 AMPLIFIED = 4  # what is left, in the preview
 SQUARE = 16  # pixels, of places that an edit is looked for in
 FEW, MOST = 0.1, 0.5  # of these places, and of what is left, for an edit to be called local
-PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff")
 CALLED = {
     "alpha": "sliders",
     "bands": "gains of blurs",

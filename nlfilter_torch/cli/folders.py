@@ -64,7 +64,7 @@ def pictures(folder: Path, what: str = "photographs") -> list[Path]:
         raise ValueError(f"{folder} is no folder; name the one that holds the {what}")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not paths:
-        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF or WebP file; put the {what} there")
+        raise ValueError(f"{folder} holds no PNG, JPEG, TIFF, WebP or AVIF file; put the {what} there")
     return paths
 
 

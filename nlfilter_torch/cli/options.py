@@ -70,7 +70,7 @@ def parse_number(text: str, parameter: Parameter) -> float | str:
     return value
 
 
-Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF or WebP file.")]
+Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF, WebP or AVIF file.")]
 Seed = Annotated[
     int,
     typer.Option(
@@ -84,7 +84,7 @@ Target = Annotated[
     str,
     typer.Argument(
         metavar="OUT",
-        help="The edited photograph; the extension of its name (.png, .jpg, .tif, .webp) selects the type.",
+        help="The edited photograph; the extension of its name (.png, .jpg, .tif, .webp, .avif) selects the type.",
     ),
 ]
 OutputDepth = Annotated[

@@ -39,9 +39,9 @@ class Extras:
     dpi: tuple[float, float] | None = None
 
     def options(self, kind: str) -> dict[str, Any]:
-        """Options of Pillow to write them to a JPEG, WebP or PNG file."""
+        """Options of Pillow to write them to a JPEG, WebP, AVIF or PNG file."""
         options: dict[str, Any] = {}
-        if self.dpi is not None and kind != "WebP":
+        if self.dpi is not None and kind not in ("WebP", "AVIF"):
             options["dpi"] = self.dpi
         if self.xmp is None or (kind == "JPEG" and len(self.xmp) > JPEG_LIMIT):
             return options

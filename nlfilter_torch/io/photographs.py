@@ -1,4 +1,4 @@
-"""Image files in and out: PNG, JPEG, TIFF and WebP at their own depth, with alpha, EXIF and colour profile.
+"""Image files in and out: PNG, JPEG, TIFF, WebP and AVIF at their own depth, with alpha, EXIF and colour profile.
 
 Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil); nothing else in the package imports this module.
 """
@@ -9,23 +9,22 @@ import secrets
 import shutil
 import sys
 import time
-import warnings
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-import imagecodecs
 import numpy as np
 import psutil
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageFile, PngImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401
+from PIL import Image
 from torch import Tensor
 
+from nlfilter_torch.io import cameras, tiff
 from nlfilter_torch.io import exif as exif_tags
-from nlfilter_torch.io import tiff
+from nlfilter_torch.io.by_pillow import read_by_pillow
 from nlfilter_torch.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
 from nlfilter_torch.tiled.sources import Picture, stored_as
 
@@ -36,17 +35,23 @@ Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
 
 BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
-# Depths that each file type supports. JPEG and WebP have 8 bits only, JPEG has no alpha, PNG no floats.
+# Depths that each file type supports: those that Pillow writes. JPEG has no alpha, PNG no floats.
 DEPTHS: dict[str, tuple[str, ...]] = {
     "PNG": ("uint8", "uint16"),
     "JPEG": ("uint8",),
     "WebP": ("uint8",),
+    "AVIF": ("uint8",),
     "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
 }
-ENCODING: dict[str, dict[str, object]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WebP": {"lossless": True}}
+ENCODING: dict[str, dict[str, object]] = {
+    "JPEG": {"quality": 95, "subsampling": 0},
+    "WebP": {"lossless": True},
+    "AVIF": {"quality": 90, "subsampling": "4:4:4"},
+}
 PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
 unfinished: set[Path] = set()  # files being written; command lines read this when interrupted
-SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".tif": "TIFF", ".tiff": "TIFF"}
+SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
+SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 
 
 @dataclass(frozen=True)
@@ -89,8 +94,9 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     """Read an image file.
 
     Args:
-        path: A PNG, JPEG, TIFF or WebP file, recognised by its content: grey or RGB, with or without alpha, 8 or 16
-            bits or (TIFF) floats. The first page of a TIFF or picture of a JPEG is read.
+        path: A PNG, JPEG, TIFF, WebP or AVIF file, recognised by its content: grey or RGB, with or without alpha, 8 or
+            16 bits, 10 or 12 (AVIF, read as 16) or floats (TIFF). The first page of a TIFF or picture of a JPEG is
+            read. RAW and HEIC files as well, with the extras ``raw`` and ``heic``; RAW, by its suffix, as 16 bits.
         bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for a
             file of 64-bit floats.
         memory: Bytes that may be used; None is the free memory.
@@ -147,13 +153,16 @@ def first_bytes(path: Path) -> bytes:
 def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tuple[Pixels, bytes | None, bytes | None]:
     """Upright channels (H, W, S) as they are stored, profile and EXIF; see :func:`read_photograph`."""
     head = first_bytes(path)
-    if tiff.is_tiff(head):
+    if cameras.is_raw(path) or cameras.is_heic(head):
+        read = cameras.read_raw if cameras.is_raw(path) else cameras.read_heic
+        channels, orientation, icc, exif = read(path, lambda size: check_memory(path, *size, bytes_per_pixel, memory))
+    elif tiff.is_tiff(head):
         channels, orientation, icc, exif = tiff.read(
             path, lambda size, double: check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
         )
     else:
         deep_png = head.startswith(b"\x89PNG") and head[24:25] == b"\x10"  # the bit depth in the header
-        channels, orientation, icc, exif = _read_by_pillow(
+        channels, orientation, icc, exif = read_by_pillow(
             path, deep_png, lambda size: check_memory(path, *size, bytes_per_pixel, memory)
         )
     return exif_tags.upright(channels, orientation), icc, exif
@@ -163,7 +172,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     """Write an image file at the photograph's depth; the extension of the name selects the type.
 
     Integer channels are clipped to what the file can hold and rounded. JPEG is written at quality 95 without colour
-    subsampling, WebP and TIFF without loss. The file appears complete or not at all.
+    subsampling, AVIF at 90, WebP and TIFF without loss. The file appears complete or not at all.
 
     Raises:
         ValueError: See :func:`check_output`.
@@ -212,7 +221,9 @@ def check_type(path: str | Path, depth: str, alpha: bool) -> str:
     check_file(path)
     kind = SUFFIXES.get(path.suffix.lower())
     if kind is None:
-        raise ValueError(f"{path} must end in .png, .jpg, .webp or .tif, got {path.suffix!r}; choose one of these")
+        raise ValueError(
+            f"{path} must end in .png, .jpg, .webp, .avif or .tif, got {path.suffix!r}; choose one of these"
+        )
     if depth not in DEPTHS[kind]:
         others = " or ".join(name for name, depths in DEPTHS.items() if depth in depths)
         raise ValueError(
@@ -220,7 +231,9 @@ def check_type(path: str | Path, depth: str, alpha: bool) -> str:
             f"write a {others} file or choose a depth of {BITS[DEPTHS[kind][-1]]}"
         )
     if alpha and kind == "JPEG":
-        raise ValueError(f"{path} cannot hold this picture: JPEG has no alpha channel; write a PNG, TIFF or WebP file")
+        raise ValueError(
+            f"{path} cannot hold this picture: JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"
+        )
     return kind
 
 
@@ -354,42 +367,3 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
 def _size(count: int) -> str:
     """A number of bytes with its unit."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
-
-
-def _read_by_pillow(
-    path: Path, deep_png: bool, check_size: Callable[[tuple[int, int]], None]
-) -> tuple[Pixels, int, bytes | None, bytes | None]:
-    """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG or WebP file."""
-    with tiff.decoding(path):
-        try:
-            with warnings.catch_warnings():
-                # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
-                image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP"])
-        except Image.DecompressionBombError as error:
-            raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
-        except UnidentifiedImageError as error:
-            sentence = f"{path} is not a PNG, JPEG, TIFF or WebP image; convert it to one of these"
-            raise tiff.UnhandledImage(sentence) from error
-        with image:
-            frames = getattr(image, "n_frames", 1)
-            if frames > 1 and image.format != "MPO":
-                raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
-            check_size(image.size)
-            orientation, exif = exif_tags.split(image.getexif)
-            # Pillow would reduce 16 bits to 8.
-            channels = imagecodecs.png_decode(path.read_bytes()) if deep_png else np.asarray(_plain_mode(image, path))
-            return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
-
-
-def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
-    """The image in one of the modes L, LA, RGB, RGBA."""
-    transparent = "transparency" in image.info
-    modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
-    modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
-    if image.mode not in modes:
-        sentence = f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB"
-        raise tiff.UnhandledImage(sentence)
-    image.load()
-    return image.convert(modes[image.mode])

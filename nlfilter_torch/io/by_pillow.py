@@ -1,0 +1,69 @@
+"""PNG, JPEG, WebP and AVIF files to channels, by Pillow, or by imagecodecs where they have more than 8 bits."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+from numpy.typing import NDArray
+from PIL import AvifImagePlugin, Image, ImageFile, PngImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401
+
+from nlfilter_torch.io import exif as exif_tags
+from nlfilter_torch.io import tiff
+
+Pixels = NDArray[np.generic]
+
+
+def read_by_pillow(
+    path: Path, deep_png: bool, check_size: Callable[[tuple[int, int]], None]
+) -> tuple[Pixels, int, bytes | None, bytes | None]:
+    """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG, WebP or AVIF file."""
+    with tiff.decoding(path):
+        try:
+            with warnings.catch_warnings():
+                # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
+                image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
+        except Image.DecompressionBombError as error:
+            raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
+        except UnidentifiedImageError as error:
+            sentence = f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these"
+            raise tiff.UnhandledImage(sentence) from error
+        with image:
+            frames = getattr(image, "n_frames", 1)
+            if frames > 1 and image.format != "MPO":
+                raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
+            check_size(image.size)
+            orientation, exif = exif_tags.split(image.getexif)
+            # Pillow would reduce 16 bits to 8, and 10 or 12.
+            if deep_png:
+                channels = imagecodecs.png_decode(path.read_bytes())
+            elif image.format == "AVIF" and (bits := _bits_of_avif(path)) > 8:
+                channels = imagecodecs.avif_decode(path.read_bytes())
+                channels = np.rint(channels * (65535 / (2**bits - 1))).astype(np.uint16)
+            else:
+                channels = np.asarray(_plain_mode(image, path))
+            return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
+
+
+def _bits_of_avif(path: Path) -> int:
+    """Bits of a channel, from the configuration of the codec, which is among the first boxes."""
+    with path.open("rb") as stream:
+        head = stream.read(1 << 16)
+    place = head.find(b"av1C") + 6  # after the version, the profile and the level
+    flags = head[place] if 6 <= place < len(head) else 0
+    return (12 if flags & 0x20 else 10) if flags & 0x40 else 8
+
+
+def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
+    """The image in one of the modes L, LA, RGB, RGBA."""
+    transparent = "transparency" in image.info
+    modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
+    modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
+    if image.mode not in modes:
+        sentence = f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB"
+        raise tiff.UnhandledImage(sentence)
+    image.load()
+    return image.convert(modes[image.mode])
