@@ -220,6 +220,8 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
     found, wanted = facts(target), facts(source)
     if options.get("varying"):  # a mean over gaps between frames as they are stored, which is not in their order
         assert abs(found.pop("rate") / wanted.pop("rate") - 1) < 0.1
+    for each in (found, wanted):
+        each["length"] = round(float(each["length"]), 2)  # the file counts thousandths of a second
     assert found == wanted
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
     with open_film(target) as film:

@@ -81,8 +81,13 @@ def estimate_noise(image: Tensor) -> Tensor:
 @torch.no_grad()
 def noise_of(source: Source) -> Noise:
     """The noise of any source."""
+    return Noise(*source.measured(_measured))
+
+
+def _measured(source: Source) -> Tensor:
+    """Floor, gain and light, (3, B)."""
     if min(source.size) < 3:
-        return Noise.even(torch.zeros(source.batch, dtype=source.dtype))
+        return torch.zeros(3, source.batch, dtype=source.dtype)
     windows = _windows(source)
     light = windows.mean((2, 3))
     response = _response(windows)
@@ -99,7 +104,7 @@ def noise_of(source: Source) -> Noise:
         variances.append(_level(response.gather(1, group[..., None].expand(-1, -1, response.shape[2])), flat).square())
     floor, gain = _line(torch.stack(shades, dim=1), torch.stack(variances, dim=1))
     even = gain == 0
-    return Noise(torch.where(even, level.square(), floor), gain, light.mean(1))
+    return torch.stack([torch.where(even, level.square(), floor), gain, light.mean(1)])
 
 
 def _windows(source: Source) -> Tensor:

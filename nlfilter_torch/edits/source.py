@@ -171,13 +171,8 @@ class Source(Protocol):
             MemoryError: if there is no room for so many ``floats`` for each of its pixels.
         """
 
-    def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
-        """Medians (B, C) over all pixels but ``margin`` at the borders.
-
-        Args:
-            response: non-negative, from an image (B, C, H, W) to one without these.
-            margin: how many pixels around a pixel it depends on.
-        """
+    def measured(self, function: Callable[["Source"], Tensor]) -> Tensor:
+        """What a function finds in the picture; of a frame, the mean of what it finds in the frames that count."""
 
 
 class InMemory:
@@ -282,9 +277,9 @@ class InMemory:
         """Means over blocks of all pixels."""
         return block_means(planes(self), step)
 
-    def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
-        """Medians over all pixels."""
-        return response(self.image).flatten(2).median(2).values
+    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+        """What a function finds."""
+        return function(self)
 
 
 @dataclass(frozen=True, eq=False)

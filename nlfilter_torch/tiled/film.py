@@ -17,7 +17,7 @@ from torch import Tensor
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step, seeded
 from nlfilter_torch.edits.recipe import Recipe
-from nlfilter_torch.edits.source import Fitted, Guide, Planes
+from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import estimate_bandwidth, reduce_channels, unit_window
@@ -157,9 +157,9 @@ class Frame(Tiled):
         """Means over the references."""
         return self.answer(lambda: mean_of([Tiled.mean_of(other, fitted, function) for other in self.each_reference()]))
 
-    def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
-        """Means over the references of their medians."""
-        return self.answer(lambda: mean_of([Tiled.medians(other, response, margin) for other in self.each_reference()]))
+    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+        """The mean of what a function finds in the references."""
+        return self.answer(lambda: mean_of([function(other) for other in self.each_reference()]))
 
 
 def mean_of(values: Sequence[Tensor]) -> Tensor:

@@ -12,7 +12,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.resizing import resized
-from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, block_means
+from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
@@ -239,29 +239,9 @@ class Tiled:
         return InMemory(self.reduced(lambda pixels: pixels.image, step))
 
     @torch.no_grad()
-    def medians(self, response: Callable[[Tensor], Tensor], margin: int) -> Tensor:
-        """Medians (1, C) over all pixels but ``margin`` at the borders, in float32.
-
-        Numbers above 0 are in the order of their bits: the upper half of these is counted first, then, for those with
-        the median's upper half, the lower one.
-        """
-        rank = ((self.size[0] - 2 * margin) * (self.size[1] - 2 * margin) - 1) // 2
-        ranks, upper = torch.full((self.channels, 1), rank), torch.zeros(self.channels, dtype=torch.long)
-        for half in (16, 0):
-            counts = torch.zeros(self.channels, 1 << 16, dtype=torch.long)
-            for tile in self.picture.tiles(margin, self.picture.statistics_rows):
-                self.passes.report("Estimating noise", tile.start, self.size[0])
-                if tile.pixels.shape[2] <= 2 * margin:
-                    continue
-                bits = response(tile.pixels).float().flatten(2)[0].contiguous().view(torch.int32)
-                for channel, row in enumerate(bits):
-                    part = row if half else row[row >> 16 == upper[channel]]
-                    counts[channel] += torch.bincount(part >> half & 0xFFFF, minlength=1 << 16)
-            summed = counts.cumsum(1)
-            found = torch.searchsorted(summed, ranks, right=True)
-            ranks = ranks - torch.where(found > 0, summed.gather(1, (found - 1).clamp(min=0)), 0)
-            upper = upper << 16 | found[:, 0]
-        return upper.int().view(torch.float32)[None].to(self.dtype)
+    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+        """What a function finds."""
+        return function(self)
 
     def pixels_of(self, tile: Tile) -> TilePixels:
         """All pixels of a tile of the picture."""
