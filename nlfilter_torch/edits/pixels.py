@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Pixels(Protocol):
-    """Some pixels of a picture: all of them, or some of its rows."""
+    """Some pixels of a picture: all of them, some of its rows, or a rectangle."""
 
     @property
     def image(self) -> Tensor:
@@ -17,6 +17,15 @@ class Pixels(Protocol):
     @property
     def first(self) -> int:
         """Number of the first one, along the rows of the picture."""
+
+    @property
+    def width(self) -> int:
+        """W of the picture."""
+
+
+def corner(pixels: Pixels) -> tuple[int, int]:
+    """Row and column of the first one."""
+    return divmod(pixels.first, pixels.width)
 
 
 Planes = Callable[[Any], Tensor]  # of some pixels, (B, C, h, W)
