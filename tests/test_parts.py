@@ -20,10 +20,10 @@ from tests.test_whole_edit import COLORIZE, DETAIL, IN, RECOLOR, rows_of
 
 SMALL = 0.006  # megapixels, fewer than the cat has
 PLACES = [
-    Rectangle(range(0, 100), range(0, 150)),
+    Rectangle(range(100), range(150)),
     Rectangle(range(13, 60), range(31, 97)),
-    Rectangle(range(0, 20), range(120, 150)),
-    Rectangle(range(71, 100), range(0, 1)),
+    Rectangle(range(20), range(120, 150)),
+    Rectangle(range(71, 100), range(1)),
 ]
 EDITS = {
     "nothing": Recipe(),

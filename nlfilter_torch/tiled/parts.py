@@ -46,6 +46,11 @@ class Rectangle:
         """With a margin, as far as a picture (H, W) has it."""
         return Rectangle(_grown(self.rows, margin, size[0]), _grown(self.columns, margin, size[1]))
 
+    def meets(self, other: "Rectangle") -> bool:
+        """Whether they have a pixel in common."""
+        pairs = ((self.rows, other.rows), (self.columns, other.columns))
+        return all(a.start < b.stop and b.start < a.stop for a, b in pairs)
+
     def inside(self, other: "Rectangle") -> tuple[slice, slice]:
         """Where it lies in another one that contains it."""
         down, right = self.rows.start - other.rows.start, self.columns.start - other.columns.start

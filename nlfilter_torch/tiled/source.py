@@ -11,8 +11,8 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
-from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.pixels import corner
+from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
