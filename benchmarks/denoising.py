@@ -1,97 +1,295 @@
-"""Evaluation of denoisers: noisy held-out photographs, other denoisers, and a table of PSNRs."""
+"""Denoisers beside each other: ``python -m benchmarks.denoising [--pictures FOLDER] [--quick] [--out FILE]``.
 
+Photographs that nothing was trained on, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour: PSNR,
+SSIM and CPU seconds of
+
+ours             ``nlfilter_torch.denoise``, told the noise, and with the noise that it estimates;
+rule             ``denoise(method="rule")``: sliders by rule, nothing learned;
+BM3D, CBM3D      package ``bm3d``;
+scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` of the best of five weights for
+                 each photograph;
+OpenCV           ``fastNlMeansDenoising`` on 8 bits, with the best of four strengths for each photograph;
+plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.train_denoiser --plain``.
+
+``--weights FILE`` judges other weights than those of the package, and may be given several times. ``--noise`` and
+``--kinds`` choose a part; without ``--pictures``, the photographs are camera, coffee, chelsea and the left halves of
+retina and page. ``--wrong`` adds: noise misstated by a fifth, noise that depends on the light, and clean photographs.
+"""
+
+import argparse
+import json
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.photographs import photograph
+from benchmarks.photographs import photograph, pictures
+from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
+from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.operator.features import reduce_channels
 
-HELD_OUT = {"camera": (60, 190), "coffee": (150, 220), "chelsea": (70, 130)}  # row and column of a part to look at
-PART = 160  # pixels of it
-NOISE = 25 / 255
-STRENGTHS = (15, 20, 25, 30)  # grey levels; the h that OpenCV's method is tried with
-
-Method = Callable[[Tensor], Tensor]  # noisy to denoised, (1, 1, H, W) both
+HELD_OUT = ("camera", "coffee", "chelsea", "retina", "page")
+LEFT_HALVES = ("retina", "page")
+NOISE = (5, 15, 25, 50)  # grey levels
+OPENCV_STRENGTHS = (0.6, 0.8, 1.0, 1.2)  # times the noise level
+TV_WEIGHTS = (0.5, 0.7, 0.9, 1.1, 1.4)  # times the noise level
+LONGEST = 512  # pixels of the longer side; larger photographs are reduced
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A photograph in grey, (1, 1, H, W) in [0, 1], and the same with noise, which may leave that range."""
+class Case:
+    """A photograph (1, 1 or 3, H, W) in [0, 1], the same with noise, which may leave that range, and the noise."""
 
     name: str
     clean: Tensor
     noisy: Tensor
+    noise: float
 
-    def psnr(self, image: Tensor) -> float:
-        """Peak signal to noise ratio of a result in decibels."""
-        return decibels(float((image - self.clean).double().square().mean()))
+    @property
+    def array(self) -> np.ndarray:
+        """The noisy photograph as (H, W) or (H, W, 3)."""
+        return as_array(self.noisy)
+
+    @property
+    def axis(self) -> int | None:
+        """The axis of colours."""
+        return None if self.noisy.shape[1] == 1 else -1
+
+
+Method = Callable[[Case], Tensor]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a method makes of a photograph."""
+
+    psnr: float
+    ssim: float
+    seconds: float  # of CPU
+
+
+def scenes(folder: Path | None, kind: str, *, quick: bool) -> dict[str, Tensor]:
+    """Photographs (1, 1 or 3, H, W) by name, in ``"grey"`` or ``"colour"``; grey ones are none in colour."""
+    if folder is not None:
+        found = pictures(folder, 320, ())
+    else:
+        found = {name: photograph(name) for name in HELD_OUT}
+        found |= {name: found[name][..., : found[name].shape[-1] // 2] for name in LEFT_HALVES}
+    cut = {}
+    for name, picture in found.items():
+        if kind == "colour" and picture.shape[1] == 1:
+            continue
+        scale = LONGEST / max(picture.shape[-2:])
+        if scale < 1:
+            size = [round(length * scale) for length in picture.shape[-2:]]
+            picture = torch.nn.functional.interpolate(picture, size, mode="bicubic", antialias=True).clamp(0, 1)
+        picture = picture if kind == "colour" else reduce_channels(picture, "luminance")
+        cut[name] = picture[..., 40:88, 40:88] if quick else picture
+    return dict(list(cut.items())[:2]) if quick else cut
+
+
+def with_noise(clean: Tensor, noise: float | Tensor, number: int) -> Tensor:
+    """A photograph with noise of its own number, not clipped."""
+    generator = torch.Generator().manual_seed(1000 + number)
+    return clean + noise * torch.randn(clean.shape, generator=generator)
 
 
 def decibels(squared_error: float) -> float:
     """A mean squared error of images in [0, 1] as a PSNR."""
-    return -10 * math.log10(squared_error)
+    return -10 * math.log10(max(squared_error, 1e-12))
 
 
-def held_out_scenes(side: int | None = None) -> list[Scene]:
-    """The photographs to judge on, whole or ``side`` x ``side`` pixels of them; the same noise on every call."""
-    generator = torch.Generator().manual_seed(0)
-    scenes = []
-    for name in HELD_OUT:
-        clean = reduce_channels(photograph(name), "luminance")
-        clean = clean if side is None else part(name, clean, side)
-        scenes.append(Scene(name, clean, clean + NOISE * torch.randn(clean.shape, generator=generator)))
-    return scenes
+def psnr(image: Tensor, clean: Tensor) -> float:
+    """Peak signal to noise ratio in decibels."""
+    return decibels(float((image - clean).double().square().mean()))
 
 
-def part(name: str, image: Tensor, side: int = PART) -> Tensor:
-    """The ``side`` x ``side`` pixels of a held-out photograph that are worth a look."""
-    top, left = HELD_OUT[name]
-    return image[..., top : top + side, left : left + side]
+def ssim(image: Tensor, clean: Tensor) -> float:
+    """Structural similarity, with the Gaussian window of the paper that defined it."""
+    from skimage.metrics import structural_similarity
+
+    arrays = [picture[0].permute(1, 2, 0).double().numpy() for picture in (image, clean)]
+    value = structural_similarity(
+        *arrays, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+    )
+    return float(value)
 
 
-def skimage_nlm(noisy: Tensor) -> Tensor:
-    """Non-local means of scikit-image, told the noise level."""
+def as_array(image: Tensor) -> np.ndarray:
+    """(1, C, H, W) as (H, W) or (H, W, 3)."""
+    return image[0].permute(1, 2, 0).squeeze(2).double().numpy()
+
+
+def as_image(array: np.ndarray) -> Tensor:
+    """The inverse of :func:`as_array`."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array)).float()
+    return (tensor[..., None] if tensor.ndim == 2 else tensor).permute(2, 0, 1)[None]
+
+
+def bm3d(case: Case) -> Tensor:
+    """BM3D in grey, CBM3D in colour."""
+    import bm3d as package
+
+    method = package.bm3d if case.axis is None else package.bm3d_rgb
+    return as_image(method(case.array, case.noise))
+
+
+def nlm(case: Case) -> Tensor:
+    """Non-local means of scikit-image."""
     from skimage.restoration import denoise_nl_means
 
-    result = denoise_nl_means(
-        noisy[0, 0].numpy(), patch_size=5, patch_distance=6, h=0.8 * NOISE, sigma=NOISE, fast_mode=True
+    options = {"patch_size": 5, "patch_distance": 6, "h": 0.8 * case.noise, "sigma": case.noise, "fast_mode": True}
+    return as_image(denoise_nl_means(case.array, **options, channel_axis=case.axis))
+
+
+def wavelets(case: Case) -> Tensor:
+    """Cycle-spun wavelets of scikit-image."""
+    from skimage.restoration import cycle_spin, denoise_wavelet
+
+    options = {"sigma": case.noise, "rescale_sigma": False, "channel_axis": case.axis}
+    return as_image(cycle_spin(case.array, 3, denoise_wavelet, func_kw=options, num_workers=1, channel_axis=case.axis))
+
+
+def total_variation(case: Case) -> Tensor:
+    """Total variation of scikit-image, of the weight that is best on this very photograph."""
+    from skimage.restoration import denoise_tv_chambolle
+
+    return best(
+        case,
+        (as_image(denoise_tv_chambolle(case.array, weight=w * case.noise, channel_axis=case.axis)) for w in TV_WEIGHTS),
     )
-    return torch.from_numpy(result)[None, None]
 
 
-def opencv_nlm(noisy: Tensor, strength: float) -> Tensor:
-    """Non-local means of OpenCV, which takes 8 bits: rounded and clipped."""
+def opencv(case: Case) -> Tensor:
+    """Non-local means of OpenCV, which takes 8 bits, of the strength that is best on this very photograph."""
     import cv2
 
-    pixels = (noisy[0, 0].clamp(0, 1) * 255).round().byte().numpy()
-    return torch.from_numpy(cv2.fastNlMeansDenoising(pixels, None, strength, 7, 21))[None, None] / 255
+    pixels = (case.array.clip(0, 1) * 255).round().astype(np.uint8)
+    strengths = [255 * case.noise * strength for strength in OPENCV_STRENGTHS]
+    if case.axis is None:
+        found = (cv2.fastNlMeansDenoising(pixels, None, strength, 7, 21) for strength in strengths)
+    else:
+        found = (cv2.fastNlMeansDenoisingColored(pixels, None, strength, strength, 7, 21) for strength in strengths)
+    return best(case, (as_image(array / 255) for array in found))
 
 
-def best_opencv_strength(scenes: Iterable[Scene]) -> float:
-    """The h with the highest mean PSNR on these very scenes, to the peer's advantage."""
-    return max(STRENGTHS, key=lambda h: sum(scene.psnr(opencv_nlm(scene.noisy, h)) for scene in scenes))
+def best(case: Case, results: Iterable[Tensor]) -> Tensor:
+    """The result of the highest PSNR."""
+    return max(results, key=lambda found: psnr(found, case.clean))
 
 
-def judge(
-    methods: Mapping[str, Method], scenes: Iterable[Scene]
-) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Tensor]]]:
-    """Print a table of PSNRs, row by row as it comes.
+def network(path: Path | None, *, plain: bool = False) -> Method:
+    """The trained network of a file, or of the package, told the noise."""
+    from benchmarks.train_denoiser import PlainDenoiser
 
-    Returns:
-        The table, by method, then by photograph and mean; and the results, by method and photograph.
-    """
-    scenes = list(scenes)
-    table, results = {}, {}
-    print(f"{'PSNR in dB':24}" + "".join(f"{name:>10}" for name in [*(scene.name for scene in scenes), "mean"]))
-    for method, function in methods.items():
-        results[method] = {scene.name: function(scene.noisy) for scene in scenes}
-        row = {scene.name: scene.psnr(results[method][scene.name]) for scene in scenes}
-        row["mean"] = statistics.mean(row.values())
-        print(f"{method:24}" + "".join(f"{value:10.2f}" for value in row.values()), flush=True)
-        table[method] = row
-    return table, results
+    kind = PlainDenoiser if plain else NonlocalDenoiser
+    denoiser = kind.trained() if path is None else kind.trained(path)
+
+    def run(case: Case) -> Tensor:
+        with torch.no_grad():
+            denoised: Tensor = denoiser(case.noisy, case.noise)
+        return denoised
+
+    return run
+
+
+def judge(method: Method, case: Case) -> Figures:
+    """What a method makes of a photograph."""
+    start = time.process_time()
+    found = method(case)
+    seconds = time.process_time() - start
+    return Figures(psnr(found, case.clean), ssim(found.clamp(0, 1), case.clean), seconds)
+
+
+def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dict[str, Figures]]:
+    """Print the PSNR of each photograph, and the means of all figures, row by row as they come."""
+    print(f"{'':22}" + "".join(f"{case.name[:9]:>10}" for case in cases) + f"{'mean':>10}{'SSIM':>8}{'CPU s':>8}")
+    rows: dict[str, dict[str, Figures]] = {}
+    for name, method in methods.items():
+        rows[name] = {case.name: judge(method, case) for case in cases}
+        found = list(rows[name].values())
+        mean = [statistics.mean(getattr(figures, which) for figures in found) for which in ("psnr", "ssim", "seconds")]
+        line = "".join(f"{figures.psnr:10.2f}" for figures in found)
+        print(f"{name:22}{line}{mean[0]:10.2f}{mean[1]:8.4f}{mean[2]:8.2f}", flush=True)
+    return rows
+
+
+def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
+    """Print what is lost where the noise is told wrong, depends on the light, or is not there."""
+    print("\nmean loss in dB with the noise told 0.8 and 1.2 times as strong")
+    for level in NOISE:
+        losses = {}
+        for factor in (0.8, 1.2):
+            pairs = []
+            for number, (name, image) in enumerate(clean.items()):
+                case = Case(name, image, with_noise(image, level / 255, number), level / 255)
+                wrong = Case(name, image, case.noisy, factor * case.noise)
+                pairs.append(psnr(denoiser(case), image) - psnr(denoiser(wrong), image))
+            losses[factor] = statistics.mean(pairs)
+        print(f"  noise {level:2}: " + ", ".join(f"{factor:g} {loss:+.2f}" for factor, loss in losses.items()))
+    print("\nclean photographs: PSNR with the noise estimated, and told to be 1 and 2 levels")
+    for name, image in clean.items():
+        estimated = psnr(denoise(image), image)
+        told = [psnr(denoiser(Case(name, image, image, level / 255)), image) for level in (1, 2)]
+        print(f"  {name:20}{estimated:8.1f}" + "".join(f"{value:8.1f}" for value in told))
+    print("\nestimated noise in grey levels, for 5, 15, 25 and 50")
+    for number, (name, image) in enumerate(clean.items()):
+        found = [255 * float(estimate_noise(with_noise(image, level / 255, number))) for level in NOISE]
+        print(f"  {name:20}" + "".join(f"{value:8.2f}" for value in found))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="Denoisers beside each other.")
+    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
+    parser.add_argument("--noise", type=float, nargs="+", default=NOISE, help="grey levels; default %(default)s")
+    parser.add_argument("--kinds", nargs="+", choices=("grey", "colour"), default=("grey", "colour"))
+    parser.add_argument("--weights", type=Path, action="append", default=[], help="further networks to judge")
+    parser.add_argument("--plain", type=Path, action="append", default=[], help="networks without the filter to judge")
+    parser.add_argument("--networks", action="store_true", help="judge networks alone")
+    parser.add_argument("--wrong", action="store_true", help="noise misstated and estimated, and clean photographs")
+    parser.add_argument("--quick", action="store_true", help="small parts of two photographs, to see that it runs")
+    parser.add_argument("--out", type=Path, help="a JSON file of all figures")
+    options = parser.parse_args(arguments)
+    own = network(None)
+    methods: dict[str, Method] = {"noisy": lambda case: case.noisy, "ours": own}
+    methods |= {path.parent.name: network(path) for path in options.weights}
+    methods |= {f"plain, {path.parent.name}": network(path, plain=True) for path in options.plain}
+    if not options.networks:
+        methods |= {
+            "ours, estimated": lambda case: denoise(case.noisy),
+            "rule": lambda case: denoise(case.noisy, method="rule", noise_level=case.noise),
+            "BM3D": bm3d,
+            "scikit-image NLM": nlm,
+            "scikit-image TV": total_variation,
+            "scikit-image wavelets": wavelets,
+            "OpenCV NLM": opencv,
+        }
+    figures = {}
+    for kind in options.kinds:
+        clean = scenes(options.pictures, kind, quick=options.quick)
+        for level in options.noise:
+            noise = level / 255
+            cases = [
+                Case(name, image, with_noise(image, noise, i), noise) for i, (name, image) in enumerate(clean.items())
+            ]
+            print(f"\n{kind}, noise {level:g}")
+            rows = table(methods, cases)
+            figures[f"{kind}, {level:g}"] = {
+                name: {scene: asdict(found) for scene, found in row.items()} for name, row in rows.items()
+            }
+        if options.wrong:
+            misstated(own, clean)
+    if options.out is not None:
+        with open_beside(options.out) as stream:
+            stream.write(json.dumps(figures, indent=2).encode())
+
+
+if __name__ == "__main__":
+    main()

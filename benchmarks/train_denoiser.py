@@ -1,281 +1,239 @@
-"""Train a denoiser around the filter and judge it: ``python -m benchmarks.train_denoiser [--out FOLDER]``.
+"""Train the denoiser: ``python -m benchmarks.train_denoiser [--out FOLDER] [--steps N] [--seed N] [--plain]``.
 
-A starting point for your own training. From the noisy image a small convolutional network computes two outputs per
-pixel: a feature vector, the guide, so that W links pixels with similar features, and the sliders. It computes no pixel
-values: the output is a convex combination of ``y, W y, ..., W^k y`` at every pixel, with weights that are
-positive and sum to one. The filter does the denoising, and everything learns end to end: network, bandwidths, sliders.
+Trains :class:`nlfilter_torch.NonlocalDenoiser` on crops of scikit-image's pictures (:mod:`benchmarks.denoiser_crops`),
+half of them grey, half in colour, with noise of 0 to 60 grey levels. The loss is the mean, over crops, of the root mean
+squared error; the weights that are saved are running means of those that were trained. The folder gets
 
-It trains on crops of photographs that come with scikit-image, with fresh white noise of 25 grey levels. It is judged on
-three that it has not seen, in grey and whole, beside
+denoiser.safetensors   the weights, with the figures of the training as metadata;
+denoiser.json          arguments, times and losses;
+curve.png              the loss on crops that are set aside;
+state.pt               everything that a training needs to go on: the same command takes it up where it was stopped, and
+                       one of more steps continues it.
 
-untrained      the same model as it starts;
-by hand        ``nlfilter_torch.denoise``: patches as guide, sliders by rule, nothing learned;
-scikit-image   ``denoise_nl_means``, fast mode, 5x5 patches within 6 pixels, h = 0.8 sigma;
-OpenCV         ``fastNlMeansDenoising``, 7x7 patches in windows of 21x21, on 8 bits; of h = 15, 20, 25 and 30 the one
-               that is best on these photographs.
-
-Equal arguments train equal weights on one machine with one number of threads.
+``--plain`` trains the same network with a further convolution in place of the filter, for comparison. Equal arguments
+train equal weights on one machine with one number of threads.
 """
 
 import argparse
-import copy
 import json
-import math
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from benchmarks.denoising import (
-    NOISE,
-    Method,
-    Scene,
-    best_opencv_strength,
-    decibels,
-    held_out_scenes,
-    judge,
-    opencv_nlm,
-    part,
-    skimage_nlm,
-)
-from benchmarks.photographs import photograph
-from nlfilter_torch import NonlocalFilter, denoise
+from benchmarks.denoiser_crops import Crops
 from nlfilter_torch.io.photographs import open_beside
-from nlfilter_torch.plotting import save_figure, show_images
+from nlfilter_torch.nn.denoiser import WIDTH, NonlocalDenoiser
+from nlfilter_torch.plotting import save_figure
 
-SCENES = ("astronaut", "motorcycle", "rocket")
-TEXTURES = ("coins", "moon", "brick", "grass", "gravel", "immunohistochemistry", "retina", "hubble_deep_field")
-SCENE_WEIGHT = 3  # photographs like those of the test are drawn more often
-LARGE = 400  # pixels of the short side, from which a photograph trains at half size too
-BATCH = 4  # crops in a step
-RATE = 3e-3  # of Adam; it rises over the first steps and falls along half a cosine
-BANDWIDTH_RATE = 5.0  # times that for bandwidths, which are single numbers and learn as logarithms
-WARM_UP = 20  # steps
-LARGEST_GRADIENT = 0.05  # its norm; one odd crop shall not undo a hundred steps
-EVERY = 100  # steps between two lines of progress
-
-DILATIONS = (1, 2, 3, 4, 3, 2)  # of the middle convolutions; with the first and the last they see 35x35 pixels
-WIDTH = 32
-FEATURES = 20
-ORDER = 3
-TILES = 8  # filtered at once
-
-SIDES = (16, 96)  # of crops; quick tiles have to fit into 96x96 pixels
-QUICK_SIDE = 96
-SHOWN = ("noisy", "trained", "scikit-image NLM")  # in the picture, beside the clean photographs
+BATCH = 8  # crops in a step
+SIDE = 96  # pixels of a crop
+RATE = 1.5e-3  # of Adam
+WARM_UP = 200  # steps over which the rate rises
+FALL = 0.4  # last share of the steps, over which it falls to nothing along half a cosine
+LARGEST_GRADIENT = 0.5  # its norm
+MEAN_OVER = 500  # steps that the running mean of the weights remembers
+EVERY = 500  # steps from one line, one point of the curve and one saved state to the next
+ASIDE, ASIDE_SEED = 24, 1_000_000  # crops of either kind that are set aside
 
 
-class Denoiser(nn.Module):
-    """Noisy to denoised, (B, 1, H, W) both: a network for guide and sliders, and the filter.
+class PlainDenoiser(NonlocalDenoiser):
+    """The denoiser without the filter: a convolution in its place, of more weights than the filter's."""
 
-    Args:
-        num_landmarks: M.
-        seed: of the network's first weights.
-    """
-
-    def __init__(self, num_landmarks: int, seed: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
-            torch.manual_seed(seed)
-            self.first = _convolution(1, WIDTH)
-            self.middle = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in DILATIONS)
-            self.last = _convolution(WIDTH, FEATURES + ORDER + 1)
-        self.filter = NonlocalFilter(
-            learn=("photometric_bandwidth", "spatial_bandwidth"),  # the sliders come with every call
-            patch_size=1,  # the network has looked around already
-            photometric_bandwidth=0.15,
-            spatial_bandwidth=12.0,
-            num_landmarks=num_landmarks,
-            guide_channels="all",
-        )
+        del self.guide, self.merge, self.log_reach
+        self.instead = nn.Conv2d(WIDTH, WIDTH, 3, padding=4, dilation=4)
+        self.register_buffer("log_reach", torch.zeros(1), persistent=False)
 
-    def forward(self, noisy: Tensor) -> Tensor:
-        """Filter a batch of crops or tiles."""
-        planes = self.first(2 * noisy - 1)
-        for layer in self.middle:
-            planes = planes + F.relu(layer(planes))
-        guide, logits = self.last(planes).split([FEATURES, ORDER + 1], dim=1)
-        # Running sums of the shares: the sliders rise to 1 for the smooth layer, so that a pixel becomes a mean.
-        alpha = logits.softmax(1).cumsum(1)  # (B, k+1, H, W)
-        denoised: Tensor = self.filter(noisy, guide=guide, alpha=alpha)
-        return denoised
+    def link(self, features: Tensor, points: Tensor) -> Tensor:
+        """What the convolution finds nearby."""
+        return self.instead(F.leaky_relu(features, 0.1))
 
 
-def _convolution(inputs: int, outputs: int, dilation: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, 3, padding=dilation, dilation=dilation, padding_mode="reflect")
+def loss_of(denoised: Tensor, clean: Tensor) -> Tensor:
+    """Mean root mean squared error of crops, in grey levels."""
+    return 255 * ((denoised - clean).square().mean((1, 2, 3)) + 1e-8).sqrt().mean()
 
 
-def training_pictures() -> list[Tensor]:
-    """The photographs (1, C, H, W) to train on, large ones at half size too."""
-    pictures = [photograph(name) for name in SCENES * SCENE_WEIGHT + TEXTURES]
-    large = [picture for picture in pictures if min(picture.shape[-2:]) >= LARGE]
-    return pictures + [F.interpolate(picture, scale_factor=0.5, mode="area") for picture in large]
+def rate_at(step: int, steps: int) -> float:
+    """Share of the rate at a step."""
+    if step < WARM_UP:
+        return (step + 1) / WARM_UP
+    passed = max(0.0, (step / steps - (1 - FALL)) / FALL)
+    return 0.5 + 0.5 * float(torch.cos(torch.tensor(torch.pi * min(1.0, passed))))
 
 
-def random_crops(pictures: Sequence[Tensor], side: int, generator: torch.Generator) -> Tensor:
-    """Crops (BATCH, 1, side, side), turned and mirrored, their colours mixed to grey at random."""
-
-    def below(count: int) -> int:
-        return int(torch.randint(count, (), generator=generator))
-
-    crops = []
-    for _ in range(BATCH):
-        picture = pictures[below(len(pictures))]
-        top, left = (below(length - side + 1) for length in picture.shape[-2:])
-        mixture = torch.rand(picture.shape[1], generator=generator) + 0.1
-        crop = torch.einsum("bchw,c->bhw", picture[..., top : top + side, left : left + side], mixture / mixture.sum())
-        crop = torch.rot90(crop, below(4), (1, 2))
-        crops.append(crop.flip(2) if below(2) else crop)
-    return torch.stack(crops)
+def new_denoiser(*, plain: bool, seed: int) -> NonlocalDenoiser:
+    """A denoiser with weights drawn from a seed."""
+    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
+        torch.manual_seed(seed)
+        return PlainDenoiser() if plain else NonlocalDenoiser()
 
 
-def train(model: Denoiser, steps: int, side: int, generator: torch.Generator) -> list[float]:
-    """Train in place, with a line of progress now and then; the mean squared error of every step."""
-    pictures = training_pictures()
-    bandwidths = list(model.filter.parameters())
-    network = [parameter for name, parameter in model.named_parameters() if not name.startswith("filter.")]
-    optimizer = torch.optim.Adam([{"params": network, "lr": RATE}, {"params": bandwidths, "lr": BANDWIDTH_RATE * RATE}])
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: min(1.0, (step + 1) / WARM_UP) * (1 + math.cos(math.pi * step / steps)) / 2
-    )
-    losses: list[float] = []
-    start = time.perf_counter()
-    for step in range(1, steps + 1):
-        clean = random_crops(pictures, side, generator)
-        noisy = clean + NOISE * torch.randn(clean.shape, generator=generator)
-        loss = F.mse_loss(model(noisy), clean)
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
-        optimizer.step()
-        schedule.step()
-        losses.append(loss.item())
-        if step % EVERY == 0 or step == steps:
-            recent = statistics.mean(losses[-EVERY:])
-            passed = time.perf_counter() - start
-            print(f"step {step:5} of {steps}: loss {recent:.5f}, {decibels(recent):.2f} dB, {passed:.0f} s", flush=True)
-    return losses
-
-
-@torch.no_grad()
-def denoise_in_tiles(model: nn.Module, noisy: Tensor, side: int) -> Tensor:
-    """Filter tiles of the training's size that overlap by half, and average what they say of a pixel.
-
-    Each is filtered in four orientations, with landmarks of their own: the network knows no upright, and errors that
-    differ average out. A tile's say falls to zero towards its border, so that no seam is left.
+class Training:
+    """A training that can be stopped and taken up.
 
     Args:
-        model: trained on crops of that size.
-        noisy: (1, 1, H, W), at least as high and wide.
-        side: of the tiles.
+        seed: of weights, crops and noise.
+        plain: whether to train the network without the filter.
+        side: of crops, in pixels.
+        half: whether convolutions run in bfloat16.
+        rate: of Adam.
     """
-    corners = [
-        (top, left)
-        for top in (*range(0, noisy.shape[-2] - side, side // 2), noisy.shape[-2] - side)
-        for left in (*range(0, noisy.shape[-1] - side, side // 2), noisy.shape[-1] - side)
-    ]
-    profile = torch.hann_window(side + 2, periodic=False)[1:-1]
-    say = torch.outer(profile, profile)
-    total, weight = torch.zeros_like(noisy), torch.zeros_like(noisy)
-    for start in range(0, len(corners), TILES):
-        windows = [(..., slice(y, y + side), slice(x, x + side)) for y, x in corners[start : start + TILES]]
-        tiles = torch.cat([noisy[window] for window in windows])
-        for turns in range(4):
-            results = model(tiles.rot90(turns, (2, 3))).rot90(-turns, (2, 3))
-            for window, result in zip(windows, results, strict=True):
-                total[window] += say * result
-                weight[window] += say
-    return total / weight
+
+    def __init__(
+        self, seed: int, *, plain: bool = False, side: int = SIDE, half: bool = False, rate: float = RATE
+    ) -> None:
+        self.model = new_denoiser(plain=plain, seed=seed).to(memory_format=torch.channels_last)
+        self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=rate)
+        self.rate, self.half = rate, half
+        self.crops = Crops(side, seed)
+        aside = Crops(side, ASIDE_SEED)
+        self.aside = [aside.batch(ASIDE, grey=grey) for grey in (True, False)]
+        self.losses: list[float] = []
+        self.curve: list[float] = []
+        self.seconds = 0.0
+
+    def denoise(self, model: nn.Module, noisy: Tensor, told: Tensor) -> Tensor:
+        """Crops denoised as a training does it."""
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            found: Tensor = model.noise_in(noisy, told)  # type: ignore[operator]
+        return noisy - found
+
+    def step(self, steps: int) -> None:
+        """One step of so many."""
+        number = len(self.losses)
+        self.optimizer.param_groups[0]["lr"] = self.rate * rate_at(number, steps)
+        clean, noisy, told = self.crops.batch(BATCH, grey=number % 2 == 0)
+        loss = loss_of(self.denoise(self.model, noisy, told), clean)
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.model.parameters(), LARGEST_GRADIENT)
+        self.optimizer.step()
+        self.mean.update_parameters(self.model)
+        self.losses.append(loss.item())
+
+    @torch.no_grad()
+    def judge(self) -> float:
+        """The loss of the mean weights on the crops set aside."""
+        found = [loss_of(self.denoise(self.mean.module, noisy, told), clean) for clean, noisy, told in self.aside]
+        return float(torch.stack(found).mean())
+
+    def run(self, steps: int, folder: Path | None = None) -> None:
+        """Train up to so many steps in all; with a folder, save the state now and then."""
+        start, before = time.perf_counter(), self.seconds
+        while len(self.losses) < steps:
+            self.step(steps)
+            if len(self.losses) % EVERY and len(self.losses) < steps:
+                continue
+            self.seconds = before + time.perf_counter() - start
+            self.curve.append(self.judge())
+            recent = statistics.mean(self.losses[-EVERY:])
+            print(
+                f"step {len(self.losses):6} of {steps}: loss {recent:.3f}, set aside {self.curve[-1]:.3f} grey levels, "
+                f"{self.seconds:.0f} s",
+                flush=True,
+            )
+            if folder is not None:
+                with open_beside(folder / "state.pt") as stream:
+                    torch.save(self.state(), stream)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that :meth:`load` needs."""
+        return {
+            "model": self.model.state_dict(),
+            "mean": self.mean.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.crops.generator.get_state(),
+            "losses": self.losses,
+            "curve": self.curve,
+            "seconds": self.seconds,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take up a training."""
+        self.model.load_state_dict(state["model"])
+        self.mean.load_state_dict(state["mean"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.crops.generator.set_state(state["generator"])
+        self.losses, self.curve, self.seconds = state["losses"], state["curve"], state["seconds"]
+
+
+def save(folder: Path, training: Training, figures: dict[str, Any]) -> None:
+    """Write weights, figures and the curve; each file appears complete or not at all."""
+    from safetensors.torch import save as as_bytes
+
+    weights = {name: value.contiguous() for name, value in training.mean.module.state_dict().items()}
+    with open_beside(folder / "denoiser.safetensors") as stream:
+        stream.write(as_bytes(weights, {name: str(value) for name, value in figures.items()}))
+    with open_beside(folder / "denoiser.json") as stream:
+        stream.write(json.dumps({**figures, "set_aside": training.curve}, indent=2).encode())
+    save_figure(curve(training.curve), folder / "curve.png")
+
+
+def curve(losses: Sequence[float]) -> Figure:
+    """The loss on crops set aside against the steps."""
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot([EVERY * (i + 1) / 1000 for i in range(len(losses))], losses)
+    axes.set(xlabel="thousand steps", ylabel="RMSE, grey levels", title="Loss on crops set aside")
+    axes.grid(alpha=0.3)
+    return figure
 
 
 def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments, checked before anything is trained."""
-    parser = argparse.ArgumentParser(description="Train a denoiser around the filter and judge it.")
-    parser.add_argument("--steps", type=int, default=3500, help=f"of {BATCH} crops each; default %(default)s")
-    parser.add_argument("--side", type=int, default=64, help="of crops and tiles, pixels; default %(default)s")
-    parser.add_argument("--landmarks", type=int, default=48, help="of a crop; default %(default)s")
+    parser = argparse.ArgumentParser(description="Train the denoiser.")
+    parser.add_argument("--steps", type=int, default=20000, help=f"of {BATCH} crops each; default %(default)s")
+    parser.add_argument(
+        "--side", type=int, default=SIDE, help="of crops, an even number of pixels; default %(default)s"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of weights, crops and noise; default %(default)s")
-    parser.add_argument("--out", type=Path, help="folder for weights, figures and a picture; made if need be")
-    parser.add_argument("--quick", action="store_true", help="judge on small parts, to see that it runs")
+    parser.add_argument("--rate", type=float, default=RATE, help="of Adam; default %(default)s")
+    parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
+    parser.add_argument(
+        "--half", action="store_true", help="convolutions in bfloat16, fast where the processor has AMX"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/denoiser"), help="folder; default %(default)s")
     options = parser.parse_args(arguments)
     if options.steps < 1:
-        parser.error(f"--steps must be at least 1, got {options.steps}; 500 give a first impression")
-    if not SIDES[0] <= options.side <= SIDES[1]:
-        parser.error(f"--side must be {SIDES[0]} to {SIDES[1]}, got {options.side}; 64 does well")
-    most = options.side**2
-    if not 1 <= options.landmarks <= most:
-        parser.error(f"--landmarks must be 1 to {most} for this --side, got {options.landmarks}; 48 do well")
+        parser.error(f"--steps must be at least 1, got {options.steps}; 2000 give a first impression")
+    if not 16 <= options.side <= 128 or options.side % 2:
+        parser.error(f"--side must be an even number from 16 to 128, got {options.side}; {SIDE} does well")
     if options.seed < 0:
         parser.error(f"--seed must not be negative, got {options.seed}; 0 will do")
-    if options.out is not None and options.out.exists() and not options.out.is_dir():
+    if not 0 < options.rate < 1:
+        parser.error(f"--rate must be between 0 and 1, got {options.rate}; {RATE} does well")
+    if options.out.exists() and not options.out.is_dir():
         parser.error(f"--out must be a folder, got the file {options.out}; name another")
     return options
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, judge, and save where asked to."""
+    """Train, and save what was trained."""
     options = read_options(arguments)
-    model = Denoiser(options.landmarks, options.seed)
-    parameters, threads = sum(parameter.numel() for parameter in model.parameters()), torch.get_num_threads()
-    print(
-        f"{parameters} parameters, {options.landmarks} landmarks in crops of {options.side} pixels, {threads} threads"
-    )
-    untrained = copy.deepcopy(model)
-    clocks = time.perf_counter(), time.process_time()
-    losses = train(model, options.steps, options.side, torch.Generator().manual_seed(options.seed))
-    seconds, cpu_seconds = time.perf_counter() - clocks[0], time.process_time() - clocks[1]
-    print(f"\n{model.filter}\n")
-
-    scenes = held_out_scenes(QUICK_SIDE if options.quick else None)
-    strength = best_opencv_strength(scenes)
-    methods: dict[str, Method] = {
-        "noisy": lambda noisy: noisy,
-        "untrained": lambda noisy: denoise_in_tiles(untrained, noisy, options.side),
-        "trained": lambda noisy: denoise_in_tiles(model, noisy, options.side),
-        "by hand": lambda noisy: denoise(noisy, noise_level=NOISE),
-        "scikit-image NLM": skimage_nlm,
-        f"OpenCV NLM, h = {strength}": lambda noisy: opencv_nlm(noisy, strength),
-    }
-    table, results = judge(methods, scenes)
-    ahead = table["trained"]["mean"] - table["scikit-image NLM"]["mean"]
-    print(
-        f"\ntrained in {seconds:.0f} s ({cpu_seconds:.0f} s of processor time); {ahead:+.2f} dB to scikit-image's NLM"
-    )
-    if options.out is not None:
-        figures = {
-            "arguments": {name: getattr(options, name) for name in ("steps", "side", "landmarks", "seed", "quick")},
-            "threads": threads,
-            "seconds": seconds,
-            "cpu_seconds": cpu_seconds,
-            "loss": [statistics.mean(losses[i : i + EVERY]) for i in range(0, len(losses), EVERY)],
-            "psnr": table,
-        }
-        save(options.out, model, figures, picture(scenes, results, whole=options.quick))
-
-
-def picture(scenes: Sequence[Scene], results: Mapping[str, Mapping[str, Tensor]], *, whole: bool) -> Figure:
-    """A row for every photograph, whole or a part of it: noisy, trained, another method, clean."""
-    panels: dict[str, Tensor] = {}
-    for scene in scenes:
-        row = {method: results[method][scene.name] for method in SHOWN} | {"clean": scene.clean}
-        for label, image in row.items():
-            panels[f"{scene.name}, {label}"] = image if whole else part(scene.name, image)
-    return show_images(panels, columns=len(SHOWN) + 1, side=320)
-
-
-def save(folder: Path, model: Denoiser, figures: Mapping[str, object], figure: Figure) -> None:
-    """Write weights, figures and picture; each file appears complete or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with open_beside(folder / "denoiser.pt") as stream:
-        torch.save(model.state_dict(), stream)
-    with open_beside(folder / "denoiser.json") as stream:
-        stream.write(json.dumps(figures, indent=2).encode())
-    save_figure(figure, folder / "denoiser.png")
+    options.out.mkdir(parents=True, exist_ok=True)
+    training = Training(options.seed, plain=options.plain, side=options.side, half=options.half, rate=options.rate)
+    state = options.out / "state.pt"
+    if state.exists():
+        training.load(torch.load(state, weights_only=True))
+        print(f"taken up at step {len(training.losses)}")
+    parameters = sum(parameter.numel() for parameter in training.model.parameters())
+    print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
+    training.run(options.steps, options.out)
+    figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "plain", "half")}
+    figures |= {"weights": parameters, "seconds": round(training.seconds), "loss": round(training.curve[-1], 4)}
+    save(options.out, training, figures)
+    print(f"{options.out / 'denoiser.safetensors'}: {figures['loss']} grey levels on crops set aside")
 
 
 if __name__ == "__main__":

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from nlfilter_torch.edits.colorize import colorize as colorize
     from nlfilter_torch.edits.defocus import defocus as defocus
     from nlfilter_torch.edits.denoise import denoise as denoise
-    from nlfilter_torch.edits.denoise import estimate_noise as estimate_noise
     from nlfilter_torch.edits.detail import enhance as enhance
     from nlfilter_torch.edits.fit_look import FittedLook as FittedLook
     from nlfilter_torch.edits.fit_look import fit_look as fit_look
     from nlfilter_torch.edits.frames import filter_frames as filter_frames
     from nlfilter_torch.edits.look import apply_look as apply_look
     from nlfilter_torch.edits.mask import region_mask as region_mask
+    from nlfilter_torch.edits.noise import estimate_noise as estimate_noise
     from nlfilter_torch.edits.recolor import recolor as recolor
     from nlfilter_torch.edits.sharpen import sharpen as sharpen
     from nlfilter_torch.edits.tone import adjust_tone as adjust_tone
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.nn import DiffusionMask as DiffusionMask
     from nlfilter_torch.nn import Look as Look
     from nlfilter_torch.nn import NonlocalAffinity as NonlocalAffinity
+    from nlfilter_torch.nn import NonlocalDenoiser as NonlocalDenoiser
     from nlfilter_torch.nn import NonlocalFilter as NonlocalFilter
     from nlfilter_torch.nn import PolynomialSliders as PolynomialSliders
     from nlfilter_torch.nn import SegmentMask as SegmentMask
@@ -59,12 +60,13 @@ _DEFINES: dict[str, tuple[str, ...]] = {
     "edits.abstract": ("abstract",),
     "edits.colorize": ("colorize",),
     "edits.defocus": ("defocus",),
-    "edits.denoise": ("denoise", "estimate_noise"),
+    "edits.denoise": ("denoise",),
     "edits.detail": ("enhance",),
     "edits.fit_look": ("FittedLook", "fit_look"),
     "edits.frames": ("filter_frames",),
     "edits.look": ("apply_look",),
     "edits.mask": ("region_mask",),
+    "edits.noise": ("estimate_noise",),
     "edits.recolor": ("recolor",),
     "edits.sharpen": ("sharpen",),
     "edits.tone": ("adjust_tone",),
@@ -81,7 +83,15 @@ _DEFINES: dict[str, tuple[str, ...]] = {
     "filtering.fitted": ("FittedFilter", "fit_filter"),
     "filtering.masks": ("diffusion_map", "diffusion_mask", "segment_mask"),
     "filtering.scribbles": ("propagate_strokes",),
-    "nn": ("DiffusionMask", "Look", "NonlocalAffinity", "NonlocalFilter", "PolynomialSliders", "SegmentMask"),
+    "nn": (
+        "DiffusionMask",
+        "Look",
+        "NonlocalAffinity",
+        "NonlocalDenoiser",
+        "NonlocalFilter",
+        "PolynomialSliders",
+        "SegmentMask",
+    ),
     "operator.build": ("nonlocal_operator", "operator_from_features"),
     "operator.features": ("estimate_bandwidth",),
     "operator.operator": ("Certificate", "Diagnostics", "NonlocalOperator"),

@@ -123,8 +123,8 @@ figure
 # ## 4. On a picture that was not used in training
 #
 # Look at the whiskers and at the skin between the eyes: noise disappears where the guide makes many pixels similar. This is the
-# result of a few seconds of training with few landmarks; more of them at test time help. `python -m benchmarks.train_denoiser`
-# trains such a network for longer.
+# result of a few seconds of training with few landmarks; more of them at test time help. `denoise` has one
+# that was trained for longer, `NonlocalDenoiser`; `python -m benchmarks.train_denoiser` trains it.
 
 # %%
 network.filter.affinity.num_landmarks = 300

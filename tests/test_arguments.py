@@ -74,7 +74,7 @@ NUMBERS: dict[str, tuple[str, Callable[[Any], object]]] = {
     "reach": ("reach", lambda v: recolor(IMAGE, IMAGE, PAINTED, reach=v, num_landmarks=20)),
     "smoothness": ("smoothness", lambda v: propagate_strokes(SPECTRUM, IMAGE, PAINTED, smoothness=v)),
     "power": ("power", lambda v: abstract(IMAGE, power=v, **OPTIONS)),
-    "noise_level": ("noise_level", lambda v: denoise(IMAGE, noise_level=v, num_landmarks=20)),
+    "noise_level": ("noise_level", lambda v: denoise(IMAGE, noise_level=v, method="rule", num_landmarks=20)),
 }
 NO_NUMBERS: dict[str, Any] = {
     "NaN": NAN,

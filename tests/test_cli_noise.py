@@ -71,6 +71,6 @@ def test_a_level_that_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_little_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     photo = write(tmp_path / "in.tif", 0.3)
     assert main(["denoise", str(photo), str(tmp_path / "out.png"), "--landmarks", "40"]) == 0
-    assert "which is hardly visible; --noise-level takes more away" in capsys.readouterr().out
+    assert "which is hardly visible; --strength 2 takes more away" in capsys.readouterr().out
     with Image.open(tmp_path / "out.png") as opened:
         assert opened.size == (96, 64)

@@ -1,132 +1,169 @@
-"""The training example trains, judges what it trained, and refuses what it cannot use before it starts."""
+"""The denoiser's training learns, can be taken up where it stopped, and refuses what it cannot use before it starts."""
 
+import copy
 import json
+from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
 
-from benchmarks import train_denoiser
-from benchmarks.denoising import HELD_OUT, NOISE, Scene, decibels, judge
-from benchmarks.train_denoiser import FEATURES, Denoiser, denoise_in_tiles, main, random_crops, train, training_pictures
-from tests.problems import seeded
-
-SMALL = ["--side", "32", "--landmarks", "12", "--quick"]
+from benchmarks import denoising, train_denoiser
+from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
+from benchmarks.denoising import HELD_OUT, LEFT_HALVES, Case, decibels, scenes, table, with_noise
+from benchmarks.train_denoiser import PlainDenoiser, Training, loss_of, main, rate_at
+from nlfilter_torch import NonlocalDenoiser
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """The folder that a short training writes."""
-    folder = tmp_path_factory.mktemp("training") / "new"
-    main(["--steps", "30", "--out", str(folder), *SMALL])
-    return folder
+def trained(steps: int, seed: int = 0, **options: bool) -> Training:
+    training = Training(seed, side=16, **options)
+    training.run(steps)
+    return training
 
 
 @pytest.mark.slow
-def test_table_loss_weights_and_picture_are_written(run):
-    figures = json.loads((run / "denoiser.json").read_text())
-    rows = figures["psnr"]
-    assert {"noisy", "trained", "untrained", "by hand", "scikit-image NLM"} < rows.keys()
-    assert any(name.startswith("OpenCV NLM") for name in rows)
-    for row in rows.values():
-        assert list(row) == [*HELD_OUT, "mean"]
-        assert row["mean"] == pytest.approx(sum(row[name] for name in HELD_OUT) / len(HELD_OUT))
-    assert rows["noisy"]["mean"] == pytest.approx(decibels(NOISE**2), abs=0.2)
-    assert rows["trained"]["mean"] > rows["untrained"]["mean"] + 0.3
-    assert (run / "denoiser.png").read_bytes().startswith(b"\x89PNG")
-    model = Denoiser(num_landmarks=12, seed=1)
-    model.load_state_dict(torch.load(run / "denoiser.pt", weights_only=True))
-
-
-@pytest.mark.slow
-def test_loss_falls_and_every_part_learns(capsys):
-    model = Denoiser(num_landmarks=12, seed=0)
-    before = {name: value.detach().clone() for name, value in model.named_parameters()}
-    clean = torch.cat([random_crops(training_pictures(), 32, seeded(seed)) for seed in range(4)])
-    noisy = clean + NOISE * torch.randn(clean.shape, generator=seeded(2))
+@pytest.mark.parametrize("plain", [False, True])
+def test_loss_falls_and_every_part_learns(plain: bool) -> None:
+    training = Training(0, side=32, plain=plain)
+    before = {name: value.detach().clone() for name, value in training.model.named_parameters()}
+    training.run(150)
+    assert len(training.losses) == 150
+    clean, noisy, told = training.aside[0]
     with torch.no_grad():
-        at_first = F.mse_loss(model(noisy), clean)
-    losses = train(model, steps=60, side=32, generator=seeded(0))
-    with torch.no_grad():
-        at_last = F.mse_loss(model(noisy), clean)
-    assert at_last < 0.8 * at_first
-    assert len(losses) == 60
-    assert "step    60 of 60: loss" in capsys.readouterr().out
-    assert {f"filter.affinity.log_{name}_bandwidth" for name in ("photometric", "spatial")} < before.keys()
-    for name, value in model.named_parameters():
+        at_last = loss_of(training.denoise(training.model, noisy, told), clean)
+    assert at_last < 0.8 * loss_of(noisy, clean)
+    for name, value in training.model.named_parameters():
         assert not torch.equal(value, before[name]), name
 
 
-def test_equal_seeds_train_equal_weights_and_leave_the_global_generator():
+def test_equal_seeds_train_equal_weights_and_leave_the_global_generator() -> None:
     state = torch.random.get_rng_state()
-    trained = []
-    for seed in (0, 0, 1):
-        model = Denoiser(num_landmarks=8, seed=seed)
-        losses = train(model, steps=2, side=16, generator=seeded(seed))
-        trained.append((losses, [value.detach() for value in model.parameters()]))
+    first, again, other = trained(2), trained(2), trained(2, seed=1)
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert trained[0][0] == trained[1][0] != trained[2][0]
-    assert all(map(torch.equal, trained[0][1], trained[1][1]))
+    assert first.losses == again.losses != other.losses
+    assert all(map(torch.equal, first.model.parameters(), again.model.parameters()))
 
 
-def test_the_filter_denoises_and_the_network_cannot_paint():
-    """Shares of means of noisy pixels: a constant stays what it is, and nothing leaves the image's range."""
-    model = Denoiser(num_landmarks=24 * 24, seed=0)  # all pixels: W as it is, without a negative entry
-    noisy = torch.rand(1, 1, 24, 24, generator=seeded(1))
-    flat = torch.full_like(noisy, 0.3)
-    with torch.no_grad():
-        model.last.weight[FEATURES:] *= 100  # sliders that go to their ends
-        torch.testing.assert_close(model(flat), flat, rtol=0, atol=1e-4)
-        result = model(noisy)
-    assert result.min() >= noisy.min() - 1e-4
-    assert result.max() <= noisy.max() + 1e-4
-    assert (result - noisy).abs().max() > 0.05
+def test_a_training_that_is_taken_up_ends_as_one_that_was_not_stopped() -> None:
+    whole, part = trained(4), trained(2)
+    taken_up = Training(7, side=16)
+    taken_up.load(copy.deepcopy(part.state()))
+    part.run(4)
+    taken_up.run(4)
+    for other in (part, taken_up):
+        assert other.losses[2:] == pytest.approx(whole.losses[2:], rel=0.3)  # the rate depends on the number of steps
+    assert taken_up.losses == part.losses
+    assert all(map(torch.equal, part.mean.module.parameters(), taken_up.mean.module.parameters()))
 
 
-@pytest.mark.parametrize("size", [(32, 32), (33, 50), (40, 32)])
-def test_tiles_cover_every_pixel_without_a_seam(size):
-    noisy = torch.rand(1, 1, *size, generator=seeded(0))
-    seen = []
+def test_the_command_writes_weights_figures_and_a_curve_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "new"
+    main(["--steps", "2", "--side", "16", "--out", str(folder)])
+    figures = json.loads((folder / "denoiser.json").read_text())
+    assert figures["steps"] == 2
+    assert figures["weights"] == sum(value.numel() for value in NonlocalDenoiser().parameters())
+    assert len(figures["set_aside"]) == 1
+    assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+    first = NonlocalDenoiser.trained(folder / "denoiser.safetensors")
+    capsys.readouterr()
+    main(["--steps", "3", "--side", "16", "--out", str(folder)])
+    assert "taken up at step 2" in capsys.readouterr().out
+    second = NonlocalDenoiser.trained(folder / "denoiser.safetensors")
+    assert not torch.equal(first.last.weight, second.last.weight)
 
-    def identity(tiles):
-        seen.append(tiles.shape)
-        return tiles
 
-    torch.testing.assert_close(denoise_in_tiles(identity, noisy, 32), noisy)
-    assert all(shape[-2:] == (32, 32) for shape in seen)
+def test_the_rate_rises_stays_and_falls() -> None:
+    rates = [rate_at(step, 1000) for step in range(1000)]
+    assert rates[0] == pytest.approx(1 / train_denoiser.WARM_UP)
+    assert max(rates) == 1
+    assert rates[train_denoiser.WARM_UP :] == sorted(rates[train_denoiser.WARM_UP :], reverse=True)
+    assert rates[599] == 1
+    assert rates[-1] < 1e-4
 
 
-def test_scores_are_decibels_of_the_squared_error(capsys):
-    clean = torch.full((1, 1, 8, 8), 0.5)
-    scene = Scene("grey", clean, clean + 0.1)
-    table, results = judge({"noisy": lambda noisy: noisy, "half": lambda noisy: noisy - 0.05}, [scene])
-    assert table["noisy"] == pytest.approx({"grey": 20.0, "mean": 20.0}, abs=1e-4)
-    assert table["half"]["mean"] == pytest.approx(26.0206, abs=1e-3)
-    torch.testing.assert_close(results["half"]["grey"], clean + 0.05)
-    assert capsys.readouterr().out.splitlines()[1].split() == ["noisy", "20.00", "20.00"]
+def test_loss_is_a_mean_of_grey_levels() -> None:
+    clean = torch.zeros(2, 1, 4, 4)
+    assert float(loss_of(clean + torch.tensor([1.0, 3.0]).view(2, 1, 1, 1) / 255, clean)) == pytest.approx(2, rel=1e-3)
+
+
+def test_the_network_without_the_filter_has_as_many_weights_at_least() -> None:
+    counts = [sum(value.numel() for value in model().parameters()) for model in (NonlocalDenoiser, PlainDenoiser)]
+    assert counts[0] <= counts[1] < 1.2 * counts[0]
+
+
+@pytest.mark.parametrize("grey", [True, False])
+def test_crops_are_pictures_with_the_noise_that_is_told(grey: bool) -> None:
+    crops = Crops(32, 5)
+    differences, levels = [], []
+    for _ in range(20):
+        clean, noisy, told = crops.batch(8, grey=grey)
+        assert clean.shape == noisy.shape == told.shape == (8, 1 if grey else 3, 32, 32)
+        assert clean.min() >= -1e-6
+        assert clean.max() <= 1 + 1e-6
+        assert (told >= 0).all()
+        differences.append((noisy - clean).square().mean())
+        levels.append(told.square().mean())
+    assert float(torch.stack(differences).mean() / torch.stack(levels).mean()) == pytest.approx(1, abs=0.2)
+    assert float(torch.stack(levels).max()) < (2 * LARGEST) ** 2
+
+
+def test_nothing_that_is_judged_is_trained_on() -> None:
+    assert set(PICTURES) & set(HELD_OUT) == set(RIGHT_HALVES) == set(LEFT_HALVES)
+
+
+def test_scores_are_decibels_of_the_squared_error(capsys: pytest.CaptureFixture[str]) -> None:
+    clean = torch.full((1, 1, 16, 16), 0.5)
+    case = Case("grey", clean, clean + 0.1, 0.1)
+    rows = table({"noisy": lambda case: case.noisy, "half": lambda case: case.noisy - 0.05}, [case])
+    assert rows["noisy"]["grey"].psnr == pytest.approx(20, abs=1e-4)
+    assert rows["half"]["grey"].psnr == pytest.approx(26.0206, abs=1e-3)
+    assert capsys.readouterr().out.splitlines()[1].split()[:3] == ["noisy", "20.00", "20.00"]
+    assert decibels(0.01) == pytest.approx(20)
+
+
+def test_scenes_are_grey_or_in_colour_and_have_noise_of_their_own() -> None:
+    grey, coloured = (scenes(None, kind, quick=False) for kind in ("grey", "colour"))
+    assert tuple(grey) == HELD_OUT
+    assert "camera" not in coloured
+    assert all(picture.shape[1] == 1 for picture in grey.values())
+    first, second = (with_noise(grey["camera"], 0.1, number) for number in (0, 1))
+    assert not torch.equal(first, second)
+    assert float((first - grey["camera"]).std()) == pytest.approx(0.1, rel=0.01)
+
+
+def test_the_benchmark_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "figures.json"
+    denoising.main(["--quick", "--noise", "25", "--networks", "--wrong", "--out", str(out)])
+    figures = json.loads(out.read_text())
+    assert set(figures) == {"grey, 25", "colour, 25"}
+    assert figures["grey, 25"]["ours"]["camera"]["psnr"] > figures["grey, 25"]["noisy"]["camera"]["psnr"]
+    assert "estimated noise" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--steps", "0"], "--steps must be at least 1, got 0"),
-        (["--side", "8"], "--side must be 16 to 96, got 8"),
-        (["--side", "128"], "--side must be 16 to 96, got 128"),
-        (["--landmarks", "0"], "--landmarks must be 1 to 4096 for this --side, got 0"),
-        (["--side", "16", "--landmarks", "257"], "--landmarks must be 1 to 256 for this --side, got 257"),
+        (["--side", "8"], "--side must be an even number from 16 to 128, got 8"),
+        (["--side", "33"], "--side must be an even number from 16 to 128, got 33"),
+        (["--side", "130"], "--side must be an even number from 16 to 128, got 130"),
         (["--seed", "-1"], "--seed must not be negative, got -1"),
+        (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
         (["--steps", "many"], "--steps: invalid int value: 'many'"),
     ],
 )
-def test_arguments_are_refused_before_anything_is_trained(arguments, message, capsys, monkeypatch):
-    monkeypatch.setattr(train_denoiser, "train", lambda *_: pytest.fail("trained"))
+def test_arguments_are_refused_before_anything_is_trained(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_denoiser, "Training", lambda *_, **__: pytest.fail("trained"))
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == 2
     assert message in capsys.readouterr().err
 
 
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path, capsys):
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
     with pytest.raises(SystemExit) as stopped:

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.denoise import estimate_noise, noise_of
 from nlfilter_torch.edits.matting import pyramid_levels
+from nlfilter_torch.edits.noise import estimate_noise, noise_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint
 from nlfilter_torch.edits.steps import Step
@@ -119,7 +119,7 @@ def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pyt
 def test_noise_is_estimated_by_rows_as_in_memory() -> None:
     image = cat()
     tiled = Tiled(Picture(rows_of(image)), Passes("float32"))
-    assert torch.equal(noise_of(tiled), estimate_noise(image))
+    assert torch.equal(noise_of(tiled).level, estimate_noise(image))
 
 
 def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:

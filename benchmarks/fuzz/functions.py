@@ -109,6 +109,11 @@ def _affinity(**options: Any) -> Tensor:
     return nlf.NonlocalAffinity(**options)(image) @ image
 
 
+def _denoiser(image: Tensor, noise: float | Tensor = 0.1) -> Tensor:
+    """One that knows nothing."""
+    return nlf.NonlocalDenoiser()(image, noise)
+
+
 def _sliders(operator: nlf.NonlocalOperator, image: Tensor, **options: Any) -> Tensor:
     return nlf.PolynomialSliders(options.pop("alpha"), **options)(operator, image)
 
@@ -215,7 +220,15 @@ FUNCTIONS = {
         nlf.adjust_tone, {"image": _image(1, 3)}, FILTER | ORDER | {"contrast": _number(0, 2), "clarity": _number(0, 4)}
     ),
     "denoise": Function(
-        nlf.denoise, IMAGE, LOCAL | {"noise_level": _number(0, 0.3), "photometric_bandwidth": _plain(0.03, 0.5)}
+        nlf.denoise,
+        IMAGE,
+        LOCAL
+        | {
+            "noise_level": _number(0, 0.3),
+            "strength": _number(0, 3),
+            "method": _one_of("network", "rule"),
+            "photometric_bandwidth": _plain(0.03, 0.5),
+        },
     ),
     "abstract": Function(
         nlf.abstract,
@@ -266,6 +279,7 @@ FUNCTIONS = {
         _layer, LIST | {"image": _image(1, 3)}, RESIDUAL | FILTER | GUIDED | {"learn": _one_of((), ("alpha",))}
     ),
     "NonlocalAffinity": Function(_affinity, {"image": _image(1, 3)}, FILTER | GUIDED | {"learn": _one_of(())}),
+    "NonlocalDenoiser": Function(_denoiser, {"image": _image(1, 3)}, {"noise": _number(0, 0.3)}),
     "PolynomialSliders": Function(_sliders, OPERATOR | IMAGE | LIST, RESIDUAL | {"learn": _one_of((), ("alpha",))}),
     "DiffusionMask": Function(
         _diffusion_module, SPECTRUM | REGION, NUMBERS | {"learn": _one_of((), ("time", "width"))}

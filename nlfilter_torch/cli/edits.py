@@ -62,6 +62,7 @@ SCRIBBLES: dict[str, dict[str, Any]] = {
         "keep": options.Keeps,
         "show": options.Show,
     },
+    "denoise": {"map": options.NoiseMap},
     "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions, "show": options.Show},
     "defocus": {"region": options.Regions, "mask": options.MaskFile, "show": options.Show},
     "mask": {
@@ -193,9 +194,9 @@ def edit_photograph(
 
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.editing import Job
-    from nlfilter_torch.cli.noise import NoiseReport
+    from nlfilter_torch.cli.noise import NoiseReport, write_map
     from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
-    from nlfilter_torch.edits.denoise import noise_of
+    from nlfilter_torch.edits.noise import Noise, noise_of
     from nlfilter_torch.edits.source import InMemory, Source
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.io.rows import StoredPicture, open_picture
@@ -211,12 +212,15 @@ def edit_photograph(
         if given.get("show") is not None:
             showing.show(given["show"], name, step.arguments, size, read, drawn)
 
-    def measured(named: dict[str, Any], picture: Source) -> NoiseReport:
-        """The report of the noise, which is estimated once, here."""
+    def measured(named: dict[str, Any], picture: Source, read: showing.Read) -> NoiseReport:
+        """The report of the noise, which is estimated once, here, and its map, if asked for."""
         level = step.arguments(picture.size)["noise_level"]
         if level is None:
             named["noise_level"] = noise_of(picture)
-        return NoiseReport(torch.as_tensor(named.get("noise_level", level)), given=level is not None)
+        found = named.get("noise_level") or Noise.even(torch.as_tensor([level]))
+        if given.get("map") is not None:
+            write_map(found, picture.size, read, given["map"])
+        return NoiseReport(found, given=level is not None)
 
     def work(photograph: Photograph) -> Tensor:
         free = editing.allowed_memory(memory)
@@ -225,9 +229,12 @@ def edit_photograph(
             def read(path: Path) -> StoredPicture:
                 return files.enter_context(open_picture(path, free))
 
+            def rows_of(part: slice) -> Tensor:
+                return photograph.pixels[..., part, :]
+
             drawn = scribbles.of_edit(step, photograph.size, given, read)
-            tell(drawn, photograph.size, lambda rows: photograph.pixels[..., rows, :])
-            noise = measured(drawn[1], InMemory(photograph.pixels)) if name == "denoise" else None
+            tell(drawn, photograph.size, rows_of)
+            noise = measured(drawn[1], InMemory(photograph.pixels), rows_of) if name == "denoise" else None
             edited = apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
             if noise is not None:
                 noise.add(photograph.pixels.numpy(), edited.numpy())
@@ -241,8 +248,12 @@ def edit_photograph(
             str(given.get("strokes") or "--region"),
         )
         drawn = scribbles.of_edit(step, job.size, given, job.open)
-        tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
-        noise = measured(drawn[1], tiled) if name == "denoise" else None
+
+        def rows_of(part: slice) -> Tensor:
+            return tiled.picture.tile(part.start, part.stop, 0).pixels
+
+        tell(drawn, job.size, rows_of)
+        noise = measured(drawn[1], tiled, rows_of) if name == "denoise" else None
         rows = tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)))
         yield from rows if noise is None else noise.watched(rows, job.picture.rows)
 

@@ -1,27 +1,37 @@
 """What ``nlfilter-torch denoise`` says: the noise that it found, and how much it changed."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
+import torch
 import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.cli.options import LEVELS
 from nlfilter_torch.edits.denoise import QUIET
+from nlfilter_torch.edits.noise import Noise
+from nlfilter_torch.io.photographs import Photograph, write_photograph
 from nlfilter_torch.tiled.sources import WHITE, Rows, RowSource
 
 VISIBLE = 0.5  # grey levels; eight bits round to as much
+LARGEST = 64  # grey levels, which are white in a map
+ROWS, AROUND = 256, 2  # of the photograph that are read at once, and beside them
 
 
 class NoiseReport:
     """Of one photograph, in grey levels.
 
     Args:
-        level: of the noise, (1,) in units of the image.
+        noise: of it.
         given: whether the user gave it.
     """
 
-    def __init__(self, level: Tensor, *, given: bool) -> None:
-        self._level, self._given = float(level), given
+    def __init__(self, noise: Noise, *, given: bool) -> None:
+        self._level, self._given = float(noise.level), given
+        ends = [float((noise.floor + light * noise.gain).sqrt()) for light in (0.0, 1.0)]
+        self._ends = f" ({LEVELS * ends[0]:.2f} in the dark, {LEVELS * ends[1]:.2f} in white)" if noise.gain > 0 else ""
         self._squares, self._count = 0.0, 0
 
     def add(self, before: NDArray[np.generic], after: NDArray[np.generic]) -> None:
@@ -42,13 +52,32 @@ class NoiseReport:
     def tell(self) -> None:
         """Print it."""
         level, change = LEVELS * self._level, LEVELS * (self._squares / max(self._count, 1)) ** 0.5
-        found = f"denoise: noise of {level:.2f} grey levels {'given' if self._given else 'found'}"
+        found = f"denoise: noise of {level:.2f} grey levels {'given' if self._given else 'found'}{self._ends}"
         if self._level < QUIET:
             typer.echo(f"{found}, less than {LEVELS * QUIET:.1f}: nothing to do, all pixels are as they were")
             return
         weak = "" if change >= VISIBLE else ", which is hardly visible"
-        remedy = "" if self._given or not weak else "; --noise-level takes more away"
+        remedy = "" if self._given or not weak else "; --strength 2 takes more away"
         typer.echo(f"{found}; pixels changed by {change:.2f} grey levels (root mean square){weak}{remedy}")
+
+
+def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tensor], path: Path) -> None:
+    """Write the standard deviation of the noise at every pixel, in 16 bits.
+
+    Args:
+        noise: of the photograph.
+        size: (H, W) of it.
+        read: rows of it, (1, C, h, W).
+        path: an image file.
+    """
+    parts = []
+    for start in range(0, size[0], ROWS):
+        stop = min(start + ROWS, size[0])
+        first, last = max(start - AROUND, 0), min(stop + AROUND, size[0])
+        levels = noise.at(read(slice(first, last)).float())
+        parts.append(levels.square().mean(1, keepdim=True).sqrt()[..., start - first : stop - first, :])
+    levels = torch.cat(parts, dim=2) * (LEVELS / LARGEST)
+    write_photograph(Photograph(levels.clamp(0, 1), "uint16"), path)
 
 
 def _scaled(rows: NDArray[np.generic]) -> NDArray[np.float32]:

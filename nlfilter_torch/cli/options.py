@@ -167,6 +167,15 @@ MaskFile = Annotated[
         help="A picture of the size of the photograph, white where it is selected and black elsewhere.",
     ),
 ]
+NoiseMap = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="FILE",
+        help="Write the noise as a picture, too: its standard deviation at every pixel; white is 64 grey levels.",
+        show_default=False,
+    ),
+]
 Show = Annotated[
     Path | None,
     typer.Option(

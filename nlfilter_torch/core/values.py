@@ -20,9 +20,13 @@ def is_hidden(tensor: Tensor) -> bool:
         tensor.device.type != "cpu"
         or torch.compiler.is_compiling()
         or is_functorch_wrapped_tensor(tensor)
-        or isinstance(tensor, FakeTensor)
-        or torch._C._get_dispatch_mode(_FAKE) is not None
+        or is_fake(tensor)
     )
+
+
+def is_fake(tensor: Tensor) -> bool:
+    """Whether a tensor has a shape alone, or tensors made now will."""
+    return isinstance(tensor, FakeTensor) or torch._C._get_dispatch_mode(_FAKE) is not None
 
 
 def refuse_transforms(name: str, *values: object) -> None:

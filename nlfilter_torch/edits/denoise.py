@@ -1,22 +1,31 @@
-"""Less noise, with sliders that every pixel sets from the noise level. Paper: Sec. III, Fig. 6(c), (d); Sec. V."""
+"""Less noise: by the trained network around the filter, or by sliders that every pixel sets from the noise level.
 
-from typing import Any
+Paper: Sec. III, Fig. 6(c), (d); Sec. V.
+"""
+
+import inspect
+from functools import cache
+from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_image, check_photograph
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.checks import check_count, check_photograph
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.values import is_fake
 from nlfilter_torch.edits.colour import nearby
+from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
-from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Operator, Pixels, Source, edited
+from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source, edited
 from nlfilter_torch.filtering.filters import weigh_layers
+from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, in_tiles, noise_map
+from nlfilter_torch.operator.build import nonlocal_operator
+
+Method = Literal["network", "rule"]
 
 GUIDE_BLUR = 0.7  # pixels; the guide's own noise would link pixels by it
 ORDER = 2
 QUIET = 0.1 / 255  # a noise level below what eight bits resolve: nothing to do
-MEDIAN = 0.6745  # of the absolute value of a normal variable
 
 
 @full_precision
@@ -24,6 +33,8 @@ def denoise(
     image: Tensor,
     *,
     noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
+    strength: float | Tensor = DENOISE.defaults["strength"],
+    method: Method = DENOISE.defaults["method"],
     photometric_bandwidth: float | Tensor | None = None,
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = DENOISE.defaults["patch_size"],
@@ -32,13 +43,17 @@ def denoise(
 ) -> Tensor:
     """Remove noise of known or estimated strength.
 
-    The sliders of eq. (12) are set for every pixel: a detail layer is kept by the share of its local energy that noise
-    does not explain. The energy is averaged by W, over similar patches wherever they are.
+    The network is :meth:`NonlocalDenoiser.trained`. With ``method="rule"`` nothing is learned: the sliders of eq. (12)
+    are set for every pixel, and a detail layer is kept by the share of its energy that noise does not explain. That
+    energy is averaged by W, over similar patches wherever they are.
 
     Args:
-        image: (B, C, H, W).
+        image: (B, C, H, W). Three channels are colours.
         noise_level: standard deviation of white noise, in units of the image, a number or a tensor of shape () or (B,);
-            None estimates it by :func:`estimate_noise`.
+            for the network also a map (B, 1 or C, H, W). None estimates it, and whether it grows with the light.
+        strength: times the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
+            smooths more.
+        method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
         photometric_bandwidth: h_y; None is the noise level.
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.
         patch_size: of the patches that are compared.
@@ -46,8 +61,8 @@ def denoise(
         **options: further ones of :func:`nonlocal_operator`.
 
     Returns:
-        (B, C, H, W) of the same mean, to rounding, as far as sliders agree; ``image`` itself where the noise level is
-        less than a tenth of a grey level. Differentiable in image and noise level.
+        (B, C, H, W); ``image`` itself where the noise level is less than a tenth of a grey level. Differentiable in
+        image and noise level.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or ``noise_level`` is negative.
@@ -56,14 +71,16 @@ def denoise(
         >>> generator = torch.Generator().manual_seed(0)
         >>> clean = torch.linspace(0, 1, 32).expand(1, 1, 32, 32)
         >>> noisy = clean + 0.1 * torch.randn(1, 1, 32, 32, generator=generator)
-        >>> round(float((noisy - clean).std()), 2), bool((denoise(noisy) - clean).std() < 0.06)
-        (0.1, True)
+        >>> bool((denoise(noisy) - clean).std() < 0.03), bool((denoise(noisy, method="rule") - clean).std() < 0.06)
+        (True, True)
     """
     check_photograph(image, "image")
     return edited(
         image,
         fit_denoise,
         noise_level=noise_level,
+        strength=strength,
+        method=method,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
@@ -75,14 +92,57 @@ def denoise(
 def fit_denoise(
     source: Source,
     *,
-    noise_level: float | Tensor | None,
-    photometric_bandwidth: float | Tensor | None,
+    noise_level: float | Tensor | Noise | None,
+    strength: float | Tensor,
+    method: Method,
     **options: Any,
 ) -> Fitted:
-    """:func:`denoise` for any source."""
+    """:func:`denoise` for any source; ``noise_level`` may be what :func:`noise_of` found."""
+    DENOISE["strength"].check_argument(strength, source.batch)
+    DENOISE["method"].check_argument(method)
     check_count(options["num_landmarks"], "num_landmarks")
-    DENOISE["noise_level"].check_argument(noise_level, source.batch)
-    level = noise_of(source) if noise_level is None else torch.as_tensor(noise_level, dtype=source.dtype).reshape(-1)
+    unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
+    if unknown:
+        raise TypeError(f"denoise takes no argument {unknown[0]}; see its documentation for those it takes")
+    is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
+    if not isinstance(noise_level, Noise) and not is_map:
+        DENOISE["noise_level"].check_argument(noise_level, source.batch)
+    if noise_level is None:
+        noise_level = noise_of(source)
+    if method == "network":
+        return _by_network(source, noise_level, strength)
+    if is_map:
+        raise ValueError("noise_level must be a number or (B,) for the rule, got a map; use the network")
+    level = noise_level.level if isinstance(noise_level, Noise) else torch.as_tensor(noise_level, dtype=source.dtype)
+    return _by_rule(source, level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1), **options)
+
+
+@cache
+def _read(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
+    return NonlocalDenoiser.trained(device=device, dtype=dtype).requires_grad_(False)
+
+
+def _network(image: Tensor) -> NonlocalDenoiser:
+    """The trained network, read once for a device and dtype, with weights that stay as they are."""
+    read = _read.__wrapped__ if is_fake(image) else _read  # fake weights would be of no use later
+    return read(image.device, image.dtype)
+
+
+def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
+    """Every tile is denoised where it stands; tiles of a picture worked on by rows stand at the same places."""
+    if isinstance(noise, Tensor) and noise.ndim == 4 and not source.whole:
+        raise ValueError("noise_level must be a number for a picture in tiles, got a map; denoise it in memory")
+
+    def finish(image: Tensor, _: Tensor) -> Tensor:
+        level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
+        level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
+        level = torch.where(level < QUIET, torch.zeros_like(level), level)
+        return image - in_tiles(image, level, _network(image).noise_in)
+
+    return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
+
+
+def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Tensor | None, **options: Any) -> Fitted:
     assumed = level.clamp(min=QUIET)
     options |= {
         "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
@@ -101,49 +161,6 @@ def fit_denoise(
         return torch.where((level < QUIET).reshape(-1, 1, 1, 1), pixels.image, weighed)
 
     return Fitted(cleaned)
-
-
-@full_precision
-def estimate_noise(image: Tensor) -> Tensor:
-    """Standard deviation of white noise: the median response to Immerkaer's mask, mean over channels.
-
-    The mask (Immerkaer, "Fast Noise Variance Estimation", 1996) is blind to whatever is linear in rows or columns, and
-    the median ignores edges, which are few. Fine texture counts as noise: expect one or two grey levels too many on
-    photographs, and ten on grass.
-
-    Args:
-        image: (B, C, H, W), at least 3x3.
-
-    Returns:
-        (B,), in units of the image; 0 for an image smaller than 3x3. Constant, as no gradient passes.
-
-    Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point (B, C, H, W) tensor.
-
-    Example:
-        >>> noise = torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
-        >>> estimate_noise(0.5 + 0.1 * noise).round(decimals=2)
-        tensor([0.1000])
-    """
-    check_image(image, "image")
-    return noise_of(InMemory(image.detach().to(working_dtype(image))))
-
-
-def noise_of(source: Source) -> Tensor:
-    """:func:`estimate_noise` for any source."""
-    if min(source.size) < 3:
-        return torch.zeros(source.batch, dtype=source.dtype)
-    return source.medians(_response, 1).mean(1) / MEDIAN
-
-
-@torch.no_grad()
-def _response(image: Tensor) -> Tensor:
-    """Absolute response (B, C, H-2, W-2) to Immerkaer's mask."""
-    second = torch.tensor([1.0, -2.0, 1.0], device=image.device, dtype=image.dtype)
-    mask = torch.outer(second, second)[None, None] / 6  # of unit norm
-    return (
-        F.conv2d(image.flatten(0, 1).unsqueeze(1), mask).abs().view(*image.shape[:2], *(n - 2 for n in image.shape[2:]))
-    )
 
 
 def _passed_noise(operator: Operator, pixels: int) -> Tensor:

@@ -305,28 +305,48 @@ DENOISE = Edit(
     "denoise",
     """Remove noise from a photograph.
 
+    The noise is measured in the photograph, and whether it grows with the light.
+
     Example: `nlfilter-torch denoise in.jpg out.jpg`
 
-    Gently: `nlfilter-torch denoise in.jpg out.jpg --noise-level 3`
+    Gently: `nlfilter-torch denoise in.jpg out.jpg --strength 0.6`
     """,
     (
+        Parameter(
+            "strength",
+            "number",
+            1.0,
+            "How much is taken away: 1 removes the noise that was found or given, less leaves some, more smooths.",
+            0,
+            4,
+            domain="not negative",
+            zero="0 changes nothing",
+            idle=0.0,
+            slider=Slider("Strength", 0, 2, 0.05, live=False),
+        ),
         Parameter(
             "noise_level",
             "number",
             None,
-            "Strength of the noise: its standard deviation in grey levels of 255. Left out: estimated.",
+            "The noise: its standard deviation in grey levels of 255. Left out: measured.",
             0,
             255,
             "levels",
             domain="not negative",
             zero="0 changes nothing",
             optional=True,
-            idle=0.0,
-            slider=Slider("Noise", 0, 50, 0.5, live=False),
+        ),
+        Parameter(
+            "method",
+            "choice",
+            "network",
+            "`network`: trained on photographs. `rule`: by sliders of the filter, which the options below are for.",
+            domain="choice",
+            choices=("network", "rule"),
         ),
         *_filter(share=0.2, landmarks=200),
     ),
-    hint="Less noise: its standard deviation in grey levels of 255.",
+    hint="Less noise: it is measured, and taken away as strongly as you choose.",
 )
 
 RECOLOR = Edit(

@@ -39,8 +39,11 @@ class Fitted:
         pixels: the edited pixels, or planes that ``finish`` makes these from.
         finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
         margin: how many.
+        step: what ``finish`` does depends on the number of a row modulo so many, counted from the first it is given;
+            tiles begin at multiples of it, and so does ``margin``.
     """
 
     pixels: Planes
     finish: Callable[[Tensor, Tensor], Tensor] | None = None
     margin: int = 0
+    step: int = 1

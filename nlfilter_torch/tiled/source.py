@@ -354,11 +354,11 @@ class Tiled:
         """
         row = self.size[1] * FINISHED * self.dtype.itemsize
         most = self.passes.memory // row - 2 * fitted.margin
-        if self.size[0] > most and most < 1:
+        if self.size[0] > most and most < fitted.step:
             raise MemoryError(
-                f"{self.picture.name} needs {row * (2 * fitted.margin + 1) / 1e6:.0f} MB of memory at least, "
+                f"{self.picture.name} needs {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory at least, "
                 f"but {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
         rows = max(rows, (1 if self.passes.tile_rows else 4) * fitted.margin)
         rows = rows if self.size[0] <= most else min(rows, most)
-        return max(1, rows)
+        return max(1, rows // fitted.step) * fitted.step

@@ -1,0 +1,163 @@
+"""What the denoiser trains on: crops of scikit-image's pictures, changed at random, patterns, and noise.
+
+The pictures to judge on (:mod:`benchmarks.denoising`) are not among them; of ``retina`` and ``page`` these are the left
+halves, and the right halves are here.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.photographs import photograph
+
+#: How often each picture is drawn; photographs more often than textures and drawings.
+PICTURES = {
+    "astronaut": 4.0,
+    "motorcycle": 6.0,
+    "rocket": 4.0,
+    "retina": 1.0,
+    "page": 1.0,
+    "hubble_deep_field": 1.0,
+    "immunohistochemistry": 1.0,
+    "coins": 1.0,
+    "brick": 1.0,
+    "grass": 1.0,
+    "gravel": 1.0,
+    "text": 1.0,
+    "clock": 1.0,
+    "moon": 0.5,
+    "cell": 0.5,
+}
+RIGHT_HALVES = ("retina", "page")
+SCALES = (1.0, 0.8, 0.6, 0.4, 0.28)
+LARGEST = 60 / 255  # standard deviation of noise
+
+
+class Crops:
+    """Random crops with noise, the same ones for equal seeds.
+
+    Args:
+        side: of the crops, in pixels.
+        seed: of all that is random.
+    """
+
+    def __init__(self, side: int, seed: int) -> None:
+        self.side, self.generator = side, torch.Generator().manual_seed(seed)
+        self.pictures: list[Tensor] = []
+        weights = []
+        for name, weight in PICTURES.items():
+            picture = photograph(name)
+            if name in RIGHT_HALVES:
+                picture = picture[..., picture.shape[-1] // 2 :]
+            for scale in SCALES:
+                size = [round(length * scale) for length in picture.shape[-2:]]
+                if min(size) > side:
+                    reduced = picture if scale == 1 else F.interpolate(picture, size, mode="bicubic", antialias=True)
+                    self.pictures.append(reduced.clamp(0, 1)[0])
+                    weights.append(weight)
+        self.weights = torch.tensor(weights)
+
+    def batch(self, count: int, *, grey: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Clean and noisy crops (B, 1 or 3, side, side), and the noise that the denoiser is told."""
+        clean = torch.stack([self._clean(grey) for _ in range(count)])
+        return (clean, *self._noise(clean))
+
+    def _random(self, *size: int) -> Tensor:
+        return torch.rand(size, generator=self.generator)
+
+    def _number(self, low: float = 0.0, high: float = 1.0) -> float:
+        return low + (high - low) * float(self._random())
+
+    def _chance(self, probability: float) -> bool:
+        return self._number() < probability
+
+    def _below(self, count: int) -> int:
+        return int(torch.randint(count, (), generator=self.generator))
+
+    def _clean(self, grey: bool) -> Tensor:
+        crop = self._pattern() if self._chance(0.08) else self._cut()
+        if self._chance(0.15):
+            crop = self._blend(crop, self._cut())
+        crop = self._as_grey(crop) if grey else self._as_colour(crop)
+        if self._chance(0.4):
+            crop = crop.clamp(0, 1) ** self._number(0.6, 1.5)
+        if self._chance(0.4):
+            contrast = self._number(0.5, 1.0)
+            crop = contrast * crop + (1 - contrast) * self._number()
+        return 1 - crop if self._chance(0.1) else crop
+
+    def _cut(self) -> Tensor:
+        """A crop (C, side, side), turned and mirrored."""
+        picture = self.pictures[int(torch.multinomial(self.weights, 1, generator=self.generator))]
+        row, column = (self._below(length - self.side + 1) for length in picture.shape[-2:])
+        crop = torch.rot90(picture[:, row : row + self.side, column : column + self.side], self._below(4), (1, 2))
+        return crop.flip(2) if self._chance(0.5) else crop
+
+    def _blend(self, first: Tensor, second: Tensor) -> Tensor:
+        """Two crops on top of each other, or beside each other with a soft or sharp border."""
+        if self._chance(0.5):
+            return torch.lerp(*torch.broadcast_tensors(first, second), self._number())
+        share = (self._smooth(1, 2 + self._below(5)) * self._number(5, 45) + 0.5).clamp(0, 1)
+        return share * first + (1 - share) * second
+
+    def _pattern(self) -> Tensor:
+        """Regions, stripes, lines or shades (3, side, side)."""
+        smooth = self._smooth(3, 2 + self._below(14))
+        colours = self._random(3, 3, 1, 1)
+        kind = self._below(4)
+        if kind == 0:
+            return colours[:, :, 0, 0].T[:, smooth.argmax(0)]
+        if kind == 1:
+            angle, frequency = self._number(0, math.pi), self._number(0.1, 1.3)
+            places = torch.arange(self.side, dtype=torch.float32)
+            along = places[:, None] * math.sin(angle) + places * math.cos(angle)
+            wave = torch.sin(frequency * along + self._number(0, 3) * smooth[:1])
+            share = (wave > 0).float() if self._chance(0.5) else (wave + 1) / 2
+        elif kind == 2:
+            share = ((2.5 * smooth[:1]).frac().abs() < 0.35).float()
+        else:
+            return (0.5 + 0.25 * smooth).clamp(0, 1)
+        return torch.lerp(colours[0], colours[1], share)
+
+    def _smooth(self, planes: int, count: int) -> Tensor:
+        """Smooth random planes (planes, side, side) of unit variance at ``count`` points."""
+        values = torch.randn(1, planes, count, count, generator=self.generator)
+        return F.interpolate(values, (self.side, self.side), mode="bicubic")[0]
+
+    def _as_grey(self, crop: Tensor) -> Tensor:
+        """One channel, the channels mixed at random."""
+        mixture = self._random(len(crop), 1, 1) + 0.1
+        return (crop * (mixture / mixture.sum())).sum(0, keepdim=True)
+
+    def _as_colour(self, crop: Tensor) -> Tensor:
+        """Three channels: grey ones between two colours, or others in another order and of another saturation."""
+        if len(crop) == 1:
+            if self._chance(0.5):
+                return crop.expand(3, -1, -1)
+            return torch.lerp(self._random(3, 1, 1), self._random(3, 1, 1), crop)
+        if self._chance(0.5):
+            crop = crop[torch.randperm(3, generator=self.generator)]
+        if self._chance(0.6):
+            mean = crop.mean(0, keepdim=True)
+            crop = torch.lerp(mean.expand_as(crop), crop, self._number(0, 1.5)).clamp(0, 1)
+        return crop
+
+    def _noise(self, clean: Tensor) -> tuple[Tensor, Tensor]:
+        """Noisy crops and what is told of the noise: even, changing from place to place, or with the light."""
+        each = (len(clean), 1, 1, 1)
+        level = LARGEST * self._random(*each) * torch.where(self._random(*each) < 0.15, 0.17, 1.0)
+        shades = F.interpolate(self._random(len(clean), 1, 3, 3), clean.shape[-2:], mode="bilinear", align_corners=True)
+        gain = level.square() * (0.5 + 1.5 * self._random(*each))  # variance at white
+        dark = (0.3 * level * self._random(*each)).square()
+        kind = self._random(*each)
+        even = level.expand_as(clean)
+        uneven = torch.where(kind < 0.7, even, level * (0.3 + 1.4 * shades))
+        deviation = torch.where(kind < 0.82, uneven, (gain * clean.clamp(min=0) + dark).sqrt())
+        noisy = clean + deviation * torch.randn(clean.shape, generator=self.generator)
+        seen = F.avg_pool2d(F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1)  # the light as it can be known
+        told = torch.where(kind < 0.82, uneven, (gain * seen.clamp(min=0) + dark).sqrt())
+        wrong = torch.where(self._random(*each) < 0.2, 0.8 + 0.45 * self._random(*each), 1.0)
+        clipped = torch.where(self._random(*each) < 0.15, noisy.clamp(0, 1), noisy)
+        return clipped, told * wrong

@@ -1,0 +1,173 @@
+"""The noise of a photograph, from the windows of it in which there is little else."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_image
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.edits.source import InMemory, Source
+
+WINDOW = 9  # pixels of a side
+WINDOWS = 6144  # that are looked at
+FLAT = 0.06  # share of them in which noise is measured: those of the least slopes
+SHADES = 6  # groups of them by their light, for noise that depends on it
+MEDIAN = 0.6745  # of the absolute value of a normal variable
+DOUBLE = 1.1  # times what is expected, from where on a group is thought to hold texture
+BETTER = 0.3  # squared relative errors that a dependence on light has to explain
+DARK = 0.02  # variance in the dark, as a share of that at white, that is always expected
+SMALLEST = 1e-12  # variance
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise whose variance grows with the light, as in cameras: ``floor + gain * light``.
+
+    Attributes:
+        floor: variance (B,) in the dark.
+        gain: growth (B,) up to white.
+        light: mean (B,) of the photograph.
+    """
+
+    floor: Tensor
+    gain: Tensor
+    light: Tensor
+
+    @classmethod
+    def even(cls, level: Tensor) -> "Noise":
+        """Noise of the same standard deviations (B,) everywhere."""
+        return cls(level.square(), torch.zeros_like(level), torch.zeros_like(level))
+
+    @property
+    def level(self) -> Tensor:
+        """Standard deviation (B,) at the mean light."""
+        return (self.floor + self.gain * self.light).sqrt()
+
+    def at(self, image: Tensor) -> Tensor:
+        """Standard deviation (B, C, H, W) at the pixels of an image, whose light is the mean of 5x5 pixels."""
+        light = F.avg_pool2d(image.detach(), 5, 1, padding=2, count_include_pad=False).clamp(0, 1)
+        floor, gain = (value.to(image).view(-1, 1, 1, 1) for value in (self.floor, self.gain))
+        return (floor + gain * light).sqrt()
+
+
+@full_precision
+def estimate_noise(image: Tensor) -> Tensor:
+    """Standard deviation of white noise, at the mean light if it depends on light.
+
+    Of many windows of 9x9 pixels, those with the least slopes of local means count, and of these the median response to
+    Immerkaer's mask ("Fast Noise Variance Estimation", 1996), which is blind to whatever is linear in rows or columns.
+    Neither slopes nor clipped pixels mislead it; texture that fills the whole picture does, by a level or two.
+
+    Args:
+        image: (B, C, H, W), at least 3x3.
+
+    Returns:
+        (B,), in units of the image; 0 for an image smaller than 3x3. Constant, as no gradient passes.
+
+    Raises:
+        TypeError, ValueError: if ``image`` is not a finite floating-point (B, C, H, W) tensor.
+
+    Example:
+        >>> noise = torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+        >>> estimate_noise(0.5 + 0.1 * noise).round(decimals=2)
+        tensor([0.1000])
+    """
+    check_image(image, "image")
+    return noise_of(InMemory(image.detach().to(working_dtype(image)))).level
+
+
+@torch.no_grad()
+def noise_of(source: Source) -> Noise:
+    """The noise of any source."""
+    if min(source.size) < 3:
+        return Noise.even(torch.zeros(source.batch, dtype=source.dtype))
+    windows = _windows(source)
+    light = windows.mean((2, 3))
+    response = _response(windows)
+    # Windows with clipped pixels come last: their noise is cut off.
+    clipped = (windows == 0).logical_or(windows == 1).any(3).any(2)
+    slopes = torch.where(clipped, torch.inf, _slopes(windows))
+    level = _level(response, slopes)
+    shades, variances = [], []
+    for group in light.argsort(1).tensor_split(SHADES, dim=1):
+        if group.shape[1] == 0:
+            continue  # of fewer windows than groups
+        flat = slopes.gather(1, group)
+        shades.append(light.gather(1, group).mean(1))
+        variances.append(_level(response.gather(1, group[..., None].expand(-1, -1, response.shape[2])), flat).square())
+    floor, gain = _line(torch.stack(shades, dim=1), torch.stack(variances, dim=1))
+    even = gain == 0
+    return Noise(torch.where(even, level.square(), floor), gain, light.mean(1))
+
+
+def _windows(source: Source) -> Tensor:
+    """Windows (B, C * n, WINDOW, WINDOW) at random places, the same ones in memory and in tiles."""
+    height, width = source.size
+    rows, columns = max(1, height - WINDOW + 1), max(1, width - WINDOW + 1)
+    generator = torch.Generator().manual_seed(0)
+    if rows * columns <= WINDOWS:
+        corners = torch.arange(rows * columns)
+    else:
+        corners = torch.randint(rows * columns, (WINDOWS,), generator=generator)
+    inside = torch.arange(WINDOW)
+    down = _mirrored(corners // columns, inside, height)
+    across = _mirrored(corners % columns, inside, width)
+    places, order = (down[:, :, None] * width + across[:, None, :]).flatten().sort()
+    colours = source.colours(places)
+    return colours[:, :, order.argsort().to(colours.device)].unflatten(2, (-1, WINDOW, WINDOW)).flatten(1, 2)
+
+
+def _mirrored(corners: Tensor, inside: Tensor, length: int) -> Tensor:
+    """Numbers of rows or columns (n, WINDOW); a picture smaller than a window goes on as in a mirror."""
+    places = (corners[:, None] + inside) % max(1, 2 * length - 2)
+    return torch.minimum(places, 2 * length - 2 - places)
+
+
+def _response(windows: Tensor) -> Tensor:
+    """Absolute response (B, n, 49) to Immerkaer's mask, which is of unit norm."""
+    second = windows.new_tensor([1.0, -2.0, 1.0])
+    mask = torch.outer(second, second)[None, None] / 6
+    return F.conv2d(windows.flatten(0, 1).unsqueeze(1), mask).abs().flatten(1).unflatten(0, windows.shape[:2])
+
+
+def _slopes(windows: Tensor) -> Tensor:
+    """How much local means (B, n) rise or fall, which hardly depends on what the mask responds to."""
+    means = F.avg_pool2d(windows.flatten(0, 1).unsqueeze(1), 5, 1)
+    down, across = means[..., 2:, 1:-1] - means[..., :-2, 1:-1], means[..., 1:-1, 2:] - means[..., 1:-1, :-2]
+    return (down.square() + across.square()).mean((1, 2, 3)).unflatten(0, windows.shape[:2])
+
+
+def _level(response: Tensor, slopes: Tensor) -> Tensor:
+    """Standard deviations (B,) from the responses (B, n, r) in the windows of the least slopes (B, n)."""
+    count = max(1, min(slopes.shape[1], max(20, int(FLAT * slopes.shape[1]))))
+    least = slopes.argsort(1)[:, :count]
+    found = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
+    return found.flatten(1).median(1).values / MEDIAN
+
+
+def _line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Floor and gain (B,) of variances (B, K) at some light: none negative, no gain unless it explains much.
+
+    Texture only adds variance, so what lies above the line counts for less.
+    """
+    variance = variance.clamp(min=SMALLEST)
+    weight = torch.ones_like(variance)
+    for _ in range(10):
+        scale = weight / variance.square()
+        ones, linear, square = scale.sum(1), (scale * light).sum(1), (scale * light.square()).sum(1)
+        constant, rising = (scale * variance).sum(1), (scale * variance * light).sum(1)
+        determinant = (ones * square - linear.square()).clamp(min=1e-30)
+        floor = (constant * square - rising * linear) / determinant
+        gain = (ones * rising - constant * linear) / determinant
+        floor, gain = (
+            torch.where(gain <= 0, constant / ones, torch.where(floor <= 0, 0.0, floor)),
+            torch.where(gain <= 0, 0.0, torch.where(floor <= 0, rising / square, gain)),
+        )
+        expected = floor[:, None] + gain[:, None] * light
+        weight = torch.where(variance > DOUBLE * expected, 0.2, 1.0).to(variance)
+    even = (constant / ones)[:, None]
+    errors = [((found - variance) / variance).square().mul(weight).sum(1) for found in (even, expected)]
+    worth = errors[0] - errors[1] > BETTER
+    return torch.where(worth, floor.maximum(DARK * gain), even[:, 0]), torch.where(worth, gain, 0.0)

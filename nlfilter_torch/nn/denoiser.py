@@ -1,0 +1,260 @@
+"""A denoiser around the filter: a small network computes guide, sliders and values, the filter links alike places."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_values
+from nlfilter_torch.core.precision import as_given
+from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.nn.weights import read_weights
+from nlfilter_torch.operator.build import operator_from_features
+
+TRAINED = Path(__file__).with_name("denoiser.safetensors")
+
+WIDTH, FEATURES, VALUES, ORDER = 48, 16, 20, 1  # planes of the network, the guide and the values; k of the sliders
+DILATIONS = (1, 2, 3)  # of the convolutions before the filter, and in reverse after it
+PLANES = 12  # of 2x2 pixels, which the network sees as one point
+POINTS = 48  # for each landmark
+START = 12.0  # spatial bandwidth, in points, before training
+BRIGHTEST = 2.0  # magnitude that larger images are scaled down to, as the network has seen none
+
+SIDE, STEP = 128, 96  # of tiles, and from one to the next, in pixels
+FRAME = 16  # pixels that an image is extended by, so that no border is in sight of it
+TOGETHER = 8  # tiles worked on at once
+
+
+class NonlocalDenoiser(nn.Module):
+    """Noisy to denoised, in grey or colour, for noise of known strength that may differ from pixel to pixel.
+
+    The network sees 2x2 pixels as one point. Its first half computes, at every point, a guide, from which
+    :func:`operator_from_features` builds W, values, and sliders, by which :func:`polynomial_filter` filters values and
+    pixels; the second half turns all of this into the noise that is subtracted. Colours are split into luminance and
+    two differences, so that one network serves grey images, whose differences are free of noise. Larger images are
+    worked on in tiles that overlap, at places that do not depend on the size of the image.
+
+    A new one knows nothing; :meth:`trained` is the one of the package.
+
+    Example:
+        >>> noisy = 0.5 + 0.1 * torch.randn(1, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+        >>> denoiser = NonlocalDenoiser.trained()
+        >>> with torch.no_grad():
+        ...     denoised = denoiser(noisy, 0.1)
+        >>> bool((denoised - 0.5).std() < 0.02)
+        True
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = _convolution(PLANES + 2, WIDTH)
+        self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in DILATIONS)
+        self.guide = nn.Conv2d(WIDTH, FEATURES + VALUES + ORDER + 1, 1)
+        self.log_reach = nn.Parameter(torch.tensor([math.log(START)]))
+        self.merge = nn.Conv2d(VALUES + PLANES, WIDTH, 1)
+        self.after = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in reversed(DILATIONS))
+        self.last = _convolution(WIDTH, PLANES)
+
+    @classmethod
+    def trained(
+        cls, path: str | Path = TRAINED, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+    ) -> "NonlocalDenoiser":
+        """A denoiser with the weights of a safetensors file; without a path, those of the package.
+
+        Args:
+            path: of the file.
+            device: where it is to run.
+            dtype: in which.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is damaged, or holds weights of something else.
+        """
+        with torch.device("meta"):
+            denoiser = cls()
+        weights = read_weights(Path(path), {name: tuple(value.shape) for name, value in denoiser.named_parameters()})
+        denoiser.load_state_dict({name: value.to(device, dtype) for name, value in weights.items()}, assign=True)
+        return denoiser.eval()
+
+    def forward(self, noisy: Tensor, noise: float | Tensor) -> Tensor:
+        """Remove noise.
+
+        Args:
+            noisy: (B, C, H, W) in [0, 1] but for the noise, or one image (C, H, W). Three channels are colours; those
+                of another number are denoised one by one.
+            noise: its standard deviation in units of the image, as the network expects it: a number, (B,), or a map
+                (B, 1 or C, H, W). Where it is 0 the image stays as it is.
+
+        Returns:
+            Of the shape and dtype of ``noisy``. Differentiable in it, in the noise and in the weights.
+
+        Raises:
+            TypeError, ValueError: if an argument has another shape, is not finite, or noise is negative.
+        """
+        if isinstance(noisy, Tensor) and noisy.ndim == 3:
+            one = isinstance(noise, Tensor) and noise.ndim == 3
+            return self(noisy.unsqueeze(0), noise.unsqueeze(0) if one else noise).squeeze(0)  # type: ignore[union-attr]
+        check_photograph(noisy, "noisy")
+        dtype = self.log_reach.dtype
+        levels = noise_map(noise, noisy).to(dtype)
+        image = noisy.to(dtype)
+        return as_given(image - in_tiles(image, levels, self.noise_in), noisy)
+
+    def noise_in(self, noisy: Tensor, noise: Tensor) -> Tensor:
+        """What is to be subtracted, all at once: this is trained on crops, and runs on tiles.
+
+        Args:
+            noisy: (B, C, H, W) of even height and width.
+            noise: (B, 1 or C, H, W).
+        """
+        if noisy.shape[1] not in (1, 3):
+            each = (planes.flatten(0, 1).unsqueeze(1) for planes in (noisy, noise.expand_as(noisy)))
+            return self.noise_in(*each).view_as(noisy)
+        scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
+        planes, levels = split_colours(noisy / scale, noise / scale)
+        points = F.pixel_unshuffle(planes, 2)
+        middle = planes.new_tensor([0.5, 0.0, 0.0]).repeat_interleave(4).view(1, -1, 1, 1)
+        seen = torch.cat([2 * (points - middle), 10 * F.avg_pool2d(levels, 2)], dim=1)
+        features = self.first(seen.contiguous(memory_format=torch.channels_last))
+        for layer in self.before:
+            features = features + layer(_bent(features))
+        features = features + self.link(features, points)
+        for layer in self.after:
+            features = features + layer(_bent(features))
+        found = F.pixel_shuffle(self.last(_bent(features)).to(planes), 2)
+        return join_colours(levels[:, (0, 1, 1)] * found, noisy.shape[1]) * scale
+
+    def link(self, features: Tensor, points: Tensor) -> Tensor:
+        """What alike places have in common: values and pixels (B, 12, h, w), filtered, as planes of the network."""
+        height, width = points.shape[-2:]
+        guide, values, logits = self.guide(features).to(points).split([FEATURES, VALUES, ORDER + 1], dim=1)
+        rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
+        places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / self.log_reach.exp()
+        operator = operator_from_features(
+            torch.cat([guide.flatten(2), places.expand(len(guide), -1, -1)], dim=1),
+            size=(height, width),
+            num_landmarks=max(1, height * width // POINTS),
+        )
+        # Running sums of shares: the sliders rise to 1 for the smooth layer, so that values become means.
+        sliders = logits.softmax(1).cumsum(1)
+        merged: Tensor = self.merge(polynomial_filter(operator, torch.cat([values, points], dim=1), sliders))
+        return merged
+
+
+def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tensor:
+    """Noise of an image (B, C, H, W) as a map (B, 1 or C, H, W), from a number, (B,) or such a map.
+
+    Args:
+        noise: standard deviations.
+        image: that has them.
+        name: of the argument in errors.
+    """
+    if isinstance(noise, Tensor) and noise.ndim == 4:
+        check_image(noise, name, batch=image.shape[0])
+        check_same_size(noise, (image.shape[-2], image.shape[-1]), name, "image")
+        if noise.shape[1] not in (1, image.shape[1]):
+            raise ValueError(
+                f"{name} must have 1 channel or those of the image, {image.shape[1]}, got {noise.shape[1]}; select one"
+            )
+        check_values(noise.flatten(), name, "not negative", noise.numel())
+        return noise.to(image).expand(image.shape[0], -1, -1, -1)
+    check_values(noise, name, "not negative", image.shape[0])
+    levels = torch.as_tensor(noise, dtype=image.dtype, device=image.device).reshape(-1, 1, 1, 1)
+    return levels.expand(image.shape[0], 1, *image.shape[-2:])
+
+
+def split_colours(image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Luminance and two differences of colours (B, 3, H, W), and the noise of luminance and differences (B, 2, H, W).
+
+    The luminance is the mean of the channels. The differences are of unit norm; those of a grey image are 0, and free
+    of noise.
+    """
+    if image.shape[1] == 1:
+        nothing = torch.zeros_like(image)
+        return torch.cat([image, nothing, nothing], dim=1), torch.cat([noise, torch.zeros_like(noise)], dim=1)
+    variance = noise.expand(-1, 3, -1, -1).square()
+    deviation = torch.cat([variance.sum(1, keepdim=True) / 9, variance.mean(1, keepdim=True)], dim=1)
+    return torch.einsum("pc,bchw->bphw", _mixture(image), image), deviation.clamp(min=1e-30).sqrt()
+
+
+def join_colours(planes: Tensor, channels: int) -> Tensor:
+    """The inverse of :func:`split_colours`."""
+    if channels == 1:
+        return planes[:, :1]
+    return torch.einsum("cp,bphw->bchw", torch.linalg.inv(_mixture(planes)), planes)
+
+
+def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """What a function makes of an image (B, C, H, W) and its noise, in overlapping tiles, or at once if it is small.
+
+    Tiles stand every ``STEP`` pixels from the upper left corner. Their weights fall to 0 in their outermost pixels, so
+    that no border of a tile is in sight.
+    """
+    height, width = image.shape[-2:]
+    below, right = (
+        FRAME + n % 2 if n + 2 * FRAME < SIDE else -(-(n + 2 * FRAME - SIDE) // STEP) * STEP + SIDE - n - FRAME
+        for n in (height, width)
+    )
+    padding = (FRAME, right, FRAME, below)
+    image, noise = (_extended(planes, padding) for planes in (image, noise))
+    rows, columns = image.shape[-2:]
+    side = (min(SIDE, rows), min(SIDE, columns))
+    places = [
+        (row, column) for row in range(0, rows - side[0] + 1, STEP) for column in range(0, columns - side[1] + 1, STEP)
+    ]
+    if len(places) == 1:
+        return function(image, noise)[..., FRAME : FRAME + height, FRAME : FRAME + width]
+    fade = torch.outer(*(_profile(n).to(image) for n in side))
+    total, weight = torch.zeros_like(image), image.new_zeros(rows, columns)
+    batch = len(image)
+    for first in range(0, len(places), TOGETHER):
+        windows = [
+            (..., slice(row, row + side[0]), slice(column, column + side[1]))
+            for row, column in places[first : first + TOGETHER]
+        ]
+        found = function(*(torch.cat([planes[window] for window in windows]) for planes in (image, noise)))
+        for window, tile in zip(windows, found.split(batch), strict=True):
+            total[window] += fade * tile
+            weight[window] += fade
+    inner = (..., slice(FRAME, FRAME + height), slice(FRAME, FRAME + width))
+    return total[inner] / weight[inner]
+
+
+def _profile(length: int) -> Tensor:
+    """Weights along one direction of a tile: 0 in the frame, then rising to 1 over what tiles have in common."""
+    distance = torch.arange(length, dtype=torch.float64) + 0.5
+    distance = torch.minimum(distance, length - distance)
+    return ((distance - (SIDE - STEP) / 4) / ((SIDE - STEP) / 2)).clamp(1e-4, 1.0)
+
+
+def _extended(planes: Tensor, padding: tuple[int, int, int, int]) -> Tensor:
+    """Planes with mirrored pixels around them, of which narrow ones are mirrored more than once."""
+    left, right, above, below = padding
+    rows = _mirrored(planes.shape[-2], above, below).to(planes.device)
+    columns = _mirrored(planes.shape[-1], left, right).to(planes.device)
+    return planes[..., rows, :][..., columns]
+
+
+def _mirrored(length: int, before: int, after: int) -> Tensor:
+    """Numbers of ``length`` pixels, continued on both sides as in a mirror."""
+    period = max(1, 2 * length - 2)
+    places = torch.arange(-before, length + after) % period
+    return torch.minimum(places, period - places)
+
+
+def _mixture(like: Tensor) -> Tensor:
+    """From red, green and blue to luminance and differences, (3, 3)."""
+    rows = [[1 / 3, 1 / 3, 1 / 3], [0.5**0.5, 0.0, -(0.5**0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]]
+    return like.new_tensor(rows)
+
+
+def _bent(features: Tensor) -> Tensor:
+    """What goes into a convolution; negative features pass weakly, as units would die if they did not."""
+    return F.leaky_relu(features, 0.1)
+
+
+def _convolution(inputs: int, outputs: int, dilation: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=dilation, dilation=dilation)

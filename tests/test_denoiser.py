@@ -1,0 +1,289 @@
+"""The trained denoiser: nothing without noise, tiles without seams, all kinds of noise, gradients, and its file."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.train_denoiser import PlainDenoiser
+from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
+from nlfilter_torch.edits.noise import Noise, noise_of
+from nlfilter_torch.edits.source import InMemory
+from nlfilter_torch.nn import denoiser as module
+from nlfilter_torch.nn.denoiser import SIDE, STEP, TRAINED, in_tiles, join_colours, noise_map, split_colours
+from tests.problems import colour, picture, seeded
+
+TRAINED_ONE = NonlocalDenoiser.trained()
+CAT = colour("chelsea", 96, 128)
+
+
+def noisy(image: Tensor, noise: float | Tensor, seed: int = 0) -> Tensor:
+    return image + noise * torch.randn(image.shape, generator=seeded(seed))
+
+
+def decibels(image: Tensor, clean: Tensor) -> float:
+    return float(-10 * (image - clean).square().mean().log10())
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(("level", "gain"), [(5, 1.0), (15, 4.0), (50, 8.0)])
+def test_photographs_come_closer(channels: int, level: int, gain: float) -> None:
+    clean = CAT[:, :channels]
+    image = noisy(clean, level / 255)
+    with torch.no_grad():
+        found = TRAINED_ONE(image, level / 255)
+    assert decibels(found, clean) > decibels(image, clean) + gain
+    assert torch.equal(denoise(image, noise_level=level / 255), found)
+
+
+def test_it_is_better_than_the_rule() -> None:
+    image = noisy(CAT, 25 / 255)
+    network, rule = (denoise(image, noise_level=25 / 255, method=method) for method in ("network", "rule"))
+    assert decibels(network, CAT) > decibels(rule, CAT) + 1
+
+
+def test_no_noise_changes_nothing() -> None:
+    assert torch.equal(TRAINED_ONE(CAT, 0.0), CAT)
+    half = torch.zeros(1, 1, *CAT.shape[-2:])
+    half[..., 64:] = 0.1
+    found = TRAINED_ONE(CAT, half)
+    assert torch.equal(found[..., :64], CAT[..., :64])
+    assert not torch.equal(found[..., 64:], CAT[..., 64:])
+    assert torch.equal(denoise(CAT, strength=0.0), CAT)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 200), (97, 95), (98, 96), (150, 131)])
+def test_every_size(size: tuple[int, int]) -> None:
+    image = noisy(torch.full((1, 1, *size), 0.5), 0.1)
+    with torch.no_grad():
+        found = TRAINED_ONE(image, 0.1)
+    assert found.shape == image.shape
+    assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("size", [(40, 300), (300, 310)])
+def test_tiles_put_together_what_they_took_apart(size: tuple[int, int]) -> None:
+    image = torch.rand(2, 3, *size, generator=seeded(0))
+    noise = torch.rand(2, 1, *size, generator=seeded(1))
+    torch.testing.assert_close(in_tiles(image, noise, lambda x, n: x + n), image + noise, rtol=0, atol=1e-6)
+
+
+def test_rows_that_begin_at_a_tile_are_those_of_the_whole() -> None:
+    image = noisy(colour("chelsea", 300, 150)[:, :1], 0.1)
+    noise = torch.full_like(image, 0.1)
+    with torch.no_grad():
+        whole = in_tiles(image, noise, TRAINED_ONE.noise_in)
+        lower = in_tiles(image[..., STEP:, :], noise[..., STEP:, :], TRAINED_ONE.noise_in)
+    torch.testing.assert_close(lower[..., SIDE:, :], whole[..., STEP + SIDE :, :], rtol=0, atol=1e-5)
+
+
+def test_colours_are_split_and_joined() -> None:
+    image = torch.rand(2, 3, 4, 6, generator=seeded(0)).double()
+    planes, noise = split_colours(image, torch.full((2, 1, 4, 6), 0.3).double())
+    torch.testing.assert_close(join_colours(planes, 3), image)
+    torch.testing.assert_close(noise[0, :, 0, 0], torch.tensor([0.3 / 3**0.5, 0.3]).double())
+    sample = 0.3 * torch.randn(1, 3, 300, 300, generator=seeded(1)).double()
+    spread = split_colours(sample, torch.full((1, 1, 300, 300), 0.3).double())[0].std((0, 2, 3))
+    torch.testing.assert_close(spread, torch.tensor([0.3 / 3**0.5, 0.3, 0.3]).double(), rtol=0.02, atol=0)
+
+
+def test_images_of_a_batch_are_denoised_as_alone() -> None:
+    images = torch.cat([noisy(CAT, 0.1), noisy(colour("coffee", 96, 128), 0.05)])
+    levels = torch.tensor([0.1, 0.05])
+    with torch.no_grad():
+        both = TRAINED_ONE(images, levels)
+        for i in range(2):
+            alone = TRAINED_ONE(images[i : i + 1], levels[i])
+            torch.testing.assert_close(both[i : i + 1], alone, rtol=0, atol=1e-4)
+            torch.testing.assert_close(TRAINED_ONE(images[i], levels[i].view(1, 1, 1).expand(1, 96, 128)), alone[0])
+
+
+def test_numbers_and_maps_of_the_noise_agree() -> None:
+    image = noisy(CAT, 0.1)
+    maps = (torch.full((1, channels, 96, 128), 0.1) for channels in (1, 3))
+    with torch.no_grad():
+        wanted = TRAINED_ONE(image, 0.1)
+        for noise in (torch.tensor(0.1), torch.tensor([0.1]), *maps):
+            torch.testing.assert_close(TRAINED_ONE(image, noise), wanted, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [2, 4])
+def test_other_channels_are_denoised_one_by_one(channels: int) -> None:
+    image = noisy(CAT[:, :1].repeat(2, channels, 1, 1), 0.1)
+    with torch.no_grad():
+        found = TRAINED_ONE(image, 0.1)
+        torch.testing.assert_close(found[1:, 1:2], TRAINED_ONE(image[1:, 1:2], 0.1), rtol=0, atol=1e-4)
+
+
+def test_bright_pictures_are_denoised_as_their_scaled_selves() -> None:
+    image = noisy(CAT[..., :64, :64], 0.1)  # a single tile
+    image = 2 * image / image.max()
+    with torch.no_grad():
+        torch.testing.assert_close(
+            TRAINED_ONE(4 * image, 0.4), 4 * TRAINED_ONE(image, 0.1), rtol=0, atol=1e-3
+        )  # the largest magnitude that the network sees is 2
+
+
+def test_gradients_reach_everything() -> None:
+    model = NonlocalDenoiser.trained()
+    image = noisy(CAT[..., :32, :32], 0.1).requires_grad_()
+    noise = torch.full((1,), 0.1, requires_grad=True)
+    (model(image, noise) - CAT[..., :32, :32]).square().mean().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+    assert image.grad is not None
+    assert image.grad.isfinite().all()
+    assert noise.grad is not None
+    assert noise.grad.abs() > 0
+
+
+def test_gradients_of_float64_are_those_of_differences() -> None:
+    model = NonlocalDenoiser.trained().double()
+    image = noisy(CAT[:, :1, :16, :16], 0.1).double()
+    weights = torch.randn(image.shape, generator=seeded(3)).double()
+    direction = torch.randn(image.shape, generator=seeded(4)).double()
+    point = image.clone().requires_grad_()
+    (weights * model(point, 0.1)).sum().backward()
+    assert point.grad is not None
+    step = 1e-6
+    with torch.no_grad():
+        ends = [(weights * model(image + sign * step * direction, 0.1)).sum() for sign in (1, -1)]
+    assert float((point.grad * direction).sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=2e-3)
+
+
+def test_precisions() -> None:
+    image = noisy(CAT, 0.1)
+    with torch.no_grad():
+        wanted = TRAINED_ONE(image, 0.1)
+        half = TRAINED_ONE(image.bfloat16(), 0.1)
+        with torch.autocast("cpu", torch.bfloat16):
+            cast = TRAINED_ONE(image, 0.1)
+    assert half.dtype == torch.bfloat16
+    assert cast.dtype == torch.float32
+    assert (cast - wanted).abs().max() < 0.05
+    double = denoise(image.double(), noise_level=0.1)
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), wanted, rtol=0, atol=1e-3)
+
+
+def test_noise_that_grows_with_the_light_is_found() -> None:
+    ramp = torch.linspace(0.1, 0.9, 200).expand(1, 3, 160, 200)
+    gain, floor = 0.004, (3 / 255) ** 2
+    image = noisy(ramp, (gain * ramp + floor).sqrt())
+    noise = noise_of(InMemory(image))
+    torch.testing.assert_close(noise.gain, torch.tensor([gain]), rtol=0.1, atol=0)
+    wanted = (gain * ramp + floor).sqrt()
+    assert (noise.at(image) / wanted - 1).abs().mean() < 0.06
+    even = noise_of(InMemory(noisy(ramp, 0.04)))
+    assert even.gain == 0
+    torch.testing.assert_close(even.level, torch.tensor([0.04]), rtol=0.04, atol=0)
+
+
+@pytest.mark.parametrize("level", [5, 15, 25, 50])
+def test_noise_is_found_beside_texture(level: int) -> None:
+    """Half of the picture is gravel, whose finest detail is as strong as noise of 20 levels."""
+    gravel = picture("gravel", 160, 160, torch.float32)
+    clean = torch.cat([gravel, torch.linspace(0.3, 0.7, 160).expand(1, 1, 160, 160)], dim=3)
+    found = 255 * estimate_noise(noisy(clean, level / 255))
+    assert float(found) == pytest.approx(level, rel=0.1)
+
+
+def test_clipped_pixels_do_not_hide_noise() -> None:
+    clean = torch.ones(1, 1, 120, 160)
+    clean[..., 60:] = 0.5
+    assert float(estimate_noise(noisy(clean, 0.08).clamp(0, 1))) == pytest.approx(0.08, rel=0.1)
+
+
+def test_even_noise_has_one_level() -> None:
+    noise = Noise.even(torch.tensor([0.1, 0.2]))
+    torch.testing.assert_close(noise.level, torch.tensor([0.1, 0.2]))
+    torch.testing.assert_close(noise.at(CAT.expand(2, -1, -1, -1)).mean((1, 2, 3)), torch.tensor([0.1, 0.2]))
+
+
+@pytest.mark.parametrize(
+    ("image", "noise", "error", "message"),
+    [
+        (torch.zeros(8, 8), 0.1, ValueError, "noisy must have shape"),
+        (torch.full((1, 1, 8, 8), torch.nan), 0.1, ValueError, "noisy must be finite"),
+        (torch.zeros(1, 3, 8, 8), -0.1, ValueError, "noise must be at least 0"),
+        (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), torch.nan), ValueError, "noise must be finite"),
+        (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), -1.0), ValueError, "noise must be at least 0"),
+        (torch.zeros(1, 3, 8, 8), torch.zeros(1, 1, 8, 9), ValueError, "noise must have the height and width"),
+        (torch.zeros(1, 3, 8, 8), torch.zeros(1, 2, 8, 8), ValueError, "noise must have 1 channel or those"),
+        (torch.zeros(1, 3, 8, 8), torch.zeros(3), ValueError, "noise must be a number or have shape"),
+        (torch.zeros(1, 3, 8, 8), "much", TypeError, "noise must be a number"),
+    ],
+)
+def test_bad_input(image: Tensor, noise: object, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        TRAINED_ONE(image, noise)
+
+
+def test_the_edit_refuses_what_it_cannot_take() -> None:
+    with pytest.raises(ValueError, match=r"noise_level must be a number or \(B,\) for the rule, got a map"):
+        denoise(CAT, noise_level=torch.zeros_like(CAT), method="rule")
+    with pytest.raises(ValueError, match="method must be one of 'network', 'rule', got 'luck'"):
+        denoise(CAT, method="luck")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="denoise takes no argument landmark"):
+        denoise(CAT, landmark=3)
+
+
+def test_the_file_of_the_package_is_small_and_says_how_it_was_trained() -> None:
+    from safetensors import safe_open
+    from safetensors.torch import load_file
+
+    assert TRAINED.stat().st_size < 1_000_000
+    weights = load_file(TRAINED)
+    assert sum(value.numel() for value in weights.values()) <= 150_000
+    for name, value in TRAINED_ONE.state_dict().items():
+        assert torch.equal(value, weights[name])
+    with safe_open(TRAINED, "pt") as file:
+        assert {"steps", "seed", "side", "rate", "loss"} <= file.metadata().keys()
+
+
+def test_files_that_are_damaged_or_of_something_else_name_themselves(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    path = tmp_path / "weights.safetensors"
+    with pytest.raises(FileNotFoundError, match=r"weights\.safetensors cannot be read: No such file"):
+        NonlocalDenoiser.trained(path)
+    whole = TRAINED.read_bytes()
+    for damaged in (b"", whole[:1000], whole[:-4], b"\0" * 100, b"\xff" * 100, b"\2\0\0\0\0\0\0\0[]"):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"weights\.safetensors is damaged"):
+            NonlocalDenoiser.trained(path)
+    save_file(PlainDenoiser().state_dict(), path)
+    with pytest.raises(ValueError, match=r"must hold log_reach of shape \(1,\), but .*weights.safetensors has none"):
+        NonlocalDenoiser.trained(path)
+    half = {name: value.half() for name, value in TRAINED_ONE.state_dict().items()}
+    save_file(half, path)
+    with pytest.raises(ValueError, match="numbers must be F32, got F16"):
+        NonlocalDenoiser.trained(path)
+
+
+def test_weights_of_ones_own_are_loaded(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    model = NonlocalDenoiser()
+    save_file(model.state_dict(), tmp_path / "own.safetensors", {"steps": "0"})
+    loaded = NonlocalDenoiser.trained(tmp_path / "own.safetensors")
+    for name, value in model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value)
+    header = json.loads((tmp_path / "own.safetensors").read_bytes()[8:].split(b"}}", 1)[0] + b"}}")
+    assert header["__metadata__"] == {"steps": "0"}
+
+
+def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, ...]] = []
+
+    def watched(image: Tensor, noise: Tensor) -> Tensor:
+        seen.append((len(image), *image.shape[-2:]))
+        return noise
+
+    image = torch.zeros(1, 1, 400, 300)
+    in_tiles(image, noise_map(0.1, image), watched)
+    assert {size[1:] for size in seen} == {(module.SIDE, module.SIDE)}
+    assert max(size[0] for size in seen) <= module.TOGETHER
