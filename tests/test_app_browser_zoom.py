@@ -164,8 +164,6 @@ def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, h
     fingers.to("Start", (x - 20, y), (x + 20, y))
     for apart in (30, 40, 60):
         fingers.to("Move", (x - apart, y), (x + apart, y))
-    fingers.to("Move", (x - 60, y))  # the other one is lifted
-    fingers.to("Move", (x - 10, y + 10))  # the one that is left neither draws nor moves
     fingers.to("End")
     assert tab.scale() == pytest.approx(3 * fit, rel=0.05)
     assert tab.share(x, y) == pytest.approx(under, abs=0.02)

@@ -35,7 +35,7 @@ RECIPES = {
     "recolor": Recipe((Step("recolor", (BLUE,)),)),
     "defocus": Recipe((Step("defocus", (IN,)),)),
     "abstract": Recipe((Step("abstract", edges=0.5),)),
-    "several": Recipe((Step("denoise", noise_level=6.0), REGION, Step("tone", contrast=1.2))),
+    "several": Recipe((Step("denoise", noise_level=6.0, method="rule"), REGION, Step("tone", contrast=1.2))),
 }
 
 

@@ -34,14 +34,15 @@ EDITS = {
     "all channels": Recipe((DETAIL.changed(channels="all", residual=0.5),)),
     "colorize": Recipe((COLORIZE,)),
     "recolor": Recipe((RECOLOR,)),
-    "denoise": Recipe((Step("denoise", noise_level=8.0, landmarks=60),)),
+    "denoise": Recipe((Step("denoise", noise_level=8.0),)),
+    "denoise by rule": Recipe((Step("denoise", noise_level=8.0, method="rule", landmarks=60),)),
     "sharpen": Recipe((Step("sharpen", landmarks=60),)),
     "sharpen, reduced": Recipe((Step("sharpen", landmarks=60, viewing_size=SMALL),)),
     "tone": Recipe((Step("tone", contrast=1.3, clarity=1.5, landmarks=60),)),
     "abstract": Recipe((Step("abstract", landmarks=60, edges=0.7, tones=6),)),
     "defocus": Recipe((Step("defocus", (IN,), landmarks=60, radius=3.0),)),
     "look": Recipe((Step("look", alpha=(2.0, 1.0, 1.0), bands=(1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0), landmarks=60),)),
-    "several": Recipe((Step("denoise", noise_level=8.0, landmarks=60), DETAIL, RECOLOR)),
+    "several": Recipe((Step("denoise", noise_level=8.0, method="rule", landmarks=60), DETAIL, RECOLOR)),
 }
 
 
@@ -123,3 +124,16 @@ def test_a_fit_that_is_interrupted_leaves_what_was_known(after: int) -> None:
     parts.fit(recipe, passes)
     fresh.fit(recipe, passes)
     assert torch.equal(parts.edited(place), fresh.edited(place))
+
+
+def test_a_part_of_a_picture_of_many_tiles_of_the_network() -> None:
+    """They stand at the same places as in the whole picture."""
+    image = torch.cat([cat(1), cat(1).flip(3)], dim=3)  # 900 pixels wide
+    source, passes = rows_of(image), Passes("float32")
+    recipe = Recipe((Step("denoise", noise_level=8.0),))
+    wanted = whole(recipe, source, passes)
+    parts = Parts(source, "scan.tif")
+    parts.fit(recipe, passes)
+    for place in (Rectangle(range(150, 190), range(400, 470)), Rectangle(range(290, 300), range(870, 900))):
+        part = wanted[..., place.rows.start : place.rows.stop, place.columns.start : place.columns.stop]
+        torch.testing.assert_close(parts.edited(place), part, atol=2e-4, rtol=0)

@@ -40,7 +40,7 @@ class Fitted:
         finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
         margin: how many.
         step: what ``finish`` does depends on the number of a row modulo so many, counted from the first it is given;
-            tiles begin at multiples of it, and so does ``margin``.
+            tiles begin at multiples of it, and so does ``margin``. Likewise for columns.
     """
 
     pixels: Planes

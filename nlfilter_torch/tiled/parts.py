@@ -46,6 +46,14 @@ class Rectangle:
         """With a margin, as far as a picture (H, W) has it."""
         return Rectangle(_grown(self.rows, margin, size[0]), _grown(self.columns, margin, size[1]))
 
+    def aligned(self, step: int, size: tuple[int, int]) -> "Rectangle":
+        """Grown so that it begins and ends at multiples of a step, or at the border of a picture (H, W)."""
+        rows, columns = (
+            range(axis.start // step * step, min(-(-axis.stop // step) * step, length))
+            for axis, length in zip((self.rows, self.columns), size, strict=True)
+        )
+        return Rectangle(rows, columns)
+
     def meets(self, other: "Rectangle") -> bool:
         """Whether they have a pixel in common."""
         pairs = ((self.rows, other.rows), (self.columns, other.columns))
@@ -110,7 +118,7 @@ def margin_of(operator: TiledOperator) -> int:
 @full_precision
 def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     """A rectangle (1, C, h, w) of a picture under an edit that was fitted to it."""
-    around = part if fitted.finish is None else part.grown(fitted.margin, tiled.size)
+    around = part if fitted.finish is None else part.aligned(fitted.step, tiled.size).grown(fitted.margin, tiled.size)
     step = max(1, STRIP // len(around.columns))
     rows = around.rows
     strips = [
