@@ -63,7 +63,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.report out/quick/speed.json
 	$(BIN)/python -m benchmarks.memory --side 128 --repeats 1
 	$(BIN)/python -m benchmarks.tables --long-side 64
-	$(BIN)/python -m benchmarks.app --side 96
+	$(BIN)/python -m benchmarks.app --side 96 --megapixels 0.05
 	$(BIN)/python -m benchmarks.distributed --ranks 2 --widths 64 --landmarks 20
 	$(BIN)/python -m benchmarks.detail --quick
 	$(BIN)/python -m benchmarks.detail --quick --scales

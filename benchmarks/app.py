@@ -1,33 +1,38 @@
 """Time of the editor from a pointer movement to the picture: python -m benchmarks.app [--side 1000] [--browser].
 
 Prints medians and quartiles of 20, in milliseconds, on a square preview; with ``--browser`` from the pointer's move to
-the picture in a headless Chromium as well, over the server and its pictures as JPEG.
+the picture in a headless Chromium as well, over the server and its pictures as JPEG. Then, for a photograph of
+``--megapixels``, from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new.
 """
 
 import argparse
+import asyncio
 import platform
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import skimage.data
 import torch
 import torch.nn.functional as F
 
 from nlfilter_torch.app import drawing
+from nlfilter_torch.app.closeup import Closeup
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 REPEATS = 20
+VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800
 
 
-def photograph(side: int) -> torch.Tensor:
-    """(1, 3, side, side) in [0, 1]."""
+def photograph(height: int, width: int) -> torch.Tensor:
+    """(1, 3, height, width) in [0, 1]."""
     pixels = torch.from_numpy(skimage.data.astronaut().copy()).permute(2, 0, 1)[None].float() / 255
-    return F.interpolate(pixels, size=(side, side), mode="bicubic", antialias=True).clamp(0, 1)
+    return F.interpolate(pixels, size=(height, width), mode="bicubic", antialias=True).clamp(0, 1)
 
 
 def milliseconds(work: Callable[[], object]) -> float:
@@ -82,6 +87,46 @@ def in_the_library(path: Path) -> None:
         report(f"{step}, {entry} changed", times)
 
 
+def at_full_size(path: Path) -> None:
+    """The part that is seen at 100 %, after pans by a third of it, and after jumps to other places."""
+    session, tasks = Session(path.parent), list[Awaitable[None]]()
+    session.open(path)
+    assert session.opened is not None
+    height, width = session.opened.photograph.size
+
+    async def run(doing: str, work: Callable[[], Any], progress: object) -> Any:
+        return work()
+
+    closeup = Closeup(run, tasks.append, lambda script: None)
+
+    def look(x: float, y: float) -> float:
+        """Milliseconds until what is seen at a place, in shares of the way to the lower right corner, is there."""
+        left, top = round(x * max(0, width - VIEW[0])), round(y * max(0, height - VIEW[1]))
+
+        def work() -> None:
+            closeup.look((left, top, left + VIEW[0], top + VIEW[1]))
+            while tasks:
+                asyncio.run(tasks.pop())  # type: ignore[arg-type]
+
+        return milliseconds(work)
+
+    for step, paint in (("detail", "in"), ("recolor", "#2040e0"), ("defocus", "in")):
+        session.load(Recipe())
+        preview = session.preview.size
+        session.add_stroke(
+            step, [(0.4 * preview[1], 0.4 * preview[0]), (0.5 * preview[1], 0.4 * preview[0])], 0.02, paint
+        )
+        if step == "detail":
+            session.set("detail", inside=(2.0, 2.0, 2.0, 1.0))
+            session.commit()
+        closeup.open(session)
+        report(f"{step} of a region: first 100 % view", [look(0.1, 0.2)])
+        third = VIEW[0] / 3 / max(1, width - VIEW[0])
+        name = f"100 % view after a pan at {width * height / 1e6:.0f} MP"
+        report(f"{name}, a third", [look(0.1 + i * third, 0.2) for i in range(1, REPEATS // 2)])
+        report(f"{name}, all of it", [look(0.5, 0.3 + 0.2 * i) for i in range(3)])
+
+
 def in_the_browser(path: Path) -> None:
     """From the pointer's move to the picture in the page."""
     from tests.browser import Editor, Tab, chromium
@@ -115,14 +160,19 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--side", type=int, default=1000, help="pixels of a square preview")
+    parser.add_argument("--megapixels", type=float, default=24, help="of the photograph that is seen at 100 %%")
     parser.add_argument("--browser", action="store_true", help="with headless Chromium too")
     arguments = parser.parse_args()
     print(f"{arguments.side}x{arguments.side} pixels, {torch.get_num_threads()} threads, {platform.machine()}")
     print(f"{'milliseconds, median and quartiles':<44}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.png"
-        write_photograph(Photograph(photograph(arguments.side)), path)
+        write_photograph(Photograph(photograph(arguments.side, arguments.side)), path)
         in_the_library(path)
+        large = Path(folder) / "large.tif"
+        height = round((arguments.megapixels * 1e6 / 1.5) ** 0.5)
+        write_photograph(Photograph(photograph(height, round(1.5 * height))), large)
+        at_full_size(large)
         if arguments.browser:
             in_the_browser(path)
 

@@ -197,10 +197,12 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("step", [1, 3])
 def test_rows_of_enlarged_blocks_are_those_of_the_whole(step: int) -> None:
     blocks = noise(1, 2, 7, 5)
-    whole = enlarged(blocks, step, 0, (7 * step - step // 2, 5 * step - step // 2))
+    whole = enlarged(blocks, step, (0, 0), (7 * step - step // 2, 5 * step - step // 2))
     for first, count in ((0, 4), (3, 3), (5, 2 * step)):
-        rows = enlarged(blocks, step, first, (count, whole.shape[3]))
+        rows = enlarged(blocks, step, (first, 0), (count, whole.shape[3]))
         torch.testing.assert_close(rows, whole[:, :, first : first + count][:, :, : rows.shape[2]])
+        part = enlarged(blocks, step, (first, first), (count, 4))
+        torch.testing.assert_close(part, rows[..., first:][..., : part.shape[3]])
     middles = whole[:, :, step // 2 :: step, step // 2 :: step]
     torch.testing.assert_close(middles, blocks[:, :, : middles.shape[2], : middles.shape[3]])
 

@@ -162,6 +162,9 @@ def test_resizing_is_antialiased_bicubic_and_can_go_by_rows(wanted: tuple[int, i
     rows = range(3, min(wanted[0], 9))
     part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows)
     torch.testing.assert_close(part, found[:, :, 3:9])
+    columns = range(2, min(wanted[1], 13))
+    part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows, columns)
+    torch.testing.assert_close(part, found[:, :, 3:9, 2:13])
 
 
 def test_the_viewing_size_of_a_picture() -> None:

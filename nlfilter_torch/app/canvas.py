@@ -46,11 +46,14 @@ class Canvas:
                 events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
             ).classes("photo")
             with self._photo:
+                ui.element("div").classes("over pieces")
                 self._mask = ui.element("img").classes("over mask").props('alt="mask"')
                 self._clipped = ui.element("img").classes("over").props('alt="clipped"')
                 self._before = ui.element("img").classes("over before").props('alt="before"')
+                ui.element("div").classes("over before originals")
                 ui.element("div").classes("edge")
                 ui.label("before").classes("tag")
+            _build_zoom()
             # Moves without a pressed button are not sent.
             self._photo.on(
                 "mouse",
@@ -66,7 +69,7 @@ class Canvas:
             ui.label("Before").classes("hint wide")
             wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
             wipe.props('dense aria-label="Before and after"')
-            wipe.on("update:model-value", js_handler="(v) => document.documentElement.style.setProperty('--wipe', v)")
+            wipe.on("update:model-value", js_handler="(v) => closeup.wipe(v)")
             self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
             self._show_mask = ui.checkbox("Mask", value=False, on_change=lambda: self.draw_mask()).props("dense")
             self._show_mask.tooltip(
@@ -82,7 +85,9 @@ class Canvas:
         preview = opened.preview
         height, width = opened.photograph.size
         self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
-        self._photo.style(f"width: min(100cqw, calc(100cqh * {preview.size[1] / preview.size[0]:.4f}))")
+        fitting = f"min(100cqw, calc(100cqh * {preview.size[1] / preview.size[0]:.4f}))"
+        self._photo.style(f"width: var(--photo-width, {fitting})")
+        ui.run_javascript(f"closeup.open({width}, {height}, '/picture/{self._token}')")
         self._mask_shown = None
         self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
         self.clipped_before = drawing.clipped_shares(preview.pixels.clamp(0, 1))
@@ -94,6 +99,7 @@ class Canvas:
     def switch(self, step: str) -> None:
         """Show the strokes of another step."""
         self._step = step
+        ui.run_javascript(f"closeup.brush({'true' if step in BRUSHES else 'false'})")
         self.draw_strokes()
         self.draw_mask()
 
@@ -163,6 +169,11 @@ class Canvas:
             self._drawn()
         self.draw_strokes()
 
+    def drop_stroke(self) -> None:
+        """Forget the stroke that is being drawn."""
+        self._line = []
+        self.draw_strokes()
+
     def _show(self, kind: str, element: ui.element) -> None:
         self._frame += 1
         address = f"/picture/{self._token}/{kind}?{self._frame}"
@@ -170,3 +181,26 @@ class Canvas:
             element.set_source(address)
         else:
             element.props(f'src="{address}"')
+
+
+def _build_zoom() -> None:
+    """Buttons for what :mod:`nlfilter_torch.app.script` does."""
+
+    def button(label: str, icon: str, tip: str, action: str) -> ui.button:
+        found = ui.button(icon=icon).props(f'flat dense color=white aria-label="{label}"').tooltip(tip)
+        return found.on("click", js_handler=f"() => closeup.{action}")
+
+    with ui.element("div").classes("zoom").props('role="group" aria-label="Zoom"'):
+        button("Zoom out", "remove", "The minus key, or the wheel", "step(-1)")
+        ui.label("").classes("zoom-level").props('aria-live="polite"')
+        button("Zoom in", "add", "The plus key, or the wheel", "step(1)")
+        button("Fit", "fit_screen", "The whole photograph; the key 0", "fit()")
+        button("Full size", "crop_free", "One pixel of the photograph for each of the screen; the key 1", "full()")
+        hand = button(
+            "Move",
+            "pan_tool",
+            "Drag the photograph in place of the brush; also the space bar, the middle "
+            "button, two fingers and the arrow keys",
+            "hand()",
+        )
+        hand.classes("grab").props('aria-pressed="false"')

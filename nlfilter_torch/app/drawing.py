@@ -31,6 +31,13 @@ def picture(image: Tensor) -> bytes:
     return _encode(Image.fromarray(np.ascontiguousarray(values.squeeze())), "JPEG", quality=QUALITY, subsampling=0)
 
 
+def lossless(image: Tensor) -> bytes:
+    """An image (1, 1 or 3, H, W) in [0, 1] as a PNG."""
+    values = _bytes(image).permute(1, 2, 0).numpy()
+    values = values[..., 0] if values.shape[2] == 1 else values
+    return _encode(Image.fromarray(np.ascontiguousarray(values)), "PNG", compress_level=1)
+
+
 def mask_picture(mask: Tensor) -> bytes:
     """A mask (1, 1, H, W) in [0, 1] as a tinted, transparent PNG."""
     alpha = (mask[0, 0] * OPACITY).round().to(torch.uint8).numpy()

@@ -15,8 +15,10 @@ from nicegui.elements.upload_files import FileUpload
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.access import LARGEST
 from nlfilter_torch.app.canvas import Canvas
+from nlfilter_torch.app.closeup import Closeup
 from nlfilter_torch.app.library import Library
 from nlfilter_torch.app.panel import Brush, Panel
+from nlfilter_torch.app.script import SCRIPT
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
 from nlfilter_torch.core.progress import Progress
@@ -61,9 +63,10 @@ class Editor:
         """Lay the page out, and open the photograph of an address that the page had before, or an image."""
         EDITORS[self._token] = self
         self._client = ui.context.client
-        self._client.on_delete(lambda: EDITORS.pop(self._token, None))
+        self._client.on_delete(self._leave)
         ui.add_css(CSS)
-        ui.add_head_html(LEAVING)
+        ui.add_head_html(LEAVING + SCRIPT)
+        self._closeup = Closeup(self._run, self._start, self._tell)
         self._build_header()
         brush = Brush()
         with ui.element("div").classes("editor"):
@@ -74,12 +77,23 @@ class Editor:
                 handle.classes("handle").on("click", js_handler=FOLD)
                 self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
         ui.keyboard(on_key=self._key)
+        ui.on("closeup", lambda event: self._closeup.look(event.args))
+        ui.on("stroke_dropped", self._canvas.drop_stroke)
         self._client.on_connect(lambda: self._begin(image, address))
 
-    @property
-    def pictures(self) -> dict[str, bytes]:
-        """Files of the pictures that the page shows, by their kind."""
-        return self._canvas.pictures
+    def picture(self, kind: str, place: str) -> bytes | None:
+        """The file of a picture that the page shows, by its kind; of the original at a place."""
+        if kind == "original":
+            return self._closeup.original(place)
+        return self._canvas.pictures.get(kind) or self._closeup.file(kind)
+
+    def _tell(self, script: str) -> None:
+        if not self._client.is_deleted:
+            self._client.run_javascript(script)
+
+    def _leave(self) -> None:
+        EDITORS.pop(self._token, None)
+        self._closeup.stop()
 
     # Layout
 
@@ -135,6 +149,7 @@ class Editor:
             self.session.commit()
             self._changed()
         else:
+            self._closeup.hold()
             self._redraw(step)
 
     def _changed(self) -> None:
@@ -149,6 +164,7 @@ class Editor:
         self._panel.follow()
         self._show_state()
         self._redraw()
+        self._closeup.follow()
 
     def _show_state(self) -> None:
         """Show what can be undone, and whether the edit is kept."""
@@ -235,8 +251,10 @@ class Editor:
         if opened is None or self._client.is_deleted:
             return
         self._title.set_text(opened.name)
-        self._canvas.open(opened)
         self._clear_error()
+        self._closeup.open(self.session)
+        with self._client:
+            self._canvas.open(opened)
         self.follow()
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")

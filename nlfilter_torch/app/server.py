@@ -30,12 +30,12 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     library = Library(folder, None if image is None else image.parent)
 
     @app.get("/picture/{token}/{kind}")
-    def _picture(token: str, kind: str) -> Response:
+    def _picture(token: str, kind: str, at: str = "") -> Response:
         editor = EDITORS.get(token)
-        content = None if editor is None else editor.pictures.get(kind)
+        content = None if editor is None else editor.picture(kind, at)
         if not content:
             return Response(status_code=404)
-        media_type = "image/png" if kind in ("mask", "clipped") else "image/jpeg"
+        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
     @ui.page("/", title=TITLE)

@@ -26,6 +26,7 @@ from nlfilter_torch.io.photographs import (
     write_photograph,
 )
 from nlfilter_torch.io.rows import FIFTH, modest_memory
+from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.tiles import Passes, in_silence
@@ -36,11 +37,12 @@ UNDOS = 100
 
 @dataclass(frozen=True)
 class Opened:
-    """An open photograph, the name of its file, and its preview."""
+    """An open photograph, the name of its file, its preview, and parts of it at full size."""
 
     name: str
     photograph: Photograph
     preview: Preview
+    parts: Parts
 
 
 class Session:
@@ -66,6 +68,7 @@ class Session:
         self._sidecar: Sidecar | None = None
         self._kept = Recipe()  # what the sidecar holds
         self._drawing = threading.Lock()  # previews keep what was computed, one picture at a time
+        self._fitting = threading.Lock()  # and so do parts at full size
         self._pixels = pixels
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
@@ -83,7 +86,10 @@ class Session:
             photograph = read_photograph(path, bytes_per_pixel=working_bytes(100, 5))
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
-        self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels))
+        if self.opened is not None:
+            self.opened.parts.close()
+        parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), "the photograph")
+        self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels), parts)
         self.recipe = self._shown = self.saved = Recipe()
         self._past, self._future = [], []
 
@@ -198,6 +204,32 @@ class Session:
         with self._drawing:
             return self.preview.mask(self.recipe.last("detail"))
 
+    def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
+        """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
+
+        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph.
+
+        Args:
+            place: of the part.
+            recipe: the edit.
+            report: told of the progress; may raise an error to interrupt.
+
+        Raises:
+            ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
+        """
+        if self.opened is None:
+            raise ValueError("open a photograph first; there is nothing to show")
+        photograph, parts = self.opened.photograph, self.opened.parts
+        passes = Passes(
+            str(photograph.pixels.numpy().dtype),
+            "sample" if needs_tiles(recipe, photograph) else "full",
+            memory=modest_memory(),
+            report=report,
+        )
+        with self._fitting:
+            parts.fit(recipe, passes)
+            return parts.edited(place)
+
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
         path = Path(name.strip())
@@ -248,7 +280,7 @@ class Session:
         assert self.opened is not None  # for mypy
         recipe, photograph = self.recipe, self.opened.photograph
         height, width = photograph.size
-        if width * height * recipe.bytes_per_pixel > FIFTH:
+        if needs_tiles(recipe, photograph):
             pixels = self._in_tiles(recipe, photograph, target.parent, report)
         else:
             check_memory(Path(self.opened.name), width, height, recipe.bytes_per_pixel)
@@ -284,3 +316,9 @@ class Session:
     def load_preset(self, content: bytes, name: str) -> None:
         """Load the edit in the content of a file; raises ValueError if there is none."""
         self.load(Recipe.from_json(content.decode("utf-8", errors="replace"), name))
+
+
+def needs_tiles(recipe: Recipe, photograph: Photograph) -> bool:
+    """Whether an edit takes so much memory that it is done in tiles."""
+    height, width = photograph.size
+    return width * height * recipe.bytes_per_pixel > FIFTH

@@ -1,7 +1,7 @@
 """The style of the page; everything comes from here and from NiceGUI, nothing from the network."""
 
 CSS = """
-:root { --wipe: 0; }
+:root { --wipe: 0; --cut: 0; }
 body { background: #17181b; }
 .nicegui-content { padding: 0 !important; gap: 0 !important; }
 :focus-visible, .q-slider:focus-within:has(:focus-visible) {
@@ -12,15 +12,29 @@ body { background: #17181b; }
 .editor { display: flex; width: 100vw; height: calc(100dvh - 52px); }
 .viewer { flex: 1; min-width: 0; display: flex; flex-direction: column; padding: 16px 20px 8px; gap: 10px; }
 .canvas { flex: 1; min-height: 0; width: 100%; display: flex; align-items: center; justify-content: center;
-  container-type: size; }
-.photo { position: relative; box-shadow: 0 2px 24px #0009; user-select: none; touch-action: none; cursor: crosshair; }
+  container-type: size; position: relative; touch-action: none; }
+.zoomed .canvas { overflow: hidden; }
+.photo { position: relative; flex: none; height: var(--photo-height, auto);
+  transform: translate(var(--right, 0px), var(--down, 0px));
+  box-shadow: 0 2px 24px #0009; user-select: none; touch-action: none; cursor: crosshair; }
 .photo.still { cursor: default; }
 .photo > svg { z-index: 2; }
 .photo .over { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none; }
-.photo .before { clip-path: inset(0 calc(100% - var(--wipe) * 1%) 0 0); z-index: 3; }
-.photo .edge { position: absolute; top: 0; bottom: 0; width: 2px; left: calc(var(--wipe) * 1% - 1px); background: #fff;
+.photo .before { clip-path: inset(0 calc(100% - var(--cut) * 1%) 0 0); z-index: 3; }
+.photo .pieces, .photo .originals { visibility: hidden; }
+.pieced .photo .pieces, .pieced .photo .originals { visibility: visible; }
+.photo .pieces img, .photo .originals img { position: absolute; }
+.coarse .photo .pieces img, .coarse .photo .originals img { image-rendering: pixelated; }
+.zoomed.brushless .photo, .hand .photo { cursor: grab; }
+.zoom { position: absolute; right: 6px; bottom: 6px; z-index: 6; display: flex; align-items: center; gap: 2px;
+  padding: 2px 4px; border-radius: 10px; background: #101114d9; color: #dfe1e6; font-size: 12px; }
+.zoom .q-btn { min-width: 32px; min-height: 32px; padding: 0; }
+.zoom-level { min-width: 44px; text-align: center; font-variant-numeric: tabular-nums; }
+.hand .zoom .grab { background: #3b4d6b; }
+.photo .edge { position: absolute; top: 0; bottom: 0; width: 2px; left: calc(var(--cut) * 1% - 1px); background: #fff;
   opacity: min(1, var(--wipe)); pointer-events: none; z-index: 4; }
-.photo .tag { position: absolute; top: 8px; left: 10px; padding: 1px 8px; border-radius: 9px; background: #000a;
+.photo .tag { position: absolute; top: calc(var(--top, 0px) + 8px); left: calc(var(--left, 0px) + 10px);
+  padding: 1px 8px; border-radius: 9px; background: #000a;
   color: #fff; font-size: 12px; pointer-events: none; z-index: 4; opacity: min(1, var(--wipe)); }
 .stroke { fill: none; stroke-linecap: round; stroke-linejoin: round; opacity: .6; }
 @keyframes flash-0 { 70% { opacity: 1; } 100% { opacity: 0; visibility: hidden; } }
@@ -53,6 +67,7 @@ body { background: #17181b; }
   .topbar { gap: 2px; padding: 0 8px; }
   .topbar .q-btn { min-width: 40px; min-height: 40px; }
   .bar .wide { display: none; }
+  .zoom .q-btn { min-width: 38px; min-height: 38px; }
   .bar { padding-left: 12px; }
   .working { position: fixed; top: 58px; left: 10px; background: #000c; padding: 4px 10px; border-radius: 14px; }
   .panel { width: 300px; flex-wrap: nowrap; }

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nlfilter_torch.edits.pixels import corner
+
 
 @dataclass(frozen=True, eq=False)
 class Scribbles:
@@ -45,12 +47,18 @@ class Scribbles:
         return replace(self, weights=weights)
 
     def planes(self, pixels: Any) -> Tensor:
-        """The weights (B, K, h, W) of some rows."""
+        """The weights (B, K, h, w) of some pixels."""
         height, width = pixels.image.shape[-2:]
-        ends = torch.tensor([pixels.first, pixels.first + height * width]).to(self.places)
+        top, left = corner(pixels)
+        ends = torch.tensor([top, top + height]).to(self.places) * pixels.width
         first, last = torch.searchsorted(self.places, ends).tolist()
+        places, weights = self.places[first:last], self.weights[:, :, first:last]
+        columns = places % pixels.width - left
+        if width < pixels.width:
+            inside = (columns >= 0) & (columns < width)
+            places, weights, columns = places[inside], weights[:, :, inside], columns[inside]
         planes = self.weights.new_zeros(*self.weights.shape[:2], height * width)
-        planes[:, :, self.places[first:last] - pixels.first] = self.weights[:, :, first:last]
+        planes[:, :, (places // pixels.width - top) * width + columns] = weights
         return planes.unflatten(2, (height, width))
 
 

@@ -60,25 +60,25 @@ class LocalValues:
         return LocalValues(solved, guide, step, width)
 
     def __call__(self, own: Tensor, first: int) -> tuple[Tensor, Tensor]:
-        """Values times influence (B, C, h, W), and influence (B, 1, h, W) in [0, 1], of some rows.
+        """Values times influence (B, C, h, w), and influence (B, 1, h, w) in [0, 1], of some pixels.
 
         The influence is the square root of how far the scribbles determine a pixel.
 
         Args:
-            own: luminance of the rows, (B, 1, h, W).
-            first: number of their first pixel.
+            own: their luminance, (B, 1, h, w).
+            first: number of the first one.
         """
-        found = self._at(own, first // self.width)
+        found = self._at(own, *divmod(first, self.width))
         influence = found[:, -1:].clamp(min=1e-6).sqrt()
         return found[:, :-1] / influence, influence
 
-    def _at(self, own: Tensor, start: int) -> Tensor:
-        """The solutions (B, C+1, h, W) at some rows."""
+    def _at(self, own: Tensor, top: int, left: int) -> Tensor:
+        """The solutions (B, C+1, h, w) at a rectangle."""
         height, width = own.shape[2:]
         if self.step == 1:
-            return self.values[:, :, start : start + height]
-        rows = self._between(start, height, self.guide.shape[2], own)
-        columns = self._between(0, width, self.guide.shape[3], own)
+            return self.values[:, :, top : top + height, left : left + width]
+        rows = self._between(top, height, self.guide.shape[2], own)
+        columns = self._between(left, width, self.guide.shape[3], own)
         total, weight = torch.zeros(()), torch.zeros(())
         for row, row_share in rows:
             for column, column_share in columns:

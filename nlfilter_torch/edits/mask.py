@@ -21,6 +21,7 @@ from nlfilter_torch.edits.colour import LIGHTNESS, colour_guide, nearby
 from nlfilter_torch.edits.components import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
+from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import enlarged
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
 from nlfilter_torch.filtering.scribbles import fit_strokes
@@ -151,12 +152,12 @@ class Regions:
         return torch.stack([marked.weights[:, 1].amax(1) for marked in self.scribbles], dim=1)
 
     def rows(self, planes: Tensor, pixels: Any) -> Tensor:
-        """The part (B, C, h, W) that some rows have of planes of the reduced picture."""
+        """The part (B, C, h, w) that some pixels have of planes of the reduced picture."""
         height, width = pixels.image.shape[-2:]
-        return enlarged(planes, self.step, pixels.first // width, (height, width))
+        return enlarged(planes, self.step, corner(pixels), (height, width))
 
     def masks(self, pixels: Any) -> Tensor:
-        """The masks (B, K, h, W) of some rows."""
+        """The masks (B, K, h, w) of some pixels."""
         image, found = pixels.image - 0.5, []
         for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = linear_mask(image, self.rows(functions, pixels)).clamp(0.0, 1.0)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Pixels(Protocol):
-    """Some pixels of a picture: all of them, or some of its rows."""
+    """Some pixels of a picture: all of them, some of its rows, or a rectangle."""
 
     @property
     def image(self) -> Tensor:
@@ -17,6 +17,15 @@ class Pixels(Protocol):
     @property
     def first(self) -> int:
         """Number of the first one, along the rows of the picture."""
+
+    @property
+    def width(self) -> int:
+        """W of the picture."""
+
+
+def corner(pixels: Pixels) -> tuple[int, int]:
+    """Row and column of the first one."""
+    return divmod(pixels.first, pixels.width)
 
 
 Planes = Callable[[Any], Tensor]  # of some pixels, (B, C, h, W)
@@ -31,7 +40,7 @@ class Fitted:
         finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
         margin: how many.
         step: what ``finish`` does depends on the number of a row modulo so many, counted from the first it is given;
-            tiles begin at multiples of it, and so does ``margin``.
+            tiles begin at multiples of it, and so does ``margin``. Likewise for columns.
     """
 
     pixels: Planes

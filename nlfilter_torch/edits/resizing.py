@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -11,7 +12,13 @@ Read = Callable[[int, int], Tensor]  # the rows (B, C, n, W) of a picture from o
 BLOCK = 64  # rows that are resized at once
 
 
-def resized(read: Read, size: tuple[int, int], wanted: tuple[int, int], rows: range | None = None) -> Tensor:
+def resized(
+    read: Read,
+    size: tuple[int, int],
+    wanted: tuple[int, int],
+    rows: range | None = None,
+    columns: range | None = None,
+) -> Tensor:
     """Some rows of a picture in another size, by bicubic interpolation with antialiasing.
 
     Args:
@@ -19,22 +26,38 @@ def resized(read: Read, size: tuple[int, int], wanted: tuple[int, int], rows: ra
         size: (H, W) of the picture.
         wanted: (H, W) it is to have.
         rows: of the result, all by default.
+        columns: likewise.
     """
     rows = range(wanted[0]) if rows is None else rows
-    scale = size[0] / wanted[0]
-    reach = 2 * max(scale, 1.0)  # of the kernel, in rows that are read
+    across = None if columns is None else interpolation(columns, size[1], wanted[1])
     parts = []
     for start in range(rows.start, rows.stop, BLOCK):
-        stop = min(start + BLOCK, rows.stop)
-        first = max(0, math.floor((start + 0.5) * scale - reach))
-        last = min(size[0], math.ceil((stop - 0.5) * scale + reach))
-        planes = read(first, last)
-        planes = F.interpolate(planes, (planes.shape[2], wanted[1]), mode="bicubic", antialias=True)
-        centres = (torch.arange(start, stop, dtype=torch.float64) + 0.5) * scale - 0.5
-        weights = cubic((torch.arange(first, last) - centres[:, None]) / max(scale, 1.0))
-        weights = (weights / weights.sum(1, keepdim=True)).to(planes)
-        parts.append(torch.einsum("rn,bcnw->bcrw", weights, planes))
+        used, weights = interpolation(range(start, min(start + BLOCK, rows.stop)), size[0], wanted[0])
+        planes = read(used.start, used.stop)
+        if across is None:
+            planes = F.interpolate(planes, (planes.shape[2], wanted[1]), mode="bicubic", antialias=True)
+        else:
+            planes = planes[..., across[0]] @ across[1].to(planes).mT
+        parts.append(torch.einsum("rn,bcnw->bcrw", weights.to(planes), planes))
     return torch.cat(parts, dim=2)
+
+
+@lru_cache(maxsize=8)  # strips of one picture have the same columns
+def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tensor]:
+    """The part of an axis that some places of its other size depend on, and their weights (places, part) in float64.
+
+    Args:
+        places: on the axis in its other size.
+        length: of the axis.
+        wanted: its other size.
+    """
+    scale = length / wanted
+    reach = 2 * max(scale, 1.0)  # of the kernel
+    first = max(0, math.floor((places.start + 0.5) * scale - reach))
+    last = min(length, math.ceil((places.stop - 0.5) * scale + reach))
+    centres = (torch.arange(places.start, places.stop, dtype=torch.float64) + 0.5) * scale - 0.5
+    weights = cubic((torch.arange(first, last) - centres[:, None]) / max(scale, 1.0))
+    return slice(first, last), weights / weights.sum(1, keepdim=True)
 
 
 def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:
@@ -49,17 +72,18 @@ def cubic(distance: Tensor) -> Tensor:
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
 
 
-def enlarged(blocks: Tensor, step: int, first: int, size: tuple[int, int]) -> Tensor:
-    """Rows (B, C, h, W) of a picture from values (B, C, n, m) of its blocks, between whose middles they are linear.
+def enlarged(blocks: Tensor, step: int, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
+    """A part (B, C, h, w) of a picture from values (B, C, n, m) of its blocks, between whose middles they are linear.
 
     Args:
         blocks: as of :func:`nlfilter_torch.edits.source.block_means`.
         step: rows and columns of a block.
-        first: number of the first row.
-        size: (h, W).
+        corner: row and column of its first pixel.
+        size: (h, w).
     """
-    low, high = max(0, first // step - 1), (first + size[0] - 1) // step + 2
-    rows = blocks[:, :, low:high]
+    low, left = (max(0, first // step - 1) for first in corner)
+    high, right = ((first + count - 1) // step + 2 for first, count in zip(corner, size, strict=True))
+    part = blocks[:, :, low:high, left:right]
     if step > 1:
-        rows = F.interpolate(rows, scale_factor=step, mode="bilinear", align_corners=False)
-    return rows[:, :, first - low * step :, :][:, :, : size[0], : size[1]]
+        part = F.interpolate(part, scale_factor=step, mode="bilinear", align_corners=False)
+    return part[:, :, corner[0] - low * step :, corner[1] - left * step :][:, :, : size[0], : size[1]]

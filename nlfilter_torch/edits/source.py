@@ -189,7 +189,7 @@ class InMemory:
     def __init__(self, image: Tensor, kept: dict[Any, Any] | None = None) -> None:
         self.image, self.kept, self.dtype = image, kept, image.dtype
         self.batch, self.channels, *size = image.shape
-        self.size = (size[0], size[1])
+        self.size, self.width = (size[0], size[1]), size[1]
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """:func:`nonlocal_operator` of the guide."""

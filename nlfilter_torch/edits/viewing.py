@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.colour import Balance, Limits, balance_of, change_luminance, limited_change, move_luminance
-from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes
+from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes, corner
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.operator.features import pad_border
 
@@ -105,12 +105,14 @@ def fit_change(
         after, saturation = limited_change(image, after, balance)
     parts = [before, after, slope(before, after), *([] if saturation is None else [saturation])]
     coarse = torch.cat(parts, dim=1)
-    width, count = source.size[1], before.shape[1]
+    count = before.shape[1]
 
     def edit(pixels: Pixels) -> Tensor:
-        first = pixels.first // width
-        rows = range(first, first + pixels.image.shape[2])
-        found = resized(lambda start, stop: coarse[:, :, start:stop], small, source.size, rows)
+        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+        columns = None if width == pixels.width else range(left, left + width)
+        found = resized(
+            lambda start, stop: coarse[:, :, start:stop], small, source.size, range(top, top + height), columns
+        )
         blurred, changed, steepness = found[:, : 3 * count].chunk(3, dim=1)
         moved = changed + steepness * (planes(pixels) - blurred)
         if limits == "none":

@@ -43,18 +43,22 @@ class TilePixels:
         image: their colours, (1, C, h, W).
         features: of these pixels, (1, D, h W), for the guide of an operator.
         first: number of the first pixel, along the rows of the picture.
+        width: W of the picture.
     """
 
     image: Tensor
     features: "Callable[[TiledOperator], Tensor]"
-    first: int = 0
+    first: int
+    width: int
     _columns: dict[int, Columns] = field(default_factory=dict)
     _layers: tuple[Planes, Tensor] | None = None
 
     def columns(self, operator: "TiledOperator") -> Columns:
         """Their columns, worked out once for each operator."""
         if id(operator) not in self._columns:
-            known = operator.kept.find(slice(self.first, self.first + self.image[0, 0].numel()))
+            known = None
+            if self.image.shape[3] == self.width:
+                known = operator.kept.find(slice(self.first, self.first + self.image[0, 0].numel()))
             self._columns[id(operator)] = (
                 operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
             )

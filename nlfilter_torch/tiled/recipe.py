@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,5 +97,9 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
 def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """The rows that a step makes of a picture."""
     tiled = Tiled(Picture(source, name), passes)
-    scribbles = scribbles_of(step, tiled.size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)
-    yield from tiled.rows(fit_step(step, tiled, *scribbles))
+    yield from tiled.rows(fit_step(step, tiled, *by_rows(step, tiled.size)))
+
+
+def by_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The strokes of a step as :func:`scribbles_of` has them, in rows."""
+    return scribbles_of(step, size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)

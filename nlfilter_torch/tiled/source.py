@@ -11,6 +11,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
+from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
@@ -188,11 +189,11 @@ class Tiled:
         """With its planes in memory, if they take a small part of it; else they are worked out as often as needed."""
         if self.picture.pixels * self.channels * self.dtype.itemsize > HELD * self.passes.memory:
             return fitted
-        planes, width = self.all(fitted), self.size[1]
+        planes = self.all(fitted)
 
         def part(pixels: Pixels) -> Tensor:
-            first = pixels.first // width
-            return planes[:, :, first : first + pixels.image.shape[2]]
+            (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+            return planes[:, :, top : top + height, left : left + width]
 
         return Fitted(part)
 
@@ -245,7 +246,8 @@ class Tiled:
 
     def pixels_of(self, tile: Tile) -> TilePixels:
         """All pixels of a tile of the picture."""
-        return TilePixels(tile.inner, lambda operator: operator.features(tile), tile.start * self.size[1])
+        width = self.size[1]
+        return TilePixels(tile.inner, lambda operator: operator.features(tile), tile.start * width, width)
 
     def parts_of(self, tile: Tile) -> Iterator[TilePixels]:
         """The pixels of a tile, a few rows at a time, and the same rows together in tiles of any height.
@@ -262,7 +264,7 @@ class Tiled:
 
         for part, image in enumerate(tile.inner.split(step, dim=2)):
             first = (tile.start + part * step) * width
-            yield TilePixels(image, lambda operator, part=part: part_of(operator, part), first)  # type: ignore[misc]
+            yield TilePixels(image, lambda operator, part=part: part_of(operator, part), first, width)  # type: ignore[misc]
 
     @full_precision
     def edited(self, fitted: Fitted, tile: Tile) -> Tensor:

@@ -1,0 +1,242 @@
+"""Any rectangle of a picture under an edit that was fitted to the whole of it.
+
+What an edit learns from the whole picture is that of :mod:`nlfilter_torch.tiled.recipe`; then the columns of the
+rectangle's own pixels are enough. An editor shows a part of a large photograph at full size this way.
+"""
+
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.applying import fit_step
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.source import Fitted
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.tiled.intermediate import intermediate
+from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
+from nlfilter_torch.tiled.recipe import by_rows
+from nlfilter_torch.tiled.sampling import KeptColumns
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.sources import GuidePicture, Picture, RowSource
+from nlfilter_torch.tiled.tiles import Passes, Statistics
+from nlfilter_torch.tiled.workers import in_order
+
+STRIP = 1 << 15  # pixels of a rectangle that are worked out at once
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Some rows and columns of a picture."""
+
+    rows: range
+    columns: range
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        return len(self.rows), len(self.columns)
+
+    def grown(self, margin: int, size: tuple[int, int]) -> "Rectangle":
+        """With a margin, as far as a picture (H, W) has it."""
+        return Rectangle(_grown(self.rows, margin, size[0]), _grown(self.columns, margin, size[1]))
+
+    def aligned(self, step: int, size: tuple[int, int]) -> "Rectangle":
+        """Grown so that it begins and ends at multiples of a step, or at the border of a picture (H, W)."""
+        rows, columns = (
+            range(axis.start // step * step, min(-(-axis.stop // step) * step, length))
+            for axis, length in zip((self.rows, self.columns), size, strict=True)
+        )
+        return Rectangle(rows, columns)
+
+    def meets(self, other: "Rectangle") -> bool:
+        """Whether they have a pixel in common."""
+        pairs = ((self.rows, other.rows), (self.columns, other.columns))
+        return all(a.start < b.stop and b.start < a.stop for a, b in pairs)
+
+    def inside(self, other: "Rectangle") -> tuple[slice, slice]:
+        """Where it lies in another one that contains it."""
+        down, right = self.rows.start - other.rows.start, self.columns.start - other.columns.start
+        return slice(down, down + len(self.rows)), slice(right, right + len(self.columns))
+
+
+def _grown(places: range, margin: int, length: int) -> range:
+    return range(max(0, places.start - margin), min(length, places.stop + margin))
+
+
+@dataclass(frozen=True)
+class SomeColumns:
+    """Rows of which only some columns are there."""
+
+    whole: RowSource
+    columns: range
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, w) or (H, w, S)."""
+        return (self.whole.shape[0], len(self.columns), *self.whole.shape[2:])
+
+    @property
+    def dtype(self) -> Any:
+        """That of the whole."""
+        return self.whole.dtype
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        return np.asarray(self.whole[rows])[:, self.columns.start : self.columns.stop]
+
+
+def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
+    """The pixels of a rectangle."""
+    margin = max((margin_of(operator) for operator in tiled.operators), default=0)
+    around = part.grown(margin, tiled.size)
+    picture = Picture(SomeColumns(tiled.picture.source, around.columns), tiled.picture.name)
+    tile = picture.tile(part.rows.start, part.rows.stop, margin)
+    columns = part.inside(around)[1]
+
+    def features(operator: TiledOperator) -> Tensor:
+        recipe = operator.kernel.recipe
+        seen = GuidePicture(picture, operator.guide.guide).seen(tile, recipe.patch_weights.shape[0] // 2)
+        found = recipe(seen.pixels, origin=(seen.origin[0], around.columns.start), halo=seen.halo)
+        return found.unflatten(2, (len(part.rows), -1))[..., columns].flatten(2)
+
+    first = part.rows.start * tiled.size[1] + part.columns.start
+    return TilePixels(tile.inner[..., columns], features, first, tiled.size[1])
+
+
+def margin_of(operator: TiledOperator) -> int:
+    """How many pixels around a pixel its column depends on, where no guide is stored."""
+    return operator.kernel.recipe.patch_weights.shape[0] // 2 + operator.guide.guide.margin
+
+
+@torch.no_grad()
+@full_precision
+def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
+    """A rectangle (1, C, h, w) of a picture under an edit that was fitted to it."""
+    around = part if fitted.finish is None else part.aligned(fitted.step, tiled.size).grown(fitted.margin, tiled.size)
+    step = max(1, STRIP // len(around.columns))
+    rows = around.rows
+    strips = [
+        Rectangle(range(start, min(start + step, rows.stop)), around.columns)
+        for start in range(rows.start, rows.stop, step)
+    ]
+    landmarks = max((operator.kernel.landmarks.shape[2] for operator in tiled.operators), default=1)
+    for operator in tiled.operators:
+        operator.settle()  # before several strips at once need it
+
+    def planes_of(strip: Rectangle) -> Tensor:
+        return fitted.pixels(pixels_of_part(tiled, strip))
+
+    planes = torch.cat(list(in_order(planes_of, strips, tiled.passes.workers(landmarks))), dim=2)
+    if fitted.finish is None:
+        return planes
+    found = fitted.finish(pixels_of_part(tiled, around).image, planes)
+    return found[..., *part.inside(around)]
+
+
+class Stage:
+    """A picture between two steps of an edit, and the step after it as it was fitted last.
+
+    Args:
+        picture: rows.
+        stack: what is closed with it.
+    """
+
+    def __init__(self, picture: Picture, stack: ExitStack) -> None:
+        self.picture, self._stack = picture, stack
+        self._fitted: tuple[Step, Tiled, Fitted] | None = None
+
+    def fit(self, step: Step, passes: Passes) -> tuple[Tiled, Fitted]:
+        """A step fitted to the picture."""
+        if self._fitted is None or self._fitted[0] != step:
+            self._fitted = None
+            tiled = Tiled(self.picture, passes)
+            fitted = fit_step(step, tiled, *by_rows(step, tiled.size))
+            for operator in tiled.operators:
+                operator.settle()
+            self._fitted = step, tiled, fitted
+        return self._fitted[1:]
+
+    def after(self, step: Step, passes: Passes) -> "Stage":
+        """The picture after a step, in a temporary file."""
+        tiled, fitted = self.fit(step, replace(passes, kind="float32"))
+        stack = ExitStack()
+        clipped = ((rows, values.clip(0, 1)) for rows, values in tiled.rows(fitted))
+        source = stack.enter_context(intermediate(clipped, tiled.size, passes.folder))
+        self.forget_columns()
+        return Stage(Picture(source, self.picture.name), stack)
+
+    def forget_columns(self) -> None:
+        """Free what passes over the whole picture kept for further ones."""
+        for operator in [] if self._fitted is None else self._fitted[1].operators:
+            operator.kept = KeptColumns(1, 0)
+
+    def close(self) -> None:
+        """Remove the file."""
+        self._stack.close()
+
+
+class Parts:
+    """Rectangles of a picture under an edit, and what was learnt from the whole picture for them.
+
+    Args:
+        source: rows.
+        name: of the source, for error messages.
+    """
+
+    def __init__(self, source: RowSource, name: str) -> None:
+        self._stages = [Stage(Picture(source, name), ExitStack())]
+        self._known: tuple[Statistics, tuple[Step, ...]] = ("sample", ())  # how, and the steps between the stages
+        self._last: tuple[Tiled, Fitted] | None = None
+
+    def fit(self, recipe: Recipe, passes: Passes) -> None:
+        """Learn what an edit needs from the whole picture, as far as that has not been done; this may take long.
+
+        What is known after an error, also one that the progress report raises, is as good as before.
+
+        Args:
+            recipe: the edit.
+            passes: how the picture is read.
+
+        Raises:
+            ValueError, MemoryError, OSError: as of :func:`~nlfilter_torch.tiled.recipe.edit_rows`.
+        """
+        steps, (statistics, known) = recipe.acting, self._known
+        self._last = None
+        same = 0
+        while statistics == passes.statistics and steps[same : same + 1] == known[same : same + 1] != ():
+            same += 1
+        self._known = passes.statistics, known[:same]
+        if statistics != passes.statistics:
+            self._stages[0] = Stage(self._stages[0].picture, ExitStack())
+        while len(self._stages) > same + 1:
+            self._stages.pop().close()
+        for step in steps[same:-1]:
+            self._stages.append(self._stages[-1].after(step, passes))
+            self._known = passes.statistics, (*self._known[1], step)
+        if steps:
+            last = self._stages[len(steps) - 1]
+            self._last = last.fit(steps[-1], passes)
+            last.forget_columns()
+
+    def edited(self, part: Rectangle) -> Tensor:
+        """A rectangle (1, C, h, w) of the picture under the edit that was fitted last, in [0, 1]."""
+        if self._last is None:
+            return self.original(part)
+        return edited_part(*self._last, part).clamp(0, 1)
+
+    def original(self, part: Rectangle) -> Tensor:
+        """A rectangle (1, C, h, w) of the picture, in [0, 1]."""
+        picture = self._stages[0].picture
+        columns = Picture(SomeColumns(picture.source, part.columns), picture.name)
+        return columns.tile(part.rows.start, part.rows.stop, 0).inner.clamp(0, 1)
+
+    def close(self) -> None:
+        """Remove temporary files."""
+        while self._stages:
+            self._stages.pop().close()

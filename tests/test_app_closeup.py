@@ -1,0 +1,175 @@
+"""What the editor shows at full size: it is what is saved, and only what is missing is worked out."""
+
+import asyncio
+import io
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nlfilter_torch.app import closeup
+from nlfilter_torch.app.closeup import CELL, Closeup
+from nlfilter_torch.app.session import Session
+from nlfilter_torch.core.progress import Progress
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.tiled.parts import Rectangle
+from tests.problems import cat
+
+PLACE = Rectangle(range(21, 83), range(33, 120))
+IN, OUT = Stroke(((0.2, 0.2), (0.3, 0.2)), 0.04, "in"), Stroke(((0.8, 0.8),), 0.04, "out")
+BLUE = Stroke(((0.37, 0.35), (0.4, 0.37)), 0.04, "#2040e0")
+REGION = Step("detail", (IN, OUT), alpha=(0.2, 1.0, 1.0), inside=(3.0, 4.0, 1.0), reach=0.5)
+RECIPES = {
+    "nothing": Recipe(),
+    "detail": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0)),)),
+    "detail, reduced": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), viewing_size=0.006),)),
+    "region": Recipe((REGION,)),
+    "region, reduced": Recipe((REGION.changed(viewing_size=0.006),)),
+    "recolor": Recipe((Step("recolor", (BLUE,)),)),
+    "defocus": Recipe((Step("defocus", (IN,)),)),
+    "abstract": Recipe((Step("abstract", edges=0.5),)),
+    "several": Recipe((Step("denoise", noise_level=6.0, method="rule"), REGION, Step("tone", contrast=1.2))),
+}
+
+
+@pytest.mark.parametrize("tiles", [False, True])
+@pytest.mark.parametrize("name", RECIPES)
+def test_what_is_shown_at_full_size_is_what_is_saved(
+    name: str, tiles: bool, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To one grey level, whether the photograph is saved in memory or, as large ones are, in tiles."""
+    if tiles:
+        monkeypatch.setattr("nlfilter_torch.app.session.FIFTH", 0)
+    session.load(RECIPES[name])
+    saved = read_photograph(session.save("out.png")).pixels
+    shown = session.part(PLACE, session.recipe)
+    wanted = saved[..., PLACE.rows.start : PLACE.rows.stop, PLACE.columns.start : PLACE.columns.stop]
+    levels = (255 * shown).round()
+    assert (levels - (255 * wanted).round()).abs().max() <= 1
+    assert name == "nothing" or (saved - cat()).abs().max() > 5 / 255
+
+
+class Page:
+    """Stands for the page: it keeps what it is told, and work is done when :meth:`finish` is called."""
+
+    def __init__(self, session: Session) -> None:
+        self.told: list[str] = []
+        self.works: list[Awaitable[None]] = []
+        self.parts: list[Rectangle] = []
+        self.before_work: Callable[[], None] = lambda: None
+        self.closeup = Closeup(self.run, self.works.append, self.told.append)
+        self.closeup.open(session)
+
+    async def run(self, doing: str, work: Callable[[], Any], progress: Progress) -> Any:
+        self.before_work()
+        return work()
+
+    def finish(self) -> None:
+        async def all_of_it() -> None:
+            while self.works:
+                await self.works.pop()
+
+        asyncio.run(all_of_it())
+
+    def look(self, *view: int) -> list[str]:
+        """What the page is told if it shows a part."""
+        self.told.clear()
+        self.closeup.look(view or None)
+        self.finish()
+        return list(self.told)
+
+
+@pytest.fixture
+def large(tmp_path: Path) -> Session:
+    """A session with a photograph of 450x300 pixels."""
+    write_photograph(Photograph(cat(1)), tmp_path / "large.png")
+    session = Session(tmp_path)
+    session.open(tmp_path / "large.png")
+    return session
+
+
+@pytest.fixture
+def page(large: Session, monkeypatch: pytest.MonkeyPatch) -> Page:
+    """Of the editor that shows it; ``parts`` are those that were worked out."""
+    page, part = Page(large), large.part
+
+    def counted(place: Rectangle, *arguments: Any) -> torch.Tensor:
+        page.parts.append(place)
+        return part(place, *arguments)
+
+    monkeypatch.setattr(large, "part", counted)
+    return page
+
+
+def pixels(content: bytes | None) -> torch.Tensor:
+    assert content is not None
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(content)))).permute(2, 0, 1)[None] / 255
+
+
+def test_pieces_cover_what_is_seen_and_a_pan_adds_what_is_new(page: Page, large: Session) -> None:
+    assert page.look(10, 20, 130, 100) == ["closeup.add('piece-1', 0, 0, 192, 128)"]
+    assert page.look(40, 20, 180, 128) == []  # there already
+    assert page.look(100, 20, 230, 100) == ["closeup.add('piece-2', 192, 0, 256, 128)"]
+    assert page.look(100, 200, 250, 300) == ["closeup.add('piece-3', 64, 192, 256, 300)"]  # to the border
+    assert len(page.parts) == 3
+    assert torch.equal(pixels(page.closeup.file("piece-2")), cat(1)[..., :128, 192:256])
+    assert page.look() == []
+    assert page.closeup.file("piece-9") is None
+
+
+def test_pieces_are_not_too_large_and_those_out_of_sight_are_dropped(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closeup, "PIECE", 6 * CELL**2)
+    monkeypatch.setattr(closeup, "KEPT", 30_000)
+    told = page.look(0, 0, 192, 192)
+    assert told == ["closeup.add('piece-1', 0, 0, 192, 128)", "closeup.add('piece-2', 0, 128, 192, 192)"]
+    told = page.look(256, 0, 384, 128)
+    assert told == ["closeup.add('piece-3', 256, 0, 384, 128)", "closeup.drop('piece-1')"]
+    assert page.closeup.file("piece-1") is None
+    assert page.look(0, 0, 64, 64) == ["closeup.add('piece-4', 0, 0, 64, 64)", "closeup.drop('piece-2')"]
+
+
+def test_an_edit_that_changes_takes_its_pieces_with_it(page: Page, large: Session) -> None:
+    page.look(0, 0, 100, 100)
+    large.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))
+    page.told.clear()
+    page.closeup.hold()  # the slider moves
+    assert page.told == ["closeup.clear()"]
+    assert page.look(0, 0, 110, 100) == []
+    large.commit()
+    page.closeup.follow()
+    page.finish()
+    assert page.told == ["closeup.add('piece-2', 0, 0, 128, 128)"]
+    found = pixels(page.closeup.file("piece-2"))
+    wanted = large.recipe.apply(cat(1)).clamp(0, 1)[..., :128, :128]
+    assert (found - wanted).abs().max() <= 1 / 255
+    page.told.clear()
+    page.closeup.follow()  # nothing has changed
+    page.finish()
+    assert page.told == []
+
+
+def test_what_is_worked_out_for_an_edit_that_has_changed_is_not_shown(page: Page, large: Session) -> None:
+    """The fit is interrupted, and that of the new edit takes its place."""
+    large.load(Recipe((Step("detail", alpha=(3.0, 1.0)),)))
+    meanwhile = iter([lambda: large.load(Recipe((Step("detail", alpha=(0.0, 1.0)),)))])
+    page.before_work = lambda: next(meanwhile, lambda: None)()
+    assert page.look(0, 0, 64, 64) == ["closeup.add('piece-1', 0, 0, 64, 64)"]
+    assert len(page.parts) == 2
+    wanted = large.recipe.apply(cat(1)).clamp(0, 1)[..., :64, :64]
+    assert (pixels(page.closeup.file("piece-1")) - wanted).abs().max() <= 1 / 255
+
+
+def test_the_original_at_full_size(page: Page) -> None:
+    assert torch.equal(pixels(page.closeup.original("30,10,90,50")), cat(1)[..., 10:50, 30:90])
+    assert torch.equal(pixels(page.closeup.original("400,250,999,999")), cat(1)[..., 250:, 400:])
+    for place in ("", "1,2,3", "1,2,x,4", "90,10,30,50", "-9,-9,0,0", "1,2,3,4,5"):
+        assert page.closeup.original(place) is None

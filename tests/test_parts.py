@@ -1,0 +1,139 @@
+"""A rectangle of a picture under an edit is that part of the whole picture under it."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from nlfilter_torch.edits.applying import fit_step
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.tiled import recipe as whole_edit
+from nlfilter_torch.tiled.parts import Parts, Rectangle
+from nlfilter_torch.tiled.tiles import Passes
+from tests.problems import cat
+from tests.test_whole_edit import COLORIZE, DETAIL, IN, RECOLOR, rows_of
+
+SMALL = 0.006  # megapixels, fewer than the cat has
+PLACES = [
+    Rectangle(range(100), range(150)),
+    Rectangle(range(13, 60), range(31, 97)),
+    Rectangle(range(20), range(120, 150)),
+    Rectangle(range(71, 100), range(1)),
+]
+EDITS = {
+    "nothing": Recipe(),
+    "detail": Recipe((Step("detail", alpha=(3.0, 1.0), landmarks=60),)),
+    "detail, reduced": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), landmarks=60, viewing_size=SMALL),)),
+    "detail of a region": Recipe((DETAIL,)),
+    "detail of a region, reduced": Recipe((DETAIL.changed(viewing_size=SMALL),)),
+    "all channels": Recipe((DETAIL.changed(channels="all", residual=0.5),)),
+    "colorize": Recipe((COLORIZE,)),
+    "recolor": Recipe((RECOLOR,)),
+    "denoise": Recipe((Step("denoise", noise_level=8.0),)),
+    "denoise by rule": Recipe((Step("denoise", noise_level=8.0, method="rule", landmarks=60),)),
+    "sharpen": Recipe((Step("sharpen", landmarks=60),)),
+    "sharpen, reduced": Recipe((Step("sharpen", landmarks=60, viewing_size=SMALL),)),
+    "tone": Recipe((Step("tone", contrast=1.3, clarity=1.5, landmarks=60),)),
+    "abstract": Recipe((Step("abstract", landmarks=60, edges=0.7, tones=6),)),
+    "defocus": Recipe((Step("defocus", (IN,), landmarks=60, radius=3.0),)),
+    "look": Recipe((Step("look", alpha=(2.0, 1.0, 1.0), bands=(1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0), landmarks=60),)),
+    "several": Recipe((Step("denoise", noise_level=8.0, method="rule", landmarks=60), DETAIL, RECOLOR)),
+}
+
+
+def whole(recipe: Recipe, source: NDArray[Any], passes: Passes) -> torch.Tensor:
+    rows = [rows for _, rows in whole_edit.edit_rows(passes, source, recipe, "scan.tif")]
+    return torch.from_numpy(np.concatenate(rows)).permute(2, 0, 1)[None].clamp(0, 1)
+
+
+@pytest.mark.parametrize("name", EDITS)
+@pytest.mark.parametrize("options", [{"statistics": "full"}, {"sample": 4096}])
+def test_a_part_is_that_of_the_whole(
+    name: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "sample" in options:  # and in blocks, as if it were large
+        monkeypatch.setattr("nlfilter_torch.edits.mask.SOLVED", 2000)
+        monkeypatch.setattr("nlfilter_torch.edits.local_values.SOLVED", 2000)
+        monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP", 1000)
+    source, passes = rows_of(cat()), Passes("float32", folder=tmp_path, **options)
+    wanted = whole(EDITS[name], source, passes)
+    parts = Parts(source, "scan.tif")
+    parts.fit(EDITS[name], passes)
+    for place in PLACES:
+        part = wanted[..., place.rows.start : place.rows.stop, place.columns.start : place.columns.stop]
+        torch.testing.assert_close(parts.edited(place), part, atol=2e-4, rtol=0)  # 0.05 grey levels
+    parts.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[str] = []
+
+    def counted(step: Step, *arguments: Any) -> Any:
+        fitted.append(step.edit)
+        return fit_step(step, *arguments)
+
+    monkeypatch.setattr("nlfilter_torch.tiled.parts.fit_step", counted)
+    source, passes, place = rows_of(cat()), Passes("float32", "full"), PLACES[1]
+    parts = Parts(source, "scan.tif")
+    detail, tone, recolor = Step("detail", alpha=(2.0, 1.0), landmarks=40), Step("tone", landmarks=40), RECOLOR
+    for steps, wanted in (
+        ((detail, tone), ["detail", "tone"]),
+        ((detail, tone), []),
+        ((detail, tone.changed(contrast=1.4)), ["tone"]),
+        ((detail, tone.changed(contrast=1.4), recolor), ["recolor"]),
+        ((detail,), []),
+        ((detail.changed(alpha=(3.0, 1.0)), tone), ["detail", "tone"]),
+        ((), []),
+        ((recolor,), ["recolor"]),
+    ):
+        fitted.clear()
+        parts.fit(Recipe(steps), passes)
+        assert fitted == wanted
+        found = parts.edited(place)
+        fresh = Parts(source, "scan.tif")
+        fresh.fit(Recipe(steps), passes)
+        assert torch.equal(found, fresh.edited(place))
+    fitted.clear()
+    parts.fit(Recipe((recolor,)), replace(passes, statistics="sample"))  # a sample gives others
+    assert fitted == ["recolor"]
+
+
+@pytest.mark.parametrize("after", [1, 4, 8])
+def test_a_fit_that_is_interrupted_leaves_what_was_known(after: int) -> None:
+    """The report of the progress raises; the next fit is as good as the first."""
+    source, recipe, place = rows_of(cat()), Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=40), RECOLOR)), PLACES[1]
+    calls = 0
+
+    def interrupt(stage: str, done: int, rows: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == after:
+            raise InterruptedError
+
+    parts, fresh = Parts(source, "scan.tif"), Parts(source, "scan.tif")
+    passes = Passes("float32", "full")
+    parts.fit(Recipe((RECOLOR,)), passes)
+    with pytest.raises(InterruptedError):
+        parts.fit(recipe, replace(passes, report=interrupt))
+    parts.fit(recipe, passes)
+    fresh.fit(recipe, passes)
+    assert torch.equal(parts.edited(place), fresh.edited(place))
+
+
+def test_a_part_of_a_picture_of_many_tiles_of_the_network() -> None:
+    """They stand at the same places as in the whole picture."""
+    image = torch.cat([cat(1), cat(1).flip(3)], dim=3)  # 900 pixels wide
+    source, passes = rows_of(image), Passes("float32")
+    recipe = Recipe((Step("denoise", noise_level=8.0),))
+    wanted = whole(recipe, source, passes)
+    parts = Parts(source, "scan.tif")
+    parts.fit(recipe, passes)
+    for place in (Rectangle(range(150, 190), range(400, 470)), Rectangle(range(290, 300), range(870, 900))):
+        part = wanted[..., place.rows.start : place.rows.stop, place.columns.start : place.columns.stop]
+        torch.testing.assert_close(parts.edited(place), part, atol=2e-4, rtol=0)
