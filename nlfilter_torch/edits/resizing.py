@@ -1,7 +1,8 @@
 """Pictures in another size, a few rows at a time."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -20,21 +21,30 @@ def resized(read: Read, size: tuple[int, int], wanted: tuple[int, int], rows: ra
         wanted: (H, W) it is to have.
         rows: of the result, all by default.
     """
+    return torch.cat([part() for part in resized_parts(read, size, wanted, rows)], dim=2)
+
+
+def resized_parts(
+    read: Read, size: tuple[int, int], wanted: tuple[int, int], rows: range | None = None
+) -> Iterator[Callable[[], Tensor]]:
+    """The rows of :func:`resized`, a few at a time: they are read here, and resized when the part is called."""
     rows = range(wanted[0]) if rows is None else rows
     scale = size[0] / wanted[0]
     reach = 2 * max(scale, 1.0)  # of the kernel, in rows that are read
-    parts = []
     for start in range(rows.start, rows.stop, BLOCK):
         stop = min(start + BLOCK, rows.stop)
         first = max(0, math.floor((start + 0.5) * scale - reach))
         last = min(size[0], math.ceil((stop - 0.5) * scale + reach))
-        planes = read(first, last)
-        planes = F.interpolate(planes, (planes.shape[2], wanted[1]), mode="bicubic", antialias=True)
-        centres = (torch.arange(start, stop, dtype=torch.float64) + 0.5) * scale - 0.5
-        weights = cubic((torch.arange(first, last) - centres[:, None]) / max(scale, 1.0))
-        weights = (weights / weights.sum(1, keepdim=True)).to(planes)
-        parts.append(torch.einsum("rn,bcnw->bcrw", weights, planes))
-    return torch.cat(parts, dim=2)
+        yield partial(_part, read(first, last), range(start, stop), first, scale, wanted[1])
+
+
+def _part(planes: Tensor, rows: range, first: int, scale: float, width: int) -> Tensor:
+    """Some rows, from those of the picture from number ``first`` on."""
+    planes = F.interpolate(planes, (planes.shape[2], width), mode="bicubic", antialias=True)
+    centres = (torch.arange(rows.start, rows.stop, dtype=torch.float64) + 0.5) * scale - 0.5
+    weights = cubic((torch.arange(first, first + planes.shape[2]) - centres[:, None]) / max(scale, 1.0))
+    weights = (weights / weights.sum(1, keepdim=True)).to(planes)
+    return torch.einsum("rn,bcnw->bcrw", weights, planes)
 
 
 def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:

@@ -16,6 +16,7 @@ from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import Picture, Rows, RowSource
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
+from nlfilter_torch.tiled.workers import undivided
 
 Floats = NDArray[np.float32]
 LOOKED_AT = 64  # rows read at once
@@ -97,4 +98,6 @@ def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """The rows that a step makes of a picture."""
     tiled = Tiled(Picture(source, name), passes)
     scribbles = scribbles_of(step, tiled.size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)
-    yield from tiled.rows(fit_step(step, tiled, *scribbles))
+    with undivided(passes.workers(1)):
+        fitted = fit_step(step, tiled, *scribbles)
+    yield from tiled.rows(fitted)
