@@ -110,7 +110,8 @@ def main(target: Path) -> None:
         (wheel,) = built.glob("*.whl")
         if not wheel.stem.endswith(f"linux_{processor}"):
             raise SystemExit(f"{wheel.name} is not for {processor}: the kernels were not compiled")
-        found = renamed(wheel, target, tools) if tools.exists() else Path(shutil.copy(wheel, target))
+        audited = tools.exists() and processor == os.uname().machine  # auditwheel refuses those of other processors
+        found = renamed(wheel, target, tools) if audited else Path(shutil.copy(wheel, target))
         print(found.name, flush=True)
         if processor == os.uname().machine:
             check_installation(found, work, "the wheel")
