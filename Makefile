@@ -10,7 +10,7 @@ AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --no-install-recommends
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks docs clean
+.PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
 
 # The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
 # torch comes first, by its exact pin, so that nothing else draws in another build of it.
@@ -70,6 +70,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.streaming --quick
 	$(BIN)/python -m benchmarks.streaming_strokes --quick
 	$(BIN)/python -m benchmarks.streaming_cpu --quick
+	$(BIN)/python -m benchmarks.streaming_busy --quick
 	$(BIN)/python -m benchmarks.fuzz --cases 20
 	$(BIN)/python -m benchmarks.masks --quick
 	$(BIN)/python -m benchmarks.recolor --quick
@@ -93,6 +94,12 @@ pictures: $(VENV)/.installed
 # Counterparts of the paper's figures and Table I in out/figures, with their numbers, in a few minutes.
 figures: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.figures --out out/figures
+
+# A source distribution and wheels in out/wheels, checked; AArch64 by a cross compiler, where one can be installed.
+wheels: $(VENV)/.installed
+	@{ command -v aarch64-linux-gnu-gcc && command -v qemu-aarch64; } >/dev/null \
+	|| { $(INSTALL_DEBIAN) gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user; } >/dev/null 2>&1 || true
+	$(BIN)/python build_wheels.py out/wheels
 
 # The documentation as a website in out/docs; whatever its generator would warn of is an error.
 docs: $(VENV)/.installed-test

@@ -1,4 +1,7 @@
-"""Compiles the kernels in C when the package is installed; where that cannot be, torch does their work, more slowly."""
+"""Compiles the kernels in C when the package is installed; where that cannot be, torch does their work, more slowly.
+
+``CC`` names the compiler; with a cross compiler, such as ``aarch64-linux-gnu-gcc``, the wheel is for its processor.
+"""
 
 import os
 import platform
@@ -13,6 +16,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 FOLDER = Path("nlfilter_torch", "core", "kernels")
 FLAGS = ["-std=gnu11", "-O3", "-fno-math-errno", "-fPIC", "-shared", "-pthread"]
+PROCESSORS = ("x86_64", "aarch64")
 
 
 class CompiledKernels(BuildHookInterface):
@@ -20,16 +24,17 @@ class CompiledKernels(BuildHookInterface):
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile with ``CC`` or ``cc``; called before files are collected."""
-        if platform.machine() != "x86_64" or sys.platform != "linux":
+        if platform.machine() not in PROCESSORS or sys.platform != "linux":
             self.app.display_info("nlfilter-torch: no kernels in C for this processor or system; torch does their work")
             return
         folder = Path(self.root) / FOLDER
         target = folder / "kernels.so"
         beside = target.with_suffix(".part")
         sources = map(str, sorted(folder.glob("*.c")))
-        command = [*shlex.split(os.environ.get("CC", "cc")), *FLAGS, "-o", str(beside), *sources]
+        compiler = shlex.split(os.environ.get("CC", "cc"))
         try:
-            subprocess.run(command, check=True, capture_output=True, text=True)
+            subprocess.run([*compiler, *FLAGS, "-o", str(beside), *sources], check=True, capture_output=True, text=True)
+            machine = subprocess.run([*compiler, "-dumpmachine"], check=True, capture_output=True, text=True).stdout
         except (OSError, subprocess.CalledProcessError) as error:
             reason = getattr(error, "stderr", None) or error
             target.unlink(missing_ok=True)  # one of an earlier version may not fit this one
@@ -39,4 +44,6 @@ class CompiledKernels(BuildHookInterface):
         build_data["artifacts"].append((FOLDER / "kernels.so").as_posix())
         build_data["pure_python"] = False
         # The library knows nothing of Python, so that one wheel serves every version of it.
-        build_data["tag"] = f"py3-none-{sysconfig.get_platform().replace('-', '_').replace('.', '_')}"
+        processor = machine.partition("-")[0]
+        own = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        build_data["tag"] = f"py3-none-{own if processor == platform.machine() else f'linux_{processor}'}"

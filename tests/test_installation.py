@@ -2,6 +2,7 @@
 
 import platform
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import pytest
 import torch
 
-from hatch_build import FOLDER, CompiledKernels
+from hatch_build import FLAGS, FOLDER, CompiledKernels
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core import instruction_sets
 from nlfilter_torch.core.kernels import definitions_only, library
 
+CROSS = "aarch64-linux-gnu-gcc"
 POSSIBLE = platform.machine() == "x86_64" and sys.platform == "linux" and shutil.which("cc") is not None
 
 
@@ -48,6 +50,31 @@ def test_installing_compiles(tmp_path: Path) -> None:
     assert build_data["artifacts"] == ["nlfilter_torch/core/kernels/kernels.so"]
     assert build_data["tag"].startswith("py3-none-")
     assert not build_data["pure_python"]
+
+
+@pytest.mark.skipif(not POSSIBLE or shutil.which(CROSS) is None, reason=f"there is no {CROSS}")
+def test_a_cross_compiler_makes_a_wheel_for_its_processor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", CROSS)
+    build_data, shown = install(tmp_path)
+    assert not shown
+    assert build_data["tag"] == "py3-none-linux_aarch64"
+    assert (tmp_path / FOLDER / "kernels.so").read_bytes()[18] == 183  # of ELF: AArch64
+
+
+@pytest.mark.parametrize(
+    ("compiler", "emulator"),
+    [(["cc"], []), (["clang"], []), ([CROSS], ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu"])],
+    ids=["cc", "clang", "aarch64"],
+)
+def test_kernels_agree_with_loops_in_float64(compiler: list[str], emulator: list[str], tmp_path: Path) -> None:
+    missing = [name for name in (compiler[0], *emulator[:1]) if shutil.which(name) is None]
+    if missing or not POSSIBLE:
+        pytest.skip(f"there is no {' and no '.join(missing)}")
+    sources = [Path(__file__).with_name("kernels_check.c"), *Path(library.__file__).parent.glob("*.c")]
+    flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
+    subprocess.run([*compiler, *flags, "-o", tmp_path / "check", *sources, "-lm"], check=True)
+    done = subprocess.run([*emulator, tmp_path / "check"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.skipif(not POSSIBLE, reason="there is no C compiler")

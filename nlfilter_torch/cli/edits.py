@@ -213,6 +213,7 @@ def edit_photograph(
     from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture, Rows
+    from nlfilter_torch.tiled.workers import undivided
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
         """Say what the scribbles cover, and show it."""
@@ -265,7 +266,9 @@ def edit_photograph(
 
         tell(drawn, job.size, rows_of)
         noise = measured(drawn[1], tiled, rows_of) if name == "denoise" else None
-        rows = tiled.rows(fit_step(step, tiled, *drawn, generator=seeded(seed)))
+        with undivided(tiled.passes.workers(1)):
+            fitted = fit_step(step, tiled, *drawn, generator=seeded(seed))
+        rows = tiled.rows(fitted)
         yield from rows if noise is None else noise.watched(rows, job.picture.rows)
 
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))

@@ -43,6 +43,7 @@ def mask(
     from nlfilter_torch.tiled.scribbles import RegionRows
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.sources import Picture
+    from nlfilter_torch.tiled.workers import undivided
 
     if mask is None and not region:
         raise ValueError(GIVE)
@@ -97,7 +98,8 @@ def mask(
             tiled = Tiled(Picture(picture.rows, source), job.passes(full, place.parent), "--region")
             drawn = selected_by(job.size, job.open)
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
-            fitted = fit_mask(tiled, *drawn, **arguments(job.size))
+            with undivided(tiled.passes.workers(1)):
+                fitted = fit_mask(tiled, *drawn, **arguments(job.size))
             write_picture(place, _first_channel(tiled.rows(fitted)), kind, plain)
 
 

@@ -1,9 +1,10 @@
 """The compiled kernels and their instruction set, without importing torch, which takes seconds."""
 
 import ctypes
+import platform
 from pathlib import Path
 
-NAMES = ("none", "AVX2", "AVX-512")
+NAMES = ("none", "NEON") if platform.machine() in ("aarch64", "arm64") else ("none", "AVX2", "AVX-512")
 
 
 def load_library() -> ctypes.CDLL | None:

@@ -1,8 +1,8 @@
 """Pictures in another size, a few rows at a time."""
 
 import math
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
 
 import torch
 import torch.nn.functional as F
@@ -28,18 +28,31 @@ def resized(
         rows: of the result, all by default.
         columns: likewise.
     """
+    return torch.cat([part() for part in resized_parts(read, size, wanted, rows, columns)], dim=2)
+
+
+def resized_parts(
+    read: Read,
+    size: tuple[int, int],
+    wanted: tuple[int, int],
+    rows: range | None = None,
+    columns: range | None = None,
+) -> Iterator[Callable[[], Tensor]]:
+    """The rows of :func:`resized`, a few at a time: they are read here, and resized when the part is called."""
     rows = range(wanted[0]) if rows is None else rows
     across = None if columns is None else interpolation(columns, size[1], wanted[1])
-    parts = []
     for start in range(rows.start, rows.stop, BLOCK):
         used, weights = interpolation(range(start, min(start + BLOCK, rows.stop)), size[0], wanted[0])
-        planes = read(used.start, used.stop)
-        if across is None:
-            planes = F.interpolate(planes, (planes.shape[2], wanted[1]), mode="bicubic", antialias=True)
-        else:
-            planes = planes[..., across[0]] @ across[1].to(planes).mT
-        parts.append(torch.einsum("rn,bcnw->bcrw", weights.to(planes), planes))
-    return torch.cat(parts, dim=2)
+        yield partial(_part, read(used.start, used.stop), weights, across, wanted[1])
+
+
+def _part(planes: Tensor, weights: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
+    """Some rows, from those of the picture that they depend on, and their weights."""
+    if across is None:
+        planes = F.interpolate(planes, (planes.shape[2], width), mode="bicubic", antialias=True)
+    else:
+        planes = planes[..., across[0]] @ across[1].to(planes).mT
+    return torch.einsum("rn,bcnw->bcrw", weights.to(planes), planes)
 
 
 @lru_cache(maxsize=8)  # strips of one picture have the same columns

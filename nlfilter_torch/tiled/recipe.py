@@ -17,6 +17,7 @@ from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import Picture, Rows, RowSource
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
+from nlfilter_torch.tiled.workers import undivided
 
 Floats = NDArray[np.float32]
 LOOKED_AT = 64  # rows read at once
@@ -97,7 +98,9 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
 def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """The rows that a step makes of a picture."""
     tiled = Tiled(Picture(source, name), passes)
-    yield from tiled.rows(fit_step(step, tiled, *by_rows(step, tiled.size)))
+    with undivided(passes.workers(1)):
+        fitted = fit_step(step, tiled, *by_rows(step, tiled.size))
+    yield from tiled.rows(fitted)
 
 
 def by_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[Any, ...], dict[str, Any]]:

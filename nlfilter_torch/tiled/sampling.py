@@ -28,7 +28,7 @@ from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
-from nlfilter_torch.tiled.workers import alone, in_order
+from nlfilter_torch.tiled.workers import in_order, undivided
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
 STARTED = 1e-3  # residual of its balancing, which is a first guess
@@ -179,7 +179,8 @@ def take_pilot(
         found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
         return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
 
-    return alone(fitted, workers)
+    with undivided(workers):  # of few pixels: a second thread would wait most of the time
+        return fitted()
 
 
 def visit(

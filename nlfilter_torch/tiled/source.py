@@ -12,7 +12,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.pixels import corner
-from nlfilter_torch.edits.resizing import resized
+from nlfilter_torch.edits.resizing import Read, resized_parts
 from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
@@ -21,6 +21,7 @@ from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot, visit
 from nlfilter_torch.tiled.scribbles import RegionRows, check_room, floats_of_scribbled, read_scribbles
 from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
+from nlfilter_torch.tiled.workers import Result, in_order, undivided
 
 HELD = 1 / 16  # of the memory that planes may take which an edit needs again
 FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
@@ -158,7 +159,7 @@ class Tiled:
             self.passes.report("Reducing", start, self.size[0])
             return self.picture.tile(start, stop, 0).pixels
 
-        planes = resized(read, self.size, size)[0].permute(1, 2, 0).numpy()
+        planes = self._resized(read, size)[0].permute(1, 2, 0).numpy()
         passes = replace(self.plain, tile_rows=None)
         return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
 
@@ -178,7 +179,13 @@ class Tiled:
             ends.extend((float(rows.min()), float(rows.max())))
             return rows
 
-        return resized(read, self.size, size).clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
+        found = self._resized(read, size)  # fills the list
+        return found.clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
+
+    def _resized(self, read: Read, size: tuple[int, int]) -> Tensor:
+        """Rows of this size in a smaller one."""
+        parts = resized_parts(read, self.size, size)
+        return torch.cat(list(in_order(lambda part: part(), parts, self.passes.workers(1))), dim=2)
 
     def all(self, fitted: Fitted) -> Tensor:
         """The planes (1, C, H, W) that an edit makes of all pixels."""
@@ -200,30 +207,52 @@ class Tiled:
     @torch.no_grad()
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means over all pixels, with a pass over the picture."""
-        total: Tensor | float = 0.0
-        for part, values in self.rows(fitted, plain=True):
-            image = self.picture.tile(part.start, part.stop, 0).pixels
-            planes = torch.from_numpy(values).permute(2, 0, 1)[None].to(image)
-            total = total + function(image, planes).double().sum((2, 3), keepdim=True)
+
+        def parts() -> Iterator[tuple[Tensor, Tensor]]:
+            for part, values in self.rows(fitted, plain=True):
+                image = self.picture.tile(part.start, part.stop, 0).pixels
+                yield image, torch.from_numpy(values).permute(2, 0, 1)[None].to(image)
+
+        def summed(part: tuple[Tensor, Tensor]) -> Tensor:
+            return function(*part).double().sum((2, 3), keepdim=True)
+
+        total = sum(in_order(summed, parts(), self.passes.workers(1)))
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
 
     @torch.no_grad()
     def mean(self, planes: Planes) -> Tensor:
         """Means (1, C, 1, 1) over all pixels."""
-        total: Tensor | float = 0.0
-        for tile in self.picture.tiles(0, self.picture.statistics_rows):
-            self.passes.report("Averaging", tile.start, self.size[0])
-            total = total + planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
+
+        def summed(tile: Tile) -> Tensor:
+            return planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
+
+        total = sum(self._of_tiles(summed, 0, self.picture.statistics_rows, "Averaging"))
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
 
     @torch.no_grad()
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of ``step`` pixels in both directions."""
-        parts, rows = [], max(1, self.picture.statistics_rows // step) * step
-        for tile in self.picture.tiles(0, rows):
-            self.passes.report("Reducing", tile.start, self.size[0])
-            parts.append(block_means(planes(self.pixels_of(tile)), step))
-        return torch.cat(parts, dim=2)
+        rows = max(1, self.picture.statistics_rows // step) * step
+
+        def part(tile: Tile) -> Tensor:
+            return block_means(planes(self.pixels_of(tile)), step)
+
+        return torch.cat(list(self._of_tiles(part, 0, rows, "Reducing")), dim=2)
+
+    def _of_tiles(self, function: Callable[[Tile], Result], margin: int, rows: int, stage: str) -> Iterator[Result]:
+        """What a function gives of each tile, in order.
+
+        That of the first tile is worked out before the others, since it may take sums of an operator.
+        """
+
+        def tiles() -> Iterator[Tile]:
+            for tile in self.picture.tiles(margin, rows):
+                self.passes.report(stage, tile.start, self.size[0])
+                yield tile
+
+        each = tiles()
+        yield function(next(each))
+        yield from in_order(function, each, self.passes.workers(1))
 
     def blocks(self, step: int, floats: int) -> InMemory:
         """The picture reduced by means over blocks, in memory.
@@ -293,8 +322,9 @@ class Tiled:
         rows = self.passes.tile_rows or (self.room(0, landmarks) if self.operators else TILE_PIXELS // self.size[1])
         together, workers = self.passes.rows_together(self.size[1]), self.passes.workers(landmarks)
         rows = max(1, rows // together) * together
-        for operator in self.operators:
-            operator.settle()  # before several tiles at once need it
+        with undivided(workers):
+            for operator in self.operators:
+                operator.settle()  # before several tiles at once need it
         if fitted.finish is None:
             yield from passes.work_out(
                 self.picture,
@@ -323,11 +353,13 @@ class Tiled:
                 found = finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels)
                 return found[..., tile.halo[0] : found.shape[2] - tile.halo[1], :]
 
-            rows = self._rows_to_finish(fitted, rows)
-            yield from passes.work_out(self.picture, finished, margin, rows, transparent=not plain)
+            rows, workers = self._rows_to_finish(fitted, rows, workers)
+            yield from passes.work_out(self.picture, finished, margin, rows, workers=workers, transparent=not plain)
 
-    def _rows_to_finish(self, fitted: Fitted, rows: int) -> int:
+    def _rows_to_finish(self, fitted: Fitted, rows: int, workers: int) -> tuple[int, int]:
         """Rows of a tile that is finished: its margins, several times if none were asked for, as far as memory allows.
+
+        And the workers: all, if such tiles fit in memory for each of them, or one.
 
         Raises:
             MemoryError: if it allows none.
@@ -340,5 +372,7 @@ class Tiled:
                 f"but {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
         rows = max(rows, (1 if self.passes.tile_rows else 4) * fitted.margin)
+        if (1 + workers) * row * (rows + 2 * fitted.margin) > self.passes.memory:
+            workers = 1
         rows = rows if self.size[0] <= most else min(rows, most)
-        return max(1, rows // fitted.step) * fitted.step
+        return max(1, rows // fitted.step) * fitted.step, workers

@@ -14,6 +14,7 @@ from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.sources import Picture, RowSource, RowTarget
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
+from nlfilter_torch.tiled.workers import undivided
 
 
 def stream_detail(
@@ -79,16 +80,17 @@ def stream_detail(
     check_target(target, source)
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
-    fitted = fit_detail(
-        tiled,
-        alpha,
-        regions,
-        negative=negative,
-        residual=residual,
-        reach=reach,
-        channels=channels,
-        **options,
-    )
+    with undivided(tiled.passes.workers(1)):
+        fitted = fit_detail(
+            tiled,
+            alpha,
+            regions,
+            negative=negative,
+            residual=residual,
+            reach=reach,
+            channels=channels,
+            **options,
+        )
     fill(target, tiled.rows(fitted))
 
 
@@ -156,7 +158,9 @@ def stream_recolor(
             f"source must have 3 or 4 channels to be recoloured, got {tiled.picture.samples}; colourise it instead"
         )
     options |= {"photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
-    fill(target, tiled.rows(fit_recolor(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)))
+    with undivided(tiled.passes.workers(1)):
+        fitted = fit_recolor(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)
+    fill(target, tiled.rows(fitted))
 
 
 def stream_colorize(
@@ -221,16 +225,17 @@ def stream_colorize(
     """
     check_target(target, source, coloured=True)
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
-    fitted = fit_colorize(
-        tiled,
-        strokes,
-        stroke_mask,
-        method=method,
-        strength=strength,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        generator=generator,
-    )
+    with undivided(tiled.passes.workers(1)):
+        fitted = fit_colorize(
+            tiled,
+            strokes,
+            stroke_mask,
+            method=method,
+            strength=strength,
+            photometric_bandwidth=photometric_bandwidth,
+            spatial_bandwidth=spatial_bandwidth,
+            patch_size=patch_size,
+            num_landmarks=num_landmarks,
+            generator=generator,
+        )
     fill(target, tiled.rows(fitted))

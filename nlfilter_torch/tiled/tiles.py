@@ -1,7 +1,7 @@
 """Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,6 +39,7 @@ class Passes:
         memory: bytes that may be used.
         report: called with the progress.
         folder: with room for planes between two passes; None is the system's for temporary files.
+        threads: that tiles are divided among.
     """
 
     kind: str
@@ -48,6 +49,7 @@ class Passes:
     memory: int = 1 << 30
     report: Report = in_silence
     folder: Path | None = None
+    threads: int = field(default_factory=torch.get_num_threads)
 
     @staticmethod
     def of(
@@ -77,7 +79,7 @@ class Passes:
         """Tiles that are worked out at once, by threads of their own: as many as fit well."""
         if self.memory < AMPLE:
             return 1
-        return max(1, min(torch.get_num_threads(), self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
+        return max(1, min(self.threads, self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
 
     def stores(self, taken: int) -> bool:
         """Whether a guide of so many bytes is kept from one pass to the next."""

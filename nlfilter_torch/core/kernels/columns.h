@@ -85,5 +85,5 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
                 memcpy(target, edge, width * sizeof(float));
         }
     }
-    __builtin_ia32_sfence(); /* complete the streaming stores before other threads read them */
+    FENCE(); /* complete the streaming stores before other threads read them */
 }

@@ -1,5 +1,5 @@
-/* Float32 kernels for x86-64: columns of the Nystrom factor and their gradients, products with the factor, Gram
- * matrices, and landmarks.
+/* Float32 kernels for x86-64 and AArch64: columns of the Nystrom factor and their gradients, products with the factor,
+ * Gram matrices, and landmarks.
  *
  * Each part names the Python file that defines the same computation in torch. Where torch makes several passes over
  * memory, these kernels keep distances, exponentials and norms in registers, and skip the zero triangle of the inverse
@@ -10,15 +10,20 @@
  * memory cannot be allocated. */
 
 #include <math.h>
+#ifdef __x86_64__
+#include <immintrin.h>
+#endif
 
 #include "tasks.h"
 
+#ifdef __x86_64__
 #define NAME(x) x##_avx512
 #define TARGET __attribute__((target("avx512f")))
 #define LANES 16
 #define ROWS 6
 #define VECTORS 4
-#define STREAM(address, value) __builtin_ia32_movntps512(address, value)
+#define STREAM(address, value) _mm512_stream_ps(address, (__m512)(value))
+#define FENCE() _mm_sfence()
 #include "kernels.h"
 #undef NAME
 #undef TARGET
@@ -32,7 +37,7 @@
 #define LANES 8
 #define ROWS 3
 #define VECTORS 4
-#define STREAM(address, value) __builtin_ia32_movntps256(address, value)
+#define STREAM(address, value) _mm256_stream_ps(address, (__m256)(value))
 #include "kernels.h"
 
 const struct set SETS[] = {
@@ -49,3 +54,24 @@ int nlfilter_level(void)
         return 2;
     return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") ? 1 : 0;
 }
+
+#elif defined(__aarch64__)
+#define NAME(x) x##_neon
+#define TARGET
+#define LANES 4
+#define ROWS 6
+#define VECTORS 4
+#define STREAM(address, value) (*(FLOATS *)(address) = (value))
+#define FENCE()
+#include "kernels.h"
+
+const struct set SETS[] = {
+    {0},
+    {6, columns_neon, backward_neon, spread_neon, gather_neon, sweep_neon, grams_neon, assign_neon, pivots_neon},
+};
+
+/* Every processor of this kind has NEON. */
+int nlfilter_level(void) { return 1; }
+#else
+#error "the kernels are for x86-64 and AArch64"
+#endif

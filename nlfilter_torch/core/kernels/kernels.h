@@ -5,7 +5,8 @@
  *   LANES     floats per register,
  *   ROWS      rows of a product computed together,
  *   VECTORS   registers of pixels processed together; ROWS * VECTORS sums stay in registers,
- *   STREAM    non-temporal store of a register, to an address aligned to its size.
+ *   STREAM    non-temporal store of a register, to an address aligned to its size, where there is one,
+ *   FENCE     what completes such stores.
  *
  * Pixels lie along the lanes, so sums over landmarks or patch positions need no shuffles. */
 
@@ -15,6 +16,20 @@ typedef int NAME(ints) __attribute__((vector_size(4 * LANES), aligned(4), may_al
 #define INTS NAME(ints)
 #define PIXELS (LANES * VECTORS) /* in a tile of affinities */
 #define INLINE static inline TARGET __attribute__((always_inline))
+
+/* The numbers of a register in another order. */
+#ifdef __clang__ /* which finds the shuffle by itself */
+INLINE FLOATS NAME(shuffle)(FLOATS x, INTS order)
+{
+    FLOATS shuffled;
+    for (int k = 0; k < LANES; k++)
+        shuffled[k] = x[order[k]];
+    return shuffled;
+}
+#define SHUFFLE NAME(shuffle)
+#else
+#define SHUFFLE __builtin_shuffle
+#endif
 
 /* 2^x to 1e-7 for -126 < x <= 0, and NaN for NaN. The polynomial is the minimax one on [-1/2, 1/2]. */
 INLINE FLOATS NAME(exp2)(FLOATS x)
@@ -104,7 +119,7 @@ INLINE float NAME(total)(FLOATS x)
         lanes[k] = k;
 #pragma GCC unroll 4
     for (int distance = LANES / 2; distance; distance /= 2)
-        x += __builtin_shuffle(x, lanes ^ distance);
+        x += SHUFFLE(x, lanes ^ distance);
     return x[0];
 }
 
@@ -128,3 +143,4 @@ INLINE const float *NAME(fetch)(const float *source, long width, float fill, flo
 #undef INTS
 #undef PIXELS
 #undef INLINE
+#undef SHUFFLE

@@ -1,8 +1,9 @@
 """The kernels in C, and how torch's dispatcher comes to call them.
 
-They are compiled when the package is installed (``hatch_build.py``), for Linux on x86-64, where there is GCC. Nothing
-is compiled or looked for later. Each belongs to an operator of ``torch.ops.nlfilter``, whose definition in torch
-computes the same everywhere else: on other devices, in other dtypes, under transforms and for derivatives.
+They are compiled when the package is installed (``hatch_build.py``) or its wheel is built, for Linux on x86-64 and
+AArch64, by GCC or Clang. Nothing is compiled or looked for later. Each belongs to an operator of
+``torch.ops.nlfilter``, whose definition in torch computes the same everywhere else: on other devices, in other dtypes,
+under transforms and for derivatives.
 """
 
 import ctypes
@@ -46,14 +47,13 @@ def _load() -> ctypes.CDLL | None:
 
 
 def _openmp() -> Any:
-    """The function by which torch's own OpenMP library runs another on its threads; None where it is not found."""
-    maps = Path("/proc/self/maps").read_text().splitlines()
-    loaded = {line.split(maxsplit=5)[5] for line in maps if "omp" in line.rpartition("/")[2] and ".so" in line}
-    for path in sorted(loaded, key=lambda path: "torch" not in path):  # other packages may have brought their own
-        function = getattr(ctypes.CDLL(path), "GOMP_parallel", None)
-        if function is not None:
-            return function
-    return None
+    """The function by which torch's OpenMP library runs another on its threads; None where torch has another library.
+
+    It is looked for in torch's own library and what that is linked to: torch has no operator that calls a function on
+    its threads, and in C++ torch calls this one.
+    """
+    path = Path(torch.__file__).with_name("lib") / "libtorch_cpu.so"
+    return getattr(ctypes.CDLL(str(path)), "GOMP_parallel", None) if path.exists() else None
 
 
 def share_threads(library: ctypes.CDLL, openmp: Any) -> None:

@@ -108,6 +108,9 @@ struct work {
     double *totals;      /* sums of each piece, or NULL */
     atomic_long next;
     atomic_int failed;
+    int places;             /* for threads of the pool, which guards this and the next */
+    struct work *following; /* in the list of what the pool may do */
+    atomic_int helping;     /* threads of the pool that have begun */
 };
 
 /* Run all pieces. Returns 0, or -1 if memory cannot be allocated. */

@@ -1,10 +1,26 @@
-/* Division of work among threads. */
+/* Division of work among threads: those of OpenMP that torch uses too, or a pool of our own. */
 
 #include <pthread.h>
 
 #include "tasks.h"
 
 #define MOST_THREADS 256
+#define SPINS 2000 /* looks at a counter before waiting in the kernel, some 20 to 50 microseconds */
+
+#if defined(__x86_64__)
+#define PAUSE() __builtin_ia32_pause()
+#elif defined(__aarch64__)
+#define PAUSE() __asm__ volatile("yield")
+#else
+#define PAUSE()
+#endif
+
+/* Wheels run on any glibc that torch does. Newer ones have another version of this function, which is the same. */
+#if defined(__GLIBC__) && defined(__x86_64__)
+__asm__(".symver pthread_create, pthread_create@GLIBC_2.2.5");
+#elif defined(__GLIBC__) && defined(__aarch64__)
+__asm__(".symver pthread_create, pthread_create@GLIBC_2.17");
+#endif
 
 static void run_worker(void *argument)
 {
@@ -28,29 +44,99 @@ static void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
 
 void nlfilter_share_threads(void *gomp_parallel) { parallel = gomp_parallel; }
 
-static void *start_helper(void *work)
+/* The pool. Its threads sleep until there is work with a free place. Who brings the work takes part in it, and waits
+ * only for those that have begun: a thread that has not been given a core yet holds up nobody. */
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static pthread_cond_t brought = PTHREAD_COND_INITIALIZER, finished = PTHREAD_COND_INITIALIZER;
+static struct work *brought_first; /* of a list */
+static int pool_size;
+
+static void *help(void *unused)
 {
-    run_worker(work);
+    (void)unused;
+    pthread_mutex_lock(&lock);
+    for (;;) {
+        struct work *work = brought_first;
+        while (work && !work->places)
+            work = work->following;
+        if (!work) {
+            pthread_cond_wait(&brought, &lock);
+            continue;
+        }
+        work->places--;
+        atomic_fetch_add(&work->helping, 1);
+        pthread_mutex_unlock(&lock);
+        run_worker(work);
+        pthread_mutex_lock(&lock);
+        if (atomic_fetch_sub(&work->helping, 1) == 1) /* from here on the work may be gone */
+            pthread_cond_broadcast(&finished);
+    }
     return NULL;
+}
+
+/* After a fork the child has none of the threads. */
+static void forget_pool(void)
+{
+    lock = (pthread_mutex_t)PTHREAD_MUTEX_INITIALIZER;
+    brought = finished = (pthread_cond_t)PTHREAD_COND_INITIALIZER;
+    brought_first = NULL;
+    pool_size = 0;
+}
+
+/* Let the pool have so many threads, or as many as can be started. */
+static void grow_pool(int wanted)
+{
+    static int registered;
+    pthread_attr_t detached;
+    pthread_t thread;
+    if (!registered)
+        registered = !pthread_atfork(NULL, NULL, forget_pool);
+    if (pthread_attr_init(&detached))
+        return;
+    pthread_attr_setdetachstate(&detached, PTHREAD_CREATE_DETACHED);
+    while (pool_size < wanted && pool_size < MOST_THREADS && !pthread_create(&thread, &detached, help, NULL))
+        pool_size++;
+    pthread_attr_destroy(&detached);
+}
+
+static void run_with_pool(struct work *work, int helpers)
+{
+    pthread_mutex_lock(&lock);
+    if (pool_size < helpers)
+        grow_pool(helpers);
+    work->places = helpers;
+    work->following = brought_first;
+    brought_first = work;
+    pthread_mutex_unlock(&lock);
+    for (int i = 0; i < helpers; i++)
+        pthread_cond_signal(&brought);
+    run_worker(work);
+    pthread_mutex_lock(&lock);
+    struct work **link = &brought_first;
+    while (*link != work)
+        link = &(*link)->following;
+    *link = work->following;
+    pthread_mutex_unlock(&lock);
+    for (int i = 0; i < SPINS && atomic_load(&work->helping); i++)
+        PAUSE();
+    if (!atomic_load(&work->helping))
+        return;
+    pthread_mutex_lock(&lock);
+    while (atomic_load(&work->helping))
+        pthread_cond_wait(&finished, &lock);
+    pthread_mutex_unlock(&lock);
 }
 
 int run_pieces(struct work *work, int threads)
 {
-    pthread_t helpers[MOST_THREADS];
     const long pieces = work->images * work->each;
-    int started = 0;
-    if (parallel && threads > 1 && pieces > 1) {
-        parallel(run_worker, work, threads, 0);
-        return work->failed ? -1 : 0;
-    }
-    while (started < threads - 1 && started < pieces - 1 && started < MOST_THREADS)
-        if (pthread_create(&helpers[started++], NULL, start_helper, work)) {
-            started--; /* no more threads available; continue with those already started */
-            break;
-        }
-    run_worker(work);
-    for (int i = 0; i < started; i++)
-        pthread_join(helpers[i], NULL);
+    const int wanted = threads < pieces ? threads : pieces;
+    if (wanted < 2)
+        run_worker(work);
+    else if (parallel)
+        parallel(run_worker, work, threads, 0); /* a smaller team would end threads that torch needs again */
+    else
+        run_with_pool(work, wanted - 1);
     return work->failed ? -1 : 0;
 }
 

@@ -1,0 +1,79 @@
+"""Tiles by threads of their own: what torch's numbers of threads are inside, after and elsewhere."""
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from nlfilter_torch.core.kernels import library
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.tiled.workers import in_order, undivided
+
+
+@pytest.fixture(autouse=True)
+def _threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(6)
+    yield
+    torch.set_num_threads(before)
+
+
+def of_new_thread() -> int:
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(torch.get_num_threads).result()
+
+
+@pytest.mark.parametrize(("workers", "each"), [(1, 6), (2, 3), (4, 1), (9, 1)])
+def test_workers_share_the_threads_and_leave_those_of_others(workers: int, each: int) -> None:
+    found = in_order(lambda k: (k, torch.get_num_threads(), torch.is_grad_enabled()), range(20), workers)
+    assert next(found) == (0, each, False)
+    assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
+    assert list(found) == [(k, each, False) for k in range(1, 20)]
+    assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
+
+
+def test_undivided_holds_for_the_calling_thread_and_its_workers() -> None:
+    with undivided(2):
+        assert (torch.get_num_threads(), of_new_thread()) == (1, 6)
+        assert list(in_order(lambda _: torch.get_num_threads(), range(3), 2)) == [3, 3, 3]
+        assert (torch.get_num_threads(), of_new_thread()) == (1, 6)
+    assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
+    with undivided(1):  # nothing else is at work then
+        assert torch.get_num_threads() == 6
+
+
+@pytest.fixture
+def own_threads() -> Iterator[None]:
+    """Kernels on threads of their own."""
+    library.share_threads(library._library, None)
+    yield
+    library.share_threads(library._library, library._openmp())
+
+
+@pytest.mark.skipif(not library.level, reason="this installation or processor has no kernels in C")
+@pytest.mark.usefixtures("own_threads")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_the_pool_serves_several_callers_at_once_and_a_forked_process() -> None:
+    factor = torch.randn(1, 20, 30_000, generator=torch.Generator().manual_seed(0))
+    rows = torch.ones(1, 2, 20)
+    with torch.no_grad():
+        torch.set_num_threads(1)
+        exact = spread(rows, factor)
+        torch.set_num_threads(6)
+        sums = moment(factor, exact)
+
+        def many(_: int) -> bool:
+            torch.set_num_threads(6)
+            found = [(spread(rows, factor), moment(factor, exact)) for _ in range(20)]
+            return all(torch.equal(first, exact) and torch.equal(second, sums) for first, second in found)
+
+        with ThreadPoolExecutor(4) as callers:
+            assert all(callers.map(many, range(8)))
+        child = os.fork()
+        if child == 0:
+            signal.alarm(60)  # instead of waiting for ever
+            os._exit(0 if torch.equal(moment(factor, exact), sums) else 1)
+        assert os.waitpid(child, 0)[1] == 0
