@@ -3,7 +3,7 @@
 Photographs that nothing was trained on, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour: PSNR,
 SSIM and CPU seconds of
 
-ours             ``nlfilter_torch.denoise``, told the noise, and with the noise that it estimates;
+ours             ``nlfilter_torch.denoise``, told the noise; the mean of four turned images; with the noise measured;
 rule             ``denoise(method="rule")``: sliders by rule, nothing learned;
 BM3D, CBM3D      package ``bm3d``;
 scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` of the best of five weights for
@@ -184,7 +184,7 @@ def best(case: Case, results: Iterable[Tensor]) -> Tensor:
     return max(results, key=lambda found: psnr(found, case.clean))
 
 
-def network(path: Path | None, *, plain: bool = False) -> Method:
+def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method:
     """The trained network of a file, or of the package, told the noise."""
     from benchmarks.train_denoiser import PlainDenoiser
 
@@ -193,7 +193,7 @@ def network(path: Path | None, *, plain: bool = False) -> Method:
 
     def run(case: Case) -> Tensor:
         with torch.no_grad():
-            denoised: Tensor = denoiser(case.noisy, case.noise, turns=4)
+            denoised: Tensor = denoiser(case.noisy, case.noise, turns=turns)
         return denoised
 
     return run
@@ -258,12 +258,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="a JSON file of all figures")
     options = parser.parse_args(arguments)
     own = network(None)
-    methods: dict[str, Method] = {"noisy": lambda case: case.noisy, "ours": own}
+    methods: dict[str, Method] = {
+        "noisy": lambda case: case.noisy,
+        "ours": own,
+        "ours, 4 turns": network(None, turns=4),
+    }
     methods |= {path.parent.name: network(path) for path in options.weights}
     methods |= {f"plain, {path.parent.name}": network(path, plain=True) for path in options.plain}
     if not options.networks:
         methods |= {
-            "ours, estimated": lambda case: denoise(case.noisy),
+            "ours, measured": lambda case: denoise(case.noisy),
             "rule": lambda case: denoise(case.noisy, method="rule", noise_level=case.noise),
             "BM3D": bm3d,
             "scikit-image NLM": nlm,

@@ -22,7 +22,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_python_blocks_run_in_order(folder: Path) -> None:
-    assert [kind for kind, _ in README.blocks()].count("python") == 4
+    assert [kind for kind, _ in README.blocks()].count("python") == 5
     names = README.run_python()
     with Image.open(folder / "crisp.png") as crisp:
         assert crisp.size == (150, 100)
