@@ -195,6 +195,17 @@ def test_noise_that_grows_with_the_light_is_found() -> None:
     torch.testing.assert_close(even.level, torch.tensor([0.04]), rtol=0.04, atol=0)
 
 
+def test_noise_is_not_that_of_the_dark() -> None:
+    """A bright disc before black: the flattest windows are black, and say little about the disc."""
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 200), indexing="ij")
+    radius = (rows.square() + columns.square()).sqrt()
+    clean = torch.where(radius < 0.85, 0.6 - 0.25 * radius, 0.0)[None, None]
+    image = noisy(clean, (0.01 * clean + (2 / 255) ** 2).sqrt())
+    noise = noise_of(InMemory(image))
+    torch.testing.assert_close(noise.gain, torch.tensor([0.01]), rtol=0.15, atol=0)
+    assert decibels(denoise(image), clean) > decibels(denoise(image, noise_level=noise.level), clean)
+
+
 @pytest.mark.parametrize("level", [5, 15, 25, 50])
 def test_noise_is_found_beside_texture(level: int) -> None:
     """Half of the picture is gravel, whose finest detail is as strong as noise of 20 levels."""

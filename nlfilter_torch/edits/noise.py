@@ -16,7 +16,7 @@ FLAT = 0.06  # share of them in which noise is measured: those of the least slop
 SHADES = 6  # groups of them by their light, for noise that depends on it
 MEDIAN = 0.6745  # of the absolute value of a normal variable
 DOUBLE = 1.1  # times what is expected, from where on a group is thought to hold texture
-BETTER = 0.3  # squared relative errors that a dependence on light has to explain
+BETTER = 0.15  # squared relative errors that a dependence on light has to explain
 DARK = 0.02  # variance in the dark, as a share of that at white, that is always expected
 SMALLEST = 1e-12  # variance
 
@@ -94,14 +94,15 @@ def _measured(source: Source) -> Tensor:
     # Windows with clipped pixels come last: their noise is cut off.
     clipped = (windows == 0).logical_or(windows == 1).any(3).any(2)
     slopes = torch.where(clipped, torch.inf, _slopes(windows))
-    level = _level(response, slopes)
+    level, _ = _level(response, slopes, light)
     shades, variances = [], []
     for group in light.argsort(1).tensor_split(SHADES, dim=1):
         if group.shape[1] == 0:
             continue  # of fewer windows than groups
-        flat = slopes.gather(1, group)
-        shades.append(light.gather(1, group).mean(1))
-        variances.append(_level(response.gather(1, group[..., None].expand(-1, -1, response.shape[2])), flat).square())
+        inside = group[..., None].expand(-1, -1, response.shape[2])
+        found, shade = _level(response.gather(1, inside), slopes.gather(1, group), light.gather(1, group))
+        shades.append(shade)
+        variances.append(found.square())
     floor, gain = _line(torch.stack(shades, dim=1), torch.stack(variances, dim=1))
     even = gain == 0
     return torch.stack([torch.where(even, level.square(), floor), gain, light.mean(1)])
@@ -144,12 +145,12 @@ def _slopes(windows: Tensor) -> Tensor:
     return (down.square() + across.square()).mean((1, 2, 3)).unflatten(0, windows.shape[:2])
 
 
-def _level(response: Tensor, slopes: Tensor) -> Tensor:
-    """Standard deviations (B,) from the responses (B, n, r) in the windows of the least slopes (B, n)."""
+def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations (B,) from responses (B, n, r) in the windows of the least slopes (B, n), and their light."""
     count = max(1, min(slopes.shape[1], max(20, int(FLAT * slopes.shape[1]))))
     least = slopes.argsort(1)[:, :count]
     found = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
-    return found.flatten(1).median(1).values / MEDIAN
+    return found.flatten(1).median(1).values / MEDIAN, light.gather(1, least).mean(1)
 
 
 def _line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
