@@ -153,7 +153,7 @@ def wavelets(case: Case) -> Tensor:
     from skimage.restoration import cycle_spin, denoise_wavelet
 
     options = {"sigma": case.noise, "rescale_sigma": False, "channel_axis": case.axis}
-    return as_image(cycle_spin(case.array, denoise_wavelet, 3, func_kw=options, num_workers=1, channel_axis=case.axis))
+    return as_image(cycle_spin(case.array, denoise_wavelet, 3, func_kw=options, channel_axis=case.axis))
 
 
 def total_variation(case: Case) -> Tensor:
