@@ -3,6 +3,7 @@
 import io
 import socket
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -70,7 +71,7 @@ def test_grey_photographs_become_coloured_files(tmp_path: Path) -> None:
 )
 def test_names_to_save_under(session: Session, name: str, photograph: Photograph, wanted: str) -> None:
     assert session.opened is not None
-    session.opened = type(session.opened)(name, photograph, session.preview)
+    session.opened = replace(session.opened, name=name, photograph=photograph)
     assert session.suggested_name() == wanted
     session.save(wanted)  # which can hold it
     assert Session(session.folder).suggested_name() == ""

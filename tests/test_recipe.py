@@ -298,5 +298,5 @@ def test_more_memory_is_asked_for_by_hungrier_steps() -> None:
     assert Recipe().bytes_per_pixel == 0
     assert Recipe((RECOLOR, DEFOCUS, COLORIZE)).bytes_per_pixel == working_bytes(100, 5)
     assert Recipe((DETAIL,)).bytes_per_pixel == working_bytes(DETAIL["landmarks"], 5, factors=2)
-    assert Recipe((Step("denoise", patch_size=9),)).bytes_per_pixel == working_bytes(200, 9)
+    assert Recipe((Step("denoise", method="rule", patch_size=9),)).bytes_per_pixel == working_bytes(200, 9)
     assert WHOLE.bytes_per_pixel == max(step.bytes_per_pixel() for step in WHOLE.acting)
