@@ -71,7 +71,6 @@ QUICK := \
 	'streaming_strokes --quick' \
 	'streaming_cpu --quick' \
 	'streaming_busy --quick' \
-	'denoising --quick --noise 25' \
 	'app --side 96 --megapixels 0.05' \
 	'looks --quick' \
 	'detail --quick' \
