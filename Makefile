@@ -76,7 +76,7 @@ QUICK := \
 	'detail --quick' \
 	'detail --quick --scales' \
 	'distributed --ranks 2 --widths 64 --landmarks 20' \
-	'tables --long-side 64' \
+	'tables --long-side 32' \
 	'masks --quick' \
 	'recolor --quick' \
 	'memory --side 128 --repeats 1' \
