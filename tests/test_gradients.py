@@ -26,7 +26,7 @@ from tests.images import hard_images
 from tests.plain_autograd import plain_filter
 from tests.problems import noise, picture, seeded
 
-SIZE = (6, 5)
+SIZE = (5, 4)
 COMPLETIONS = ("diagonal", "none")
 ALPHA = (3.0, 0.5, 2.0, 1.05)
 # Without completion a small bandwidth breaks the method itself.

@@ -49,7 +49,7 @@ def test_every_image_and_bandwidth(name: str, bandwidth: int, landmarks: str) ->
 @pytest.mark.parametrize("bandwidth", [1, 10, 1000])
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
 def test_whole_photographs(name: str, bandwidth: int) -> None:
-    promises(torch.tensor(reduced(name, 700), dtype=torch.float32)[None, None], bandwidth, "kmeans")
+    promises(torch.tensor(reduced(name, 320), dtype=torch.float32)[None, None], bandwidth, "kmeans")
 
 
 @pytest.mark.parametrize("bandwidth", BANDWIDTHS)
