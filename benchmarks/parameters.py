@@ -62,21 +62,34 @@ def places(edit: Edit, parameter: Parameter) -> list[str]:
     for path in sorted(PACKAGE.rglob("*.py")):
         file = path.relative_to(PACKAGE).as_posix()
         own = file in FILES or path.stem == edit.name or path.parent.name in INTERFACES
-        tree = ast.parse(path.read_text(encoding="utf-8"))
         if path.stem.endswith("parameters") and path.parent.name == "edits":
-            scopes = [n for n in tree.body if isinstance(n, ast.Assign) and named(n.targets[0]) in used(edit.name)]
+            scopes = [
+                n for n in parsed(path).body if isinstance(n, ast.Assign) and named(n.targets[0]) in used(edit.name)
+            ]
             nodes = [node for one in scopes for node in ast.walk(one)]
             found += [f"{file}:{n.lineno}" for n in nodes if declares(n, parameter.name)]
         elif own:
-            found += [f"{file}:{line}" for line, name in literals(tree) if name in names]
+            found += [f"{file}:{line}" for line, name in written_in(path) if name in names]
     return found
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A file of the package."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def written_in(path: Path) -> list[tuple[int, str]]:
+    """:func:`literals` of a file of the package."""
+    return literals(parsed(path))
 
 
 @cache
 def used(edit: str) -> set[str]:
     """Names of what the edit of a name is declared with, its own too."""
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (PACKAGE / "edits").glob("*parameters.py")]
-    assigned = [node for tree in trees for node in tree.body if isinstance(node, ast.Assign)]
+    bodies = [parsed(path).body for path in (PACKAGE / "edits").glob("*parameters.py")]
+    assigned = [node for body in bodies for node in body if isinstance(node, ast.Assign)]
     scope = next(node for node in assigned if named(node.targets[0]) == edit.upper())
     return {edit.upper()} | {node.id for node in ast.walk(scope.value) if isinstance(node, ast.Name)}
 
