@@ -9,6 +9,9 @@ COMPILED := hatch_build.py $(wildcard nlfilter_torch/core/kernels/*.[ch])
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --no-install-recommends
 
+# Modules are compiled once for all processes of tests and benchmarks, whatever the environment says.
+export PYTHONDONTWRITEBYTECODE :=
+
 .DELETE_ON_ERROR:
 .PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
 
