@@ -42,7 +42,7 @@ def promises(image: torch.Tensor, bandwidth: float, landmarks: str) -> None:
 @pytest.mark.parametrize("bandwidth", BANDWIDTHS)
 @pytest.mark.parametrize("name", [*IMAGES, *PHOTOGRAPHS])
 def test_every_image_and_bandwidth(name: str, bandwidth: int, landmarks: str) -> None:
-    image = IMAGES[name] if name in IMAGES else reduced(name, 200)
+    image = IMAGES[name] if name in IMAGES else reduced(name, 120)
     promises(torch.tensor(image, dtype=torch.float32)[None, None], bandwidth, landmarks)
 
 
