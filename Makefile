@@ -9,6 +9,9 @@ COMPILED := hatch_build.py $(wildcard nlfilter_torch/core/kernels/*.[ch])
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --no-install-recommends
 
+# Modules are compiled once for all processes of tests and benchmarks, whatever the environment says.
+export PYTHONDONTWRITEBYTECODE :=
+
 .DELETE_ON_ERROR:
 .PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
 
@@ -42,7 +45,8 @@ demo: $(VENV)/.installed
 
 # Everything that has to hold; pytest comes last, so that its count closes the output. A process for every core, of one
 # thread each: several threads in several processes would wait for each other. Tests of threads set their own number.
-test: lint types bench-quick chromium
+test: $(VENV)/.installed-test chromium
+	$(MAKE) --no-print-directory -j2 lint types bench-quick
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(VENV)/.installed-test
@@ -57,25 +61,29 @@ bench: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
 	$(BIN)/python -m benchmarks.report out/speed.json
 
-# Every benchmark once, on a size that takes seconds: that it runs, not how fast.
+# Every benchmark once, on a size that takes seconds: that it runs, not how fast. One of one thread for every core.
+bench-quick: export OMP_NUM_THREADS = 1
 bench-quick: $(VENV)/.installed-test
-	$(BIN)/python -m benchmarks.speed --quick --out out/quick/speed.json
+	printf '%s\n' $(QUICK) | xargs -P "$$(getconf _NPROCESSORS_ONLN)" -I '{}' \
+	sh -c 'told="$$($(BIN)/python -m benchmarks.{} 2>&1)"; failed=$$?; printf "%s\n" "{}" "$$told"; exit $$failed'
 	$(BIN)/python -m benchmarks.report out/quick/speed.json
-	$(BIN)/python -m benchmarks.memory --side 128 --repeats 1
-	$(BIN)/python -m benchmarks.tables --long-side 64
-	$(BIN)/python -m benchmarks.app --side 96 --megapixels 0.05
-	$(BIN)/python -m benchmarks.distributed --ranks 2 --widths 64 --landmarks 20
-	$(BIN)/python -m benchmarks.detail --quick
-	$(BIN)/python -m benchmarks.detail --quick --scales
-	$(BIN)/python -m benchmarks.streaming --quick
-	$(BIN)/python -m benchmarks.streaming_strokes --quick
-	$(BIN)/python -m benchmarks.streaming_cpu --quick
-	$(BIN)/python -m benchmarks.streaming_busy --quick
-	$(BIN)/python -m benchmarks.fuzz --cases 20
-	$(BIN)/python -m benchmarks.masks --quick
-	$(BIN)/python -m benchmarks.recolor --quick
-	$(BIN)/python -m benchmarks.looks --quick
-	$(BIN)/python -m benchmarks.denoising --quick --noise 25
+
+QUICK := \
+	'speed --quick --out out/quick/speed.json' \
+	'streaming --quick' \
+	'streaming_strokes --quick' \
+	'streaming_cpu --quick' \
+	'streaming_busy --quick' \
+	'app --side 96 --megapixels 0.05' \
+	'looks --quick' \
+	'detail --quick' \
+	'detail --quick --scales' \
+	'distributed --ranks 2 --widths 64 --landmarks 20' \
+	'tables --long-side 32' \
+	'masks --quick' \
+	'recolor --quick' \
+	'memory --side 128 --repeats 1' \
+	'fuzz --cases 20'
 
 # The weights of the denoiser, from nothing, with their figures and learning curve: about an hour on a processor with AMX.
 # A training that was stopped goes on.

@@ -7,11 +7,13 @@ Without a file it prints the places only; the exit status is 1 if a parameter is
 
 import argparse
 import ast
+from functools import cache
 from pathlib import Path
 
 import nlfilter_torch
 from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.shared_parameters import FILTER
 
 PACKAGE = Path(nlfilter_torch.__file__).parent
 INTERFACES = ("cli", "app")  # whose files may declare parameters of any edit
@@ -60,16 +62,36 @@ def places(edit: Edit, parameter: Parameter) -> list[str]:
     for path in sorted(PACKAGE.rglob("*.py")):
         file = path.relative_to(PACKAGE).as_posix()
         own = file in FILES or path.stem == edit.name or path.parent.name in INTERFACES
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        if file == "edits/parameters.py":
-            scope = next(n for n in tree.body if isinstance(n, ast.Assign) and named(n.targets[0]) == edit.name.upper())
-            names_in = {node.id for node in ast.walk(scope.value) if isinstance(node, ast.Name)}  # of what edits share
-            scopes = [scope, *(n for n in tree.body if isinstance(n, ast.Assign) and named(n.targets[0]) in names_in)]
+        if path.stem.endswith("parameters") and path.parent.name == "edits":
+            scopes = [
+                n for n in parsed(path).body if isinstance(n, ast.Assign) and named(n.targets[0]) in used(edit.name)
+            ]
             nodes = [node for one in scopes for node in ast.walk(one)]
             found += [f"{file}:{n.lineno}" for n in nodes if declares(n, parameter.name)]
         elif own:
-            found += [f"{file}:{line}" for line, name in literals(tree) if name in names]
+            found += [f"{file}:{line}" for line, name in written_in(path) if name in names]
     return found
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A file of the package."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def written_in(path: Path) -> list[tuple[int, str]]:
+    """:func:`literals` of a file of the package."""
+    return literals(parsed(path))
+
+
+@cache
+def used(edit: str) -> set[str]:
+    """Names of what the edit of a name is declared with, its own too."""
+    bodies = [parsed(path).body for path in (PACKAGE / "edits").glob("*parameters.py")]
+    assigned = [node for body in bodies for node in body if isinstance(node, ast.Assign)]
+    scope = next(node for node in assigned if named(node.targets[0]) == edit.upper())
+    return {edit.upper()} | {node.id for node in ast.walk(scope.value) if isinstance(node, ast.Name)}
 
 
 def named(node: ast.expr) -> str:
@@ -81,7 +103,7 @@ def declares(node: ast.AST, name: str) -> bool:
     """Whether a node is ``Parameter("name", ...)``, or the call of a function that makes one."""
     return (
         isinstance(node, ast.Call)
-        and named(node.func) in ("Parameter", "_curve")
+        and named(node.func) in ("Parameter", "_curve", "gain", "sliders", "choice")
         and isinstance(node.args[0], ast.Constant)
         and node.args[0].value == name
     )
@@ -117,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
     for edit in EDITS.values():
         for parameter in edit:
             if parameter.keyword in FILTER and parameter.name != "tolerance":
-                continue  # declared once for all edits, in _filter, with the edit's defaults
+                continue  # declared once for all edits, in filter_parameters, with the edit's defaults
             where = places(edit, parameter)
             worst = max(worst, len(where))
             print(f"{edit.name} {parameter.name}: {len(where)} ({', '.join(where)})")

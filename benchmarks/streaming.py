@@ -181,7 +181,7 @@ def main() -> None:
         print(json.dumps(work(Path(source), Path(target), statistics, int(landmarks), 800 * MIB)))
         return
 
-    sides = [300, 450] if options.quick else [2048, 5000, 10_000]
+    sides = [200] if options.quick else [2048, 5000, 10_000]
     runs = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -190,11 +190,11 @@ def main() -> None:
             write_mosaic(source, side)
             kinds = [("sample", 100)]
             if number == 0:
-                kinds += [("full", 100), ("sample", 50), ("sample", 200)]
+                kinds += [("full", 100)] if options.quick else [("full", 100), ("sample", 50), ("sample", 200)]
             for statistics, landmarks in kinds:
                 runs.append(in_fresh_process(folder, source, statistics, landmarks))
                 show(runs[-1])
-    exact = exactness(400, [16, 64, 400]) if options.quick else exactness(2050, [64, 256, 1000, 4096])
+    exact = exactness(200, [16, 64, 200]) if options.quick else exactness(2050, [64, 256, 1000, 4096])
     print(
         f"{exact['megapixels']:.2f} MP against memory, from a sample of {exact['sample_pixels']:.0f} pixels: "
         f"{exact['sample_max'] * 255:.2f} levels of 255 at most (RMS {exact['sample_rms'] * 255:.3f}), "

@@ -25,17 +25,19 @@ from tests.problems import cat
 PLACE = Rectangle(range(21, 83), range(33, 120))
 IN, OUT = Stroke(((0.2, 0.2), (0.3, 0.2)), 0.04, "in"), Stroke(((0.8, 0.8),), 0.04, "out")
 BLUE = Stroke(((0.37, 0.35), (0.4, 0.37)), 0.04, "#2040e0")
-REGION = Step("detail", (IN, OUT), alpha=(0.2, 1.0, 1.0), inside=(3.0, 4.0, 1.0), reach=0.5)
+REGION = Step("detail", (IN, OUT), alpha=(0.2, 1.0, 1.0), inside=(3.0, 4.0, 1.0), reach=0.5, landmarks=60)
 RECIPES = {
     "nothing": Recipe(),
-    "detail": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0)),)),
-    "detail, reduced": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), viewing_size=0.006),)),
+    "detail": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), landmarks=60),)),
+    "detail, reduced": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), viewing_size=0.006, landmarks=60),)),
     "region": Recipe((REGION,)),
     "region, reduced": Recipe((REGION.changed(viewing_size=0.006),)),
     "recolor": Recipe((Step("recolor", (BLUE,)),)),
     "defocus": Recipe((Step("defocus", (IN,)),)),
     "abstract": Recipe((Step("abstract", edges=0.5),)),
-    "several": Recipe((Step("denoise", noise_level=6.0, method="rule"), REGION, Step("tone", contrast=1.2))),
+    "several": Recipe(
+        (Step("denoise", noise_level=6.0, method="rule"), REGION, Step("tone", contrast=1.2, landmarks=60))
+    ),
 }
 
 

@@ -17,6 +17,8 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.features import reduce_channels
 from tests.problems import cat, difference
 
+FEW = {"landmarks": 60}
+
 
 def test_preview_of_a_small_photograph_is_the_photograph(session: Session) -> None:
     assert session.preview.stride == 1
@@ -31,11 +33,11 @@ def test_what_is_shown_is_what_is_saved(colour: bool) -> None:
     preview = Preview(image)
     for recipe in (
         Recipe(),
-        Recipe((Step("detail", alpha=(3.0, 2.0, 1.0)),)),
+        Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), **FEW),)),
         Recipe((Step("detail", bandwidth=15.0, spatial_bandwidth=20.0, patch_size=3, landmarks=40),)),
-        Recipe((Step("detail", (region, outside), alpha=(0.2, 1.0, 1.0), inside=(3.0, 4.0, 1.0), reach=0.5),)),
-        Recipe((Step("detail", alpha=(2.0, 1.0, 1.0, 1.0)), Step("defocus", (region,)))),
-        Recipe((Step("denoise"), Step("detail", residual=1.0), Step("tone"), Step("sharpen"))),
+        Recipe((Step("detail", (region, outside), alpha=(0.2, 1.0, 1.0), inside=(3.0, 4.0, 1.0), **FEW),)),
+        Recipe((Step("detail", alpha=(2.0, 1.0, 1.0, 1.0), **FEW), Step("defocus", (region,)))),
+        Recipe((Step("denoise"), Step("detail", residual=1.0, **FEW), Step("tone", **FEW), Step("sharpen", **FEW))),
     ):
         assert difference(preview.render(recipe), recipe.apply(image)) < 1
 

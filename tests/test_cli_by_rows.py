@@ -226,8 +226,16 @@ def test_what_is_too_large_to_be_put_together_is_named(
         assert "--memory must be a " in refused(capsys, photo, tmp_path / "o.tif", "--memory", wrong)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("target", ["out.tif", "out.zarr"])
+@pytest.mark.parametrize(
+    ("target", "number"),
+    [
+        ("out.tif", signal.SIGKILL),
+        ("out.tif", signal.SIGINT),
+        ("out.tif", signal.SIGTERM),
+        ("out.zarr", signal.SIGKILL),
+        ("out.zarr", signal.SIGTERM),
+    ],
+)
 def test_interrupted_work_leaves_nothing_that_looks_finished(
     photo: Path, tmp_path: Path, number: signal.Signals, target: str
 ) -> None:

@@ -6,11 +6,11 @@ import pytest
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.multiprocessing.spawn import spawn
 from torch.nn.parallel import DistributedDataParallel
 
 from nlfilter_torch import NonlocalFilter
 from tests.problems import noise
+from tests.ranks import run_ranks
 
 PROCESSES = 2
 STEPS = 3
@@ -64,7 +64,7 @@ def work(rank: int, folder: str) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not dist.is_available() or not dist.is_gloo_available(), reason="this torch has no gloo")
 def test_two_processes_learn_what_one_learns(tmp_path: Path) -> None:
-    spawn(work, (str(tmp_path),), nprocs=PROCESSES)
+    run_ranks(work, (str(tmp_path),), PROCESSES)
     states = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(PROCESSES)]
     alone, start = Network(), Network().state_dict()
     train(alone, *data())

@@ -1,5 +1,6 @@
 """The kernels in C compute what torch does without them, whatever the sizes, the threads and the instruction set."""
 
+from itertools import product
 from typing import Any
 
 import pytest
@@ -29,6 +30,11 @@ pytestmark = pytest.mark.skipif(not library.level, reason="this installation or 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def sizes(pixels: list[int], marks: list[int], most: int = 8_000_000) -> list[tuple[int, int]]:
+    """Pairs of these, but for those of which both are large: blocks of either kind are full in the others."""
+    return [pair for pair in product(pixels, marks) if pair[0] * pair[1] <= most]
 
 
 @pytest.fixture(params=LEVELS)
@@ -134,8 +140,7 @@ def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tens
     return newton._sweep(KernelMatrix(factor, diagonal), total)
 
 
-@pytest.mark.parametrize("pixels", [1, 7, 255, 8256, 40_000])
-@pytest.mark.parametrize("marks", [1, 3, 50, 900])
+@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 7, 255, 8256, 40_000], [1, 3, 50, 900]))
 def test_sweep(level: int, pixels: int, marks: int) -> None:
     factor = random(2, marks, pixels).abs()
     factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
@@ -149,11 +154,11 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
 
 
-@pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("pixels", [1, 9, 63, 4128, 4129, 30_001])
 @pytest.mark.parametrize("rows", [1, 2, 3, 8])
 @pytest.mark.parametrize("marks", [1, 2, 3, 5, 100])
-def test_products_with_few_rows(level: int, batch: int, pixels: int, rows: int, marks: int) -> None:
+def test_products_with_few_rows(level: int, pixels: int, rows: int, marks: int) -> None:
+    batch = 1 if pixels in (1, 4129, 30_001) else 2
     factor, vectors, images = random(batch, marks, pixels), random(batch, rows, marks), random(batch, rows, pixels)
     image = (vectors.double() @ factor.double()).float()
     torch.testing.assert_close(spread(vectors, factor), image, atol=1e-5, rtol=1e-6)
@@ -212,8 +217,7 @@ def test_ties_are_broken_by_one_rule(level: int, image: torch.Tensor, spatial_ba
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("pixels", [1, 300, 40_000])
-@pytest.mark.parametrize("marks", [1, 3, 50, 900])
+@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 300, 8256, 40_000], [1, 3, 50, 900]))
 def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
     arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
     factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
@@ -224,8 +228,7 @@ def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
     assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
 
 
-@pytest.mark.parametrize("pixels", [1, 17, 1024, 1025, 9000])
-@pytest.mark.parametrize("marks", [1, 3, 6, 7, 50, 400])
+@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 17, 1024, 1025, 9000], [1, 3, 6, 7, 50, 400], 3_000_000))
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
     factor, scaling, remainder = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, pixels).sigmoid()

@@ -2,12 +2,15 @@
 
 import base64
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import jupytext
 import nbformat
 import pytest
+from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
+from nbclient.util import run_sync
 from PIL import Image
 
 from benchmarks.notebooks import WIDEST, tidy
@@ -62,14 +65,28 @@ def test_results_are_small_pictures_and_text() -> None:
                     assert 100 < picture.width <= WIDEST
 
 
+@pytest.fixture(scope="module")
+def kernel() -> Iterator[AsyncKernelManager]:
+    """One for all notebooks, since its start and the imports take longer than most of them."""
+    manager = AsyncKernelManager(kernel_name="python3")
+    yield manager
+    run_sync(manager.shutdown_kernel)(now=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 @pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:(zmq|jupyter_client|tornado|traitlets|asyncio)")
-def test_runs(script: Path, tmp_path: Path) -> None:
+def test_runs(script: Path, tmp_path: Path, kernel: AsyncKernelManager) -> None:
     notebook = jupytext.read(script)
     if script.stem == "01_first_filter":
         notebook.cells.append(nbformat.v4.new_code_cell(DRAG))
-    NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()
+    forget = nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}")  # as in a kernel of its own
+    notebook.cells.insert(0, forget)
+    client = NotebookClient(notebook, km=kernel, timeout=300, resources={"metadata": {"path": tmp_path}})
+    client.execute()
+    assert client.kc is not None
+    client.kc.stop_channels()
+    notebook.cells.pop(0)
     warned = [
         output.text
         for cell in notebook.cells

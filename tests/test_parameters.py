@@ -9,7 +9,8 @@ import nlfilter_torch
 from benchmarks import parameters
 from nlfilter_torch.edits.applying import FITS
 from nlfilter_torch.edits.declaration import Edit, Parameter
-from nlfilter_torch.edits.parameters import EDITS, FILTER
+from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.shared_parameters import FILTER
 from tests.pages import ROOT
 
 EVERY = [(edit, parameter) for edit in EDITS.values() for parameter in edit]

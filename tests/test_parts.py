@@ -18,12 +18,12 @@ from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import cat
 from tests.test_whole_edit import COLORIZE, DETAIL, IN, RECOLOR, rows_of
 
-SMALL = 0.006  # megapixels, fewer than the cat has
+SMALL = 0.002  # megapixels, fewer than the cat has
 PLACES = [
-    Rectangle(range(100), range(150)),
-    Rectangle(range(13, 60), range(31, 97)),
-    Rectangle(range(20), range(120, 150)),
-    Rectangle(range(71, 100), range(1)),
+    Rectangle(range(60), range(90)),
+    Rectangle(range(8, 36), range(19, 58)),
+    Rectangle(range(12), range(72, 90)),
+    Rectangle(range(43, 60), range(1)),
 ]
 EDITS = {
     "nothing": Recipe(),
@@ -60,7 +60,7 @@ def test_a_part_is_that_of_the_whole(
         monkeypatch.setattr("nlfilter_torch.edits.mask.SOLVED", 2000)
         monkeypatch.setattr("nlfilter_torch.edits.local_values.SOLVED", 2000)
         monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP", 1000)
-    source, passes = rows_of(cat()), Passes("float32", folder=tmp_path, **options)
+    source, passes = rows_of(cat(5)), Passes("float32", folder=tmp_path, **options)
     wanted = whole(EDITS[name], source, passes)
     parts = Parts(source, "scan.tif")
     parts.fit(EDITS[name], passes)
@@ -79,7 +79,7 @@ def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPa
         return fit_step(step, *arguments)
 
     monkeypatch.setattr("nlfilter_torch.tiled.parts.fit_step", counted)
-    source, passes, place = rows_of(cat()), Passes("float32", "full"), PLACES[1]
+    source, passes, place = rows_of(cat(5)), Passes("float32", "full"), PLACES[1]
     parts = Parts(source, "scan.tif")
     detail, tone, recolor = Step("detail", alpha=(2.0, 1.0), landmarks=40), Step("tone", landmarks=40), RECOLOR
     for steps, wanted in (
@@ -107,7 +107,11 @@ def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("after", [1, 4, 8])
 def test_a_fit_that_is_interrupted_leaves_what_was_known(after: int) -> None:
     """The report of the progress raises; the next fit is as good as the first."""
-    source, recipe, place = rows_of(cat()), Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=40), RECOLOR)), PLACES[1]
+    source, recipe, place = (
+        rows_of(cat(5)),
+        Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=40), RECOLOR)),
+        PLACES[1],
+    )
     calls = 0
 
     def interrupt(stage: str, done: int, rows: int) -> None:

@@ -15,7 +15,6 @@ import pytest
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch.multiprocessing.spawn import spawn
 
 from benchmarks.distributed import watched
 from nlfilter_torch import (
@@ -33,6 +32,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.core.communicator import ALONE, RowCommunicator, all_gather_shapes
 from tests.problems import noise, picture, seeded
+from tests.ranks import run_ranks
 
 pytestmark = [
     pytest.mark.slow,
@@ -309,7 +309,7 @@ def work(rank: int, folder: str) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the processes found."""
     path = tmp_path_factory.mktemp("ranks")
-    spawn(work, (str(path),), nprocs=PROCESSES)
+    run_ranks(work, (str(path),), PROCESSES)
     return path
 
 

@@ -238,7 +238,7 @@ def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
     for options in ({}, {"regions": spots(150, 67)}):
         first, *others = (
             streamed(picture, statistics=statistics, sample=4000, num_landmarks=50, tile_rows=rows, **options)
-            for rows in (1, 16, 64, 4096)
+            for rows in (1, 16, 4096)
         )
         assert max(np.abs(other - first).max() for other in others) < 2.5e-7  # of the colours' conversion alone
 

@@ -23,10 +23,10 @@ def trained(steps: int, seed: int = 0, **options: bool) -> Training:
 @pytest.mark.slow
 @pytest.mark.parametrize("plain", [False, True])
 def test_loss_falls_and_every_part_learns(plain: bool) -> None:
-    training = Training(0, side=32, plain=plain)
+    training = Training(0, side=16, plain=plain)
     before = {name: value.detach().clone() for name, value in training.model.named_parameters()}
-    training.run(150)
-    assert len(training.losses) == 150
+    training.run(100)
+    assert len(training.losses) == 100
     clean, noisy, told = training.aside[0]
     with torch.no_grad():
         at_last = loss_of(training.denoise(training.model, noisy, told), clean)

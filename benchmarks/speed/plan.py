@@ -105,6 +105,7 @@ QUICK = Plan(
     pause=0.0,
     processes=1,
     probes=2,
+    threads=(1, 2),
 )
 
 

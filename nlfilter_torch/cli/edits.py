@@ -110,8 +110,8 @@ def _argument(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _declared(parameters: Iterable[Parameter]) -> list[inspect.Parameter]:
-    return [_argument(p.name, option(p), option_value(p, p.default)) for p in parameters]
+def _declared(parameter: Parameter, panel: str | None = None) -> inspect.Parameter:
+    return _argument(parameter.name, option(parameter, panel), option_value(parameter, parameter.default))
 
 
 def signature(edit: Edit) -> inspect.Signature:
@@ -121,7 +121,7 @@ def signature(edit: Edit) -> inspect.Signature:
             _argument("source", options.Source, inspect.Parameter.empty),
             _argument("target", options.Target, inspect.Parameter.empty),
             *(_argument(name, annotation, None) for name, annotation in SCRIBBLES.get(edit.name, {}).items()),
-            *_declared(p for p in edit if p.is_option),
+            *(_declared(p) for p in edit if p.is_option),
             _argument("depth", options.OutputDepth, None),
             _argument("seed", options.Seed, 0),
             _argument("memory", options.Memory, None),
@@ -136,17 +136,12 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[.
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         found = inspect.signature(function, eval_str=True).parameters.values()
         own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in found if p.kind != p.VAR_KEYWORD]
-        declared = {name: option(EDITS["detail"][name]) for name in names}
-        defaults = {name: EDITS["detail"][name] for name in names}
+        added = {name: _declared(EDITS["detail"][name]) for name in names}
         for edit in more:
             for parameter in edit:
-                if parameter.is_option and parameter.name not in declared:
-                    declared[parameter.name] = option(parameter, f"Options of {edit.name}")
-                    defaults[parameter.name] = parameter
-        added = [
-            _argument(name, of, option_value(defaults[name], defaults[name].default)) for name, of in declared.items()
-        ]
-        signature = inspect.Signature([*own, *added])
+                if parameter.is_option and parameter.name not in added:
+                    added[parameter.name] = _declared(parameter, f"Options of {edit.name}")
+        signature = inspect.Signature([*own, *added.values()])
         setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
         return function
 

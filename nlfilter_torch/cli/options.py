@@ -6,7 +6,7 @@ appear at once.
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -106,82 +106,54 @@ Full = Annotated[
         help="In tiles: learn from every pixel to the last digit. Takes two or three times as long.",
     ),
 ]
-StrokesFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--strokes",
-        metavar="FILE",
-        help="Scribbles over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where nothing is "
-        "drawn.",
-    ),
-]
-ColourRegions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        metavar="X,Y,W,H:COLOUR",
-        help="A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, "
-        "width and height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a "
-        "small square around that point. May be given several times; later ones cover earlier ones.",
-    ),
-]
-Keeps = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--keep",
-        metavar="X,Y,W,H",
-        help="A rectangle; whatever looks like it stays as it is. May be given several times.",
-    ),
-]
-Regions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        metavar="X,Y,W,H",
-        help="A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the "
-        "photograph; X,Y alone is a small square around that point. May be given several times.",
-    ),
-]
-Backgrounds = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--background",
-        metavar="X,Y,W,H",
-        help="A rectangle of what is around, where the mask takes in too much. May be given several times.",
-    ),
-]
-SliderRegions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        metavar="X,Y,W,H[:SLIDERS]",
-        help="Edit only what looks like a rectangle: column and row of its upper left corner, its width and height, "
-        "and its own sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be given several times.",
-    ),
-]
-MaskFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--mask",
-        metavar="FILE",
-        help="A picture of the size of the photograph, white where it is selected and black elsewhere.",
-    ),
-]
-NoiseMap = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        metavar="FILE",
-        help="Write the noise as a picture, too: its standard deviation at every pixel; white is 64 grey levels.",
-        show_default=False,
-    ),
-]
-Show = Annotated[
-    Path | None,
-    typer.Option(
-        "--show",
-        metavar="FILE",
-        help="A picture to write before the edit: the photograph, reduced, with scribbles and what they select over "
-        "it.",
-    ),
-]
+
+
+def _file(name: str, help: str) -> Any:
+    """An option for a file."""
+    return Annotated[Path | None, typer.Option(name, metavar="FILE", help=help)]
+
+
+def _rectangles(name: str, metavar: str, help: str) -> Any:
+    """An option for rectangles, which may be given several times."""
+    return Annotated[list[str] | None, typer.Option(name, metavar=metavar, help=help)]
+
+
+StrokesFile = _file(
+    "--strokes",
+    "Scribbles over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where nothing is drawn.",
+)
+ColourRegions = _rectangles(
+    "--region",
+    "X,Y,W,H:COLOUR",
+    "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width and "
+    "height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small square "
+    "around that point. May be given several times; later ones cover earlier ones.",
+)
+Keeps = _rectangles(
+    "--keep", "X,Y,W,H", "A rectangle; whatever looks like it stays as it is. May be given several times."
+)
+Regions = _rectangles(
+    "--region",
+    "X,Y,W,H",
+    "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; X,Y "
+    "alone is a small square around that point. May be given several times.",
+)
+Backgrounds = _rectangles(
+    "--background",
+    "X,Y,W,H",
+    "A rectangle of what is around, where the mask takes in too much. May be given several times.",
+)
+SliderRegions = _rectangles(
+    "--region",
+    "X,Y,W,H[:SLIDERS]",
+    "Edit only what looks like a rectangle: column and row of its upper left corner, its width and height, and its own "
+    "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be given several times.",
+)
+MaskFile = _file("--mask", "A picture of the size of the photograph, white where it is selected and black elsewhere.")
+NoiseMap = _file(
+    "--map", "Write the noise as a picture, too: its standard deviation at every pixel; white is 64 grey levels."
+)
+Show = _file(
+    "--show",
+    "A picture to write before the edit: the photograph, reduced, with scribbles and what they select over it.",
+)

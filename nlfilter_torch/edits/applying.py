@@ -15,9 +15,9 @@ from nlfilter_torch.edits.defocus import fit_defocus
 from nlfilter_torch.edits.denoise import fit_denoise
 from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.edits.look import fit_look_edit
-from nlfilter_torch.edits.parameters import FILTER
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
+from nlfilter_torch.edits.shared_parameters import FILTER
 from nlfilter_torch.edits.sharpen import fit_sharpen
 from nlfilter_torch.edits.source import Fitted, InMemory, Source, edited
 from nlfilter_torch.edits.steps import Step

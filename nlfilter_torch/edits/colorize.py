@@ -6,7 +6,6 @@ mean is better than either of them.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, cast
@@ -23,9 +22,10 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
+from nlfilter_torch.edits.components import scribbled_blocks
 from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.parameters import COLORIZE
-from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Source, edited, luminance
+from nlfilter_torch.edits.source import Fitted, Guide, Operator, Source, edited, luminance
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.spectrum import Spectrum
@@ -187,7 +187,7 @@ def fit_colorize(
         operator = operator_of(stage)
         columns = operator.at(scribbles.places)
         fitted = fit_strokes(
-            partial(_scribbled, columns, scribbles.weights, wanted),
+            partial(scribbled_blocks, [(columns, scribbles.weights, wanted)]),
             operator.pairs,
             pixels,
             strength=strength if stage is FAR else 0.0,
@@ -205,12 +205,3 @@ def fit_colorize(
         return merge_luminance(grey, alike + SHARE * (with_green(connected) - influence * alike))
 
     return Fitted(coloured)
-
-
-def _scribbled(columns: Blocks, weights: Tensor, values: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Columns, weights and values of scribbled pixels, block by block."""
-    first = 0
-    for block in columns():
-        part = slice(first, first + block.shape[2])
-        yield block, weights[:, :, part], values[:, :, part]
-        first = part.stop

@@ -10,7 +10,7 @@ from nlfilter_torch.core.checks import check_image, check_order, check_photograp
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.applying import apply_step, seeded
 from nlfilter_torch.edits.detail import options_of
-from nlfilter_torch.edits.parameters import KNOTS, SATURATIONS, STRAIGHT
+from nlfilter_torch.edits.look_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.recipe import in_file
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.steps import Step

@@ -32,7 +32,6 @@ ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
 }
 BT601, BT709 = 5, 1  # matrices, as swscale numbers them
 MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}  # from the numbers of H.273
-UNTAGGED = 2
 LIMITED, FULL = 1, 2  # ranges of brightness
 HD = 720  # rows from which players take films without a tag for BT.709
 OF_THE_FILE = ("major_brand", "minor_version", "compatible_brands", "encoder")  # entries that describe the file itself

@@ -8,12 +8,11 @@ from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_count, check_image
 from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
+from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
-
-NEAR = 1 / 12  # spatial bandwidth, as a share of the short side, of looks that fit_look finds
 
 
 class Look(nn.Module):
@@ -73,7 +72,7 @@ class Look(nn.Module):
                 self.register_parameter(name, nn.Parameter(own))
             else:
                 self.register_buffer(name, own)
-        self.options = {"photometric_bandwidth": 20 / 255, "num_landmarks": 300, **options}
+        self.options = {"photometric_bandwidth": LEVELS / 255, "num_landmarks": LANDMARKS, **options}
 
     def forward(self, image: Tensor, operator: NonlocalOperator | None = None, **parts: Tensor) -> Tensor:
         """The image under the look, (B, 3, H, W); values may leave [0, 1].

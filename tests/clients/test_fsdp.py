@@ -8,8 +8,8 @@ import torch.distributed as dist
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from torch.distributed.device_mesh import init_device_mesh
 from torch.distributed.fsdp import fully_shard
-from torch.multiprocessing.spawn import spawn
 
+from tests.ranks import run_ranks
 from tests.test_distributed import PROCESSES, Network, data, train
 
 
@@ -33,7 +33,7 @@ def work(rank: int, folder: str) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not dist.is_available() or not dist.is_gloo_available(), reason="this torch has no gloo")
 def test_two_shards_learn_what_one_process_learns(tmp_path: Path) -> None:
-    spawn(work, (str(tmp_path),), nprocs=PROCESSES)
+    run_ranks(work, (str(tmp_path),), PROCESSES)
     sharded = torch.load(tmp_path / "sharded.pt", weights_only=True)
     alone = Network()
     train(alone, *data())

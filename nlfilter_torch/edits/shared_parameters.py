@@ -1,0 +1,153 @@
+"""Parameters that several edits share, and functions that declare parameters of a kind."""
+
+from typing import Any
+
+from nlfilter_torch.edits.declaration import (
+    BANDWIDTHS,
+    DISTANCES,
+    GAINS,
+    MAX_LANDMARKS,
+    MAX_PATCH,
+    Parameter,
+    Slider,
+    Unit,
+)
+from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
+
+ALIKE = "How different two spots may be and still count as alike"
+#: Arguments of the filter of an edit.
+FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
+
+
+def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
+    """A factor."""
+    return Parameter(name, "number", default, help, *GAINS, "gain", domain="finite", **more)
+
+
+def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
+    """A list of numbers."""
+    return Parameter(name, "sliders", default, help, *GAINS, unit, **more)
+
+
+def choice(name: str, choices: tuple[str, ...], help: str) -> Parameter:
+    """One of some words, the first by default."""
+    return Parameter(name, "choice", choices[0], help, domain="choice", choices=choices)
+
+
+def filter_parameters(
+    *,
+    bandwidth: Any = None,
+    share: float = 0.0,
+    patch_size: int = 5,
+    landmarks: int = 100,
+    auto: bool = False,
+    far: bool = False,
+) -> tuple[Parameter, ...]:
+    """Parameters of the filter of an edit, with its defaults; ``far`` if distance may also not count at all."""
+    levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) touch fine texture only, large ones (40) treat "
+    photometric = Parameter(
+        "bandwidth",
+        "number",
+        bandwidth,
+        levels + ("much as detail. `auto` looks at the picture." if auto else "much as one."),
+        *BANDWIDTHS,
+        "levels",
+        words=("auto",) if auto else (),
+        optional=bandwidth is None,
+        argument="photometric_bandwidth",
+    )
+    reach = "as far as the picture goes" if share == 0 else f"{share:.2g} of the short side"
+    if far:
+        reach += ". `none`: distance does not count, and large areas of light and dark are details, too"
+    return (
+        photometric,
+        Parameter(
+            "spatial_bandwidth",
+            "number",
+            None,
+            f"How far apart two spots may be and still count as alike. Left out: {reach}.",
+            *DISTANCES,
+            "px",
+            words=("none",) if far else (),
+            optional=True,
+            share=share,
+        ),
+        Parameter(
+            "patch_size",
+            "odd",
+            patch_size,
+            "Width of the patch around each spot that is compared; an odd number. 1 compares single pixels.",
+            1,
+            MAX_PATCH,
+            "px",
+        ),
+        Parameter(
+            "landmarks",
+            "count",
+            landmarks,
+            "Number of typical patches that stand for the whole picture. More are truer, slower and take more memory.",
+            1,
+            MAX_LANDMARKS,
+            argument="num_landmarks",
+            metavar="N",
+        ),
+        Parameter(
+            "sampling",
+            "choice",
+            "kmeans",
+            "How the typical patches are found: by grouping similar ones, on a regular grid, or at random.",
+            choices=("kmeans", "uniform", "random"),
+            argument="landmarks",
+        ),
+    )
+
+
+#: Of all edits of brightness that tell shading from detail.
+WITHOUT_SHADING = filter_parameters(bandwidth=LEVELS, share=NEAR, landmarks=LANDMARKS, auto=True, far=True)
+#: Of all edits of brightness.
+LIMITS = choice(
+    "limits",
+    ("soft", "none"),
+    "How far pixels may get brighter or darker: `soft` keeps what highlights and shadows show, `none` lets them clip.",
+)
+#: Likewise.
+VIEWING_SIZE = Parameter(
+    "viewing_size",
+    "number",
+    1.5,
+    "Size at which the picture is looked at, in millions of pixels, so that the sliders do the same to it at any "
+    "resolution. In larger photographs patches and lengths are counted in pixels of that size. 0: of the file.",
+    0,
+    1e6,
+    domain="not negative",
+    zero="0 is the size of the image",
+    metavar="MEGAPIXELS",
+)
+#: Of all edits that find a thing.
+TOLERANCE = Parameter(
+    "tolerance",
+    "number",
+    8.0,
+    "How different two colours may be and still count as alike, in units of CIE Lab.",
+    1,
+    100,
+    "lab",
+    argument="photometric_bandwidth",
+)
+#: Of all edits that find regions.
+REACH = Parameter(
+    "reach",
+    "number",
+    0.6,
+    "How far a region spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+    0,
+    0.999,
+    domain="below 1",
+    metavar="0...1",
+)
+REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
+
+
+def reach_of_time(time: float) -> float:
+    """The reach of a region for the diffusion time that files had in its place: 0.6 for 1, the default of both."""
+    return time / (time + 2 / 3) if time > 0 else time
