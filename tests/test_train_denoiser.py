@@ -10,7 +10,7 @@ import torch
 from benchmarks import denoising, train_denoiser
 from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
 from benchmarks.denoising import HELD_OUT, LEFT_HALVES, Case, decibels, scenes, table, with_noise
-from benchmarks.train_denoiser import PlainDenoiser, Training, loss_of, main, rate_at
+from benchmarks.train_denoiser import EXPECTED, PlainDenoiser, Training, errors, loss_of, main, rate_at
 from nlfilter_torch import NonlocalDenoiser
 
 
@@ -29,8 +29,8 @@ def test_loss_falls_and_every_part_learns(plain: bool) -> None:
     assert len(training.losses) == 150
     clean, noisy, told = training.aside[0]
     with torch.no_grad():
-        at_last = loss_of(training.denoise(training.model, noisy, told), clean)
-    assert at_last < 0.8 * loss_of(noisy, clean)
+        at_last = errors(training.denoise(training.model, noisy, told), clean)
+    assert at_last.mean() < 0.8 * errors(noisy, clean).mean()
     for name, value in training.model.named_parameters():
         assert not torch.equal(value, before[name]), name
 
@@ -82,9 +82,14 @@ def test_the_rate_rises_stays_and_falls() -> None:
     assert rates[-1] < 1e-4
 
 
-def test_loss_is_a_mean_of_grey_levels() -> None:
+def test_loss_is_the_mean_error_over_what_the_noise_makes_expect() -> None:
     clean = torch.zeros(2, 1, 4, 4)
-    assert float(loss_of(clean + torch.tensor([1.0, 3.0]).view(2, 1, 1, 1) / 255, clean)) == pytest.approx(2, rel=1e-3)
+    denoised, noisy = (
+        torch.tensor(levels).view(2, 1, 1, 1).expand(2, 1, 4, 4) / 255 for levels in ([1.0, 3], [5.0, 19])
+    )
+    assert errors(denoised, clean).tolist() == pytest.approx([1, 3], rel=1e-3)
+    wanted = (1 / 6**EXPECTED + 3 / 20**EXPECTED) / 2
+    assert float(loss_of(denoised, clean, noisy)) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_the_network_without_the_filter_has_as_many_weights_at_least() -> None:
