@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import denoising, train_denoiser
+from benchmarks import denoising, denoising_tables, train_denoiser
 from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
 from benchmarks.denoising import HELD_OUT, LEFT_HALVES, Case, decibels, scenes, table, with_noise
 from benchmarks.train_denoiser import EXPECTED, PlainDenoiser, Training, errors, loss_of, main, rate_at
@@ -139,11 +139,31 @@ def test_scenes_are_grey_or_in_colour_and_have_noise_of_their_own() -> None:
 
 def test_the_benchmark_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figures.json"
-    denoising.main(["--quick", "--noise", "25", "--networks", "--wrong", "--out", str(out)])
+    denoising.main(["--quick", "--noise", "25", "--methods", "noisy", "ours", "--wrong", "--out", str(out)])
     figures = json.loads(out.read_text())
     assert set(figures) == {"grey, 25", "colour, 25"}
     assert figures["grey, 25"]["ours"]["camera"]["psnr"] > figures["grey, 25"]["noisy"]["camera"]["psnr"]
-    assert "estimated noise" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "estimated noise" in printed
+    denoising.main(["--quick", "--noise", "25", "--kinds", "grey", "--methods", "rule", "--out", str(out)])
+    assert set(json.loads(out.read_text())["grey, 25"]) == {"noisy", "ours", "rule"}
+
+    page = tmp_path / "page.md"
+    page.write_text("above\n{}\n{}\nbelow".format(*denoising_tables.MARKERS))
+    denoising_tables.main([str(out), "--docs", str(page)])
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("above", "below")
+    row = next(line for line in lines if line.startswith("| ours"))
+    mean = sum(found["psnr"] for found in figures["grey, 25"]["ours"].values()) / 2
+    assert f"{mean:.2f}" in row
+
+
+def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> None:
+    page, figures = tmp_path / "page.md", tmp_path / "figures.json"
+    page.write_text("no markers")
+    figures.write_text('{"grey, 25": {"ours": {"camera": {"psnr": 30.0, "ssim": 0.9, "seconds": 1.0}}}}')
+    with pytest.raises(ValueError, match="the file must hold the lines '<!-- denoising"):
+        denoising_tables.main([str(figures), "--docs", str(page)])
 
 
 @pytest.mark.parametrize(
