@@ -88,7 +88,7 @@ QUICK := \
 # The weights of the denoiser, from nothing, with their figures and learning curve: about an hour on a processor with AMX.
 # A training that was stopped goes on.
 train: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser --half --steps 9500 --out out/denoiser
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser --half --out out/denoiser
 	cp out/denoiser/denoiser.safetensors nlfilter_torch/nn/
 	cp out/denoiser/denoiser.json docs/
 	cp out/denoiser/curve.png docs/denoiser.png

@@ -33,6 +33,7 @@ PICTURES = {
 RIGHT_HALVES = ("retina", "page")
 SCALES = (1.0, 0.8, 0.6, 0.4, 0.28)
 LARGEST = 60 / 255  # standard deviation of noise
+MISSTATED = 0.75, 1.35  # noise as told over the noise that is there, in half of the crops
 
 
 class Crops:
@@ -142,12 +143,14 @@ class Crops:
         if self._chance(0.6):
             mean = crop.mean(0, keepdim=True)
             crop = torch.lerp(mean.expand_as(crop), crop, self._number(0, 1.5)).clamp(0, 1)
+        if self._chance(0.35):  # light of another colour
+            crop = crop.clamp(0, 1) ** (0.7 + 0.8 * self._random(3, 1, 1)) * (0.15 + 0.85 * self._random(3, 1, 1))
         return crop
 
     def _noise(self, clean: Tensor) -> tuple[Tensor, Tensor]:
         """Noisy crops and what is told of the noise: even, changing from place to place, or with the light."""
         each = (len(clean), 1, 1, 1)
-        level = LARGEST * self._random(*each) * torch.where(self._random(*each) < 0.15, 0.17, 1.0)
+        level = LARGEST * self._random(*each) ** 1.4
         shades = F.interpolate(self._random(len(clean), 1, 3, 3), clean.shape[-2:], mode="bilinear", align_corners=True)
         gain = level.square() * (0.5 + 1.5 * self._random(*each))  # variance at white
         dark = (0.3 * level * self._random(*each)).square()
@@ -158,6 +161,8 @@ class Crops:
         noisy = clean + deviation * torch.randn(clean.shape, generator=self.generator)
         seen = F.avg_pool2d(F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1)  # the light as it can be known
         told = torch.where(kind < 0.82, uneven, (gain * seen.clamp(min=0) + dark).sqrt())
-        wrong = torch.where(self._random(*each) < 0.2, 0.8 + 0.45 * self._random(*each), 1.0)
+        low, high = (math.log(factor) for factor in MISSTATED)
+        factor = (low + (high - low) * self._random(*each)).exp()
+        wrong = torch.where(self._random(*each) < 0.5, factor, 1.0)
         clipped = torch.where(self._random(*each) < 0.15, noisy.clamp(0, 1), noisy)
         return clipped, told * wrong

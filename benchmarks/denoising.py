@@ -1,4 +1,4 @@
-"""Denoisers beside each other: ``python -m benchmarks.denoising [--pictures FOLDER] [--quick] [--out FILE]``.
+"""Denoisers beside each other: ``python -m benchmarks.denoising [--pictures FOLDER] [--methods NAMES] [--out FILE]``.
 
 Photographs that nothing was trained on, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour: PSNR,
 SSIM and CPU seconds of
@@ -11,9 +11,11 @@ scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_cha
 OpenCV           ``fastNlMeansDenoising`` on 8 bits, with the best of four strengths for each photograph;
 plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.train_denoiser --plain``.
 
-``--weights FILE`` judges other weights than those of the package, and may be given several times. ``--noise`` and
-``--kinds`` choose a part; without ``--pictures``, the photographs are camera, coffee, chelsea and the left halves of
-retina and page. ``--wrong`` adds: noise misstated by a fifth, noise that depends on the light, and clean photographs.
+``--methods``, ``--noise`` and ``--kinds`` choose a part of it; what is measured is added to the file ``--out``, from
+which ``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` judges other weights than those of the
+package, and may be given several times. Without ``--pictures``, the photographs are camera, coffee, chelsea and the
+left halves of retina and page. ``--wrong`` adds: noise misstated by a fifth, noise that depends on the light, and clean
+photographs.
 """
 
 import argparse
@@ -23,7 +25,9 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,6 +43,7 @@ LEFT_HALVES = ("retina", "page")
 NOISE = (5, 15, 25, 50)  # grey levels
 OPENCV_STRENGTHS = (0.6, 0.8, 1.0, 1.2)  # times the noise level
 TV_WEIGHTS = (0.5, 0.7, 0.9, 1.1, 1.4)  # times the noise level
+GAINS, FLOOR = (0.002, 0.01), 2 / 255  # of noise that grows with the light, as in cameras
 LONGEST = 512  # pixels of the longer side; larger photographs are reduced
 
 
@@ -184,6 +189,7 @@ def best(case: Case, results: Iterable[Tensor]) -> Tensor:
     return max(results, key=lambda found: psnr(found, case.clean))
 
 
+@cache
 def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method:
     """The trained network of a file, or of the package, told the noise."""
     from benchmarks.train_denoiser import PlainDenoiser
@@ -197,6 +203,21 @@ def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method
         return denoised
 
     return run
+
+
+#: What ``--methods`` takes.
+METHODS: dict[str, Method] = {
+    "noisy": lambda case: case.noisy,
+    "ours": lambda case: network(None)(case),
+    "ours, 4 turns": lambda case: network(None, turns=4)(case),
+    "ours, measured": lambda case: denoise(case.noisy),
+    "rule": lambda case: denoise(case.noisy, method="rule", noise_level=case.noise),
+    "BM3D": bm3d,
+    "scikit-image NLM": nlm,
+    "scikit-image TV": total_variation,
+    "scikit-image wavelets": wavelets,
+    "OpenCV NLM": opencv,
+}
 
 
 def judge(method: Method, case: Case) -> Figures:
@@ -238,6 +259,17 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
         estimated = psnr(denoise(image), image)
         told = [psnr(denoiser(Case(name, image, image, level / 255)), image) for level in (1, 2)]
         print(f"  {name:20}{estimated:8.1f}" + "".join(f"{value:8.1f}" for value in told))
+    print(
+        "\nnoise whose variance grows with the light, by 0.002 and 0.01 of it: PSNR with the noise known, and estimated"
+    )
+    for number, (name, image) in enumerate(clean.items()):
+        line = f"  {name:20}"
+        for gain in GAINS:
+            deviation = (gain * image + FLOOR**2).sqrt()
+            noisy = with_noise(image, deviation, number)
+            known = psnr(NonlocalDenoiser.trained()(noisy, deviation).detach(), image)
+            line += f"{known:8.2f}{psnr(denoise(noisy), image):8.2f}"
+        print(line)
     print("\nestimated noise in grey levels, for 5, 15, 25 and 50")
     for number, (name, image) in enumerate(clean.items()):
         found = [255 * float(estimate_noise(with_noise(image, level / 255, number))) for level in NOISE]
@@ -252,30 +284,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--kinds", nargs="+", choices=("grey", "colour"), default=("grey", "colour"))
     parser.add_argument("--weights", type=Path, action="append", default=[], help="further networks to judge")
     parser.add_argument("--plain", type=Path, action="append", default=[], help="networks without the filter to judge")
-    parser.add_argument("--networks", action="store_true", help="judge networks alone")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=tuple(METHODS), help="default: all")
     parser.add_argument("--wrong", action="store_true", help="noise misstated and estimated, and clean photographs")
     parser.add_argument("--quick", action="store_true", help="small parts of two photographs, to see that it runs")
     parser.add_argument("--out", type=Path, help="a JSON file of all figures")
     options = parser.parse_args(arguments)
-    own = network(None)
-    methods: dict[str, Method] = {
-        "noisy": lambda case: case.noisy,
-        "ours": own,
-        "ours, 4 turns": network(None, turns=4),
-    }
+    methods = {name: METHODS[name] for name in options.methods}
     methods |= {path.parent.name: network(path) for path in options.weights}
-    methods |= {f"plain, {path.parent.name}": network(path, plain=True) for path in options.plain}
-    if not options.networks:
-        methods |= {
-            "ours, measured": lambda case: denoise(case.noisy),
-            "rule": lambda case: denoise(case.noisy, method="rule", noise_level=case.noise),
-            "BM3D": bm3d,
-            "scikit-image NLM": nlm,
-            "scikit-image TV": total_variation,
-            "scikit-image wavelets": wavelets,
-            "OpenCV NLM": opencv,
-        }
-    figures = {}
+    methods |= {
+        "plain" if path.parent.name == "plain" else f"plain, {path.parent.name}": network(path, plain=True)
+        for path in options.plain
+    }
+    figures: dict[str, dict[str, Any]] = {}
+    if options.out is not None and options.out.exists():
+        figures = json.loads(options.out.read_text())
     for kind in options.kinds:
         clean = scenes(options.pictures, kind, quick=options.quick)
         for level in options.noise:
@@ -285,14 +307,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ]
             print(f"\n{kind}, noise {level:g}")
             rows = table(methods, cases)
-            figures[f"{kind}, {level:g}"] = {
-                name: {scene: asdict(found) for scene, found in row.items()} for name, row in rows.items()
-            }
+            figures.setdefault(f"{kind}, {level:g}", {}).update(
+                {name: {scene: asdict(found) for scene, found in row.items()} for name, row in rows.items()}
+            )
+            if options.out is not None:
+                with open_beside(options.out) as stream:
+                    stream.write(json.dumps(figures, indent=1).encode())
         if options.wrong:
-            misstated(own, clean)
-    if options.out is not None:
-        with open_beside(options.out) as stream:
-            stream.write(json.dumps(figures, indent=2).encode())
+            misstated(network(None), clean)
 
 
 if __name__ == "__main__":

@@ -221,17 +221,17 @@ def readme_part(results: Results) -> str:
     )
 
 
-def between_markers(text: str, part: str) -> str:
-    """``text`` with what stands between the markers replaced.
+def between(text: str, part: str, begin: str, end: str) -> str:
+    """``text`` with what stands between two markers replaced.
 
     Raises:
         ValueError: if it lacks one of them.
     """
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"the README must hold the lines {BEGIN!r} and {END!r}, got neither or one; add both")
-    return f"{before}{BEGIN}\n\n{part}\n\n{END}{after}"
+    before, first, rest = text.partition(begin)
+    _, last, after = rest.partition(end)
+    if not first or not last:
+        raise ValueError(f"the file must hold the lines {begin!r} and {end!r}, got neither or one; add both")
+    return f"{before}{begin}\n\n{part}\n\n{end}{after}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -254,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.readme:
         if results["quick"] or not records_of(results, "main"):
             sys.exit("the README takes figures of a full run only; run python -m benchmarks.speed without --quick")
-        write(options.readme, between_markers(options.readme.read_text(), readme_part(results)).encode())
+        write(options.readme, between(options.readme.read_text(), readme_part(results), BEGIN, END).encode())
     print(text)
 
 

@@ -35,8 +35,10 @@ from nlfilter_torch.plotting import save_figure
 
 BATCH = 6  # crops in a step
 SIDE = 64  # pixels of a crop
-RATE = 2e-3  # of Adam
+RATE = 4e-3  # of Muon, for the kernels of the convolutions
+ADAM_RATE = 2e-3  # of Adam, for all else
 BANDWIDTH_RATE = 5.0  # times that for bandwidths, which are single numbers and learn as logarithms
+EXPECTED = 0.55  # power of the noise that the error of a denoiser grows with
 WARM_UP = 200  # steps over which the rate rises
 FALL = 0.4  # last share of the steps, over which it falls to nothing along half a cosine
 LARGEST_GRADIENT = 0.5  # its norm
@@ -52,18 +54,23 @@ class PlainDenoiser(NonlocalDenoiser):
         super().__init__()
         del self.log_bandwidths
         self.guide = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
-        self.last = nn.Conv2d(WIDTH, PLANES, 1)
+        self.picture = nn.Conv2d(WIDTH, PLANES, 1)
         self.register_buffer("log_bandwidths", torch.zeros(2), persistent=False)
 
     def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
         """What the convolutions take for the picture."""
-        found: Tensor = self.last(F.leaky_relu(self.guide(F.leaky_relu(features, 0.1)), 0.1))
+        found: Tensor = self.picture(F.leaky_relu(self.guide(F.leaky_relu(features, 0.1)), 0.1))
         return planes + found.to(planes)
 
 
-def loss_of(denoised: Tensor, clean: Tensor) -> Tensor:
-    """Mean root mean squared error of crops, in grey levels."""
-    return 255 * ((denoised - clean).square().mean((1, 2, 3)) + 1e-8).sqrt().mean()
+def errors(image: Tensor, clean: Tensor) -> Tensor:
+    """Root mean squared error of each crop, in grey levels."""
+    return 255 * ((image - clean).square().mean((1, 2, 3)) + 1e-8).sqrt()
+
+
+def loss_of(denoised: Tensor, clean: Tensor, noisy: Tensor) -> Tensor:
+    """Mean error of crops, over what is to be expected of their noise, so that weak noise counts as much as strong."""
+    return (errors(denoised, clean) / (1 + errors(noisy, clean)) ** EXPECTED).mean()
 
 
 def rate_at(step: int, steps: int) -> float:
@@ -72,6 +79,11 @@ def rate_at(step: int, steps: int) -> float:
         return (step + 1) / WARM_UP
     passed = max(0.0, (step / steps - (1 - FALL)) / FALL)
     return 0.5 + 0.5 * float(torch.cos(torch.tensor(torch.pi * min(1.0, passed))))
+
+
+def _as_matrix(kernel: Tensor) -> Tensor:
+    """A kernel, in memory by outputs, then pixels, then inputs, as a matrix of outputs, in the same memory."""
+    return kernel.detach().permute(0, 2, 3, 1).view(len(kernel), -1)
 
 
 def new_denoiser(*, plain: bool, seed: int) -> NonlocalDenoiser:
@@ -89,7 +101,7 @@ class Training:
         plain: whether to train the network without the filter.
         side: of crops, in pixels.
         half: whether convolutions run in bfloat16.
-        rate: of Adam.
+        rate: of Muon, for kernels of convolutions.
     """
 
     def __init__(
@@ -99,8 +111,22 @@ class Training:
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
         named = dict(self.model.named_parameters())
         bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []
-        self.optimizer = torch.optim.Adam([{"params": [*named.values()]}, {"params": bandwidths}], lr=rate)
-        self.rate, self.half = rate, half
+        self.kernels = [
+            (weight, _as_matrix(weight)) for weight in named.values() if weight.ndim == 4 and len(weight) > PLANES
+        ]
+        others = [weight for weight in named.values() if weight.ndim == 1 or len(weight) <= PLANES]
+        self.optimizers = [
+            torch.optim.Muon(
+                [matrix for _, matrix in self.kernels],
+                lr=rate,
+                weight_decay=0.0,
+                adjust_lr_fn="match_rms_adamw",
+            ),
+            torch.optim.Adam([{"params": others}, {"params": bandwidths}], lr=rate),
+        ]
+        self.rates = [(self.optimizers[0].param_groups[0], rate)]
+        self.rates += zip(self.optimizers[1].param_groups, (ADAM_RATE, BANDWIDTH_RATE * ADAM_RATE), strict=True)
+        self.half = half
         self.crops = Crops(side, seed)
         aside = Crops(side, ASIDE_SEED)
         self.aside = [aside.batch(ASIDE, grey=grey) for grey in (True, False)]
@@ -117,21 +143,24 @@ class Training:
     def step(self, steps: int) -> None:
         """One step of so many."""
         number = len(self.losses)
-        for group, factor in zip(self.optimizer.param_groups, (1.0, BANDWIDTH_RATE), strict=True):
-            group["lr"] = factor * self.rate * rate_at(number, steps)
+        for group, rate in self.rates:
+            group["lr"] = rate * rate_at(number, steps)
         clean, noisy, told = self.crops.batch(BATCH, grey=number % 2 == 0)
-        loss = loss_of(self.denoise(self.model, noisy, told), clean)
-        self.optimizer.zero_grad()
+        loss = loss_of(self.denoise(self.model, noisy, told), clean, noisy)
+        self.model.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.model.parameters(), LARGEST_GRADIENT)
-        self.optimizer.step()
+        for kernel, matrix in self.kernels:
+            matrix.grad = _as_matrix(kernel.grad.contiguous(memory_format=torch.channels_last))
+        for optimizer in self.optimizers:
+            optimizer.step()
         self.mean.update_parameters(self.model)
         self.losses.append(loss.item())
 
     @torch.no_grad()
     def judge(self) -> float:
         """The loss of the mean weights on the crops set aside."""
-        found = [loss_of(self.denoise(self.mean.module, noisy, told), clean) for clean, noisy, told in self.aside]
+        found = [errors(self.denoise(self.mean.module, noisy, told), clean) for clean, noisy, told in self.aside]
         return float(torch.stack(found).mean())
 
     def run(self, steps: int, folder: Path | None = None) -> None:
@@ -145,7 +174,7 @@ class Training:
             self.curve.append(self.judge())
             recent = statistics.mean(self.losses[-EVERY:])
             print(
-                f"step {len(self.losses):6} of {steps}: loss {recent:.3f}, set aside {self.curve[-1]:.3f} grey levels, "
+                f"step {len(self.losses):6} of {steps}: loss {recent:.4f}, set aside {self.curve[-1]:.3f} grey levels, "
                 f"{self.seconds:.0f} s",
                 flush=True,
             )
@@ -158,7 +187,7 @@ class Training:
         return {
             "model": self.model.state_dict(),
             "mean": self.mean.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "generator": self.crops.generator.get_state(),
             "losses": self.losses,
             "curve": self.curve,
@@ -169,7 +198,8 @@ class Training:
         """Take up a training."""
         self.model.load_state_dict(state["model"])
         self.mean.load_state_dict(state["mean"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
         self.crops.generator.set_state(state["generator"])
         self.losses, self.curve, self.seconds = state["losses"], state["curve"], state["seconds"]
 
@@ -199,10 +229,10 @@ def curve(losses: Sequence[float]) -> Figure:
 def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments, checked before anything is trained."""
     parser = argparse.ArgumentParser(description="Train the denoiser.")
-    parser.add_argument("--steps", type=int, default=9500, help=f"of {BATCH} crops each; default %(default)s")
+    parser.add_argument("--steps", type=int, default=9000, help=f"of {BATCH} crops each; default %(default)s")
     parser.add_argument("--side", type=int, default=SIDE, help="of crops, in pixels; default %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of weights, crops and noise; default %(default)s")
-    parser.add_argument("--rate", type=float, default=RATE, help="of Adam; default %(default)s")
+    parser.add_argument("--rate", type=float, default=RATE, help="of Muon, for convolutions; default %(default)s")
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
     parser.add_argument(
         "--half", action="store_true", help="convolutions in bfloat16, fast where the processor has AMX"

@@ -98,7 +98,7 @@ def test_readme_takes_full_runs_only_and_loses_nothing_around_the_markers(result
 
 def test_a_readme_without_markers_is_refused():
     with pytest.raises(ValueError, match="must hold the lines"):
-        report.between_markers("a text", "a table")
+        report.between("a text", "a table", report.BEGIN, report.END)
 
 
 def test_a_missing_peer_names_its_extra_and_the_rest_goes_on(monkeypatch):

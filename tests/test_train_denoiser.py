@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import denoising, train_denoiser
+from benchmarks import denoising, denoising_tables, train_denoiser
 from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
 from benchmarks.denoising import HELD_OUT, LEFT_HALVES, Case, decibels, scenes, table, with_noise
-from benchmarks.train_denoiser import PlainDenoiser, Training, loss_of, main, rate_at
+from benchmarks.train_denoiser import EXPECTED, PlainDenoiser, Training, errors, loss_of, main, rate_at
 from nlfilter_torch import NonlocalDenoiser
 
 
@@ -29,8 +29,8 @@ def test_loss_falls_and_every_part_learns(plain: bool) -> None:
     assert len(training.losses) == 100
     clean, noisy, told = training.aside[0]
     with torch.no_grad():
-        at_last = loss_of(training.denoise(training.model, noisy, told), clean)
-    assert at_last < 0.8 * loss_of(noisy, clean)
+        at_last = errors(training.denoise(training.model, noisy, told), clean)
+    assert at_last.mean() < 0.8 * errors(noisy, clean).mean()
     for name, value in training.model.named_parameters():
         assert not torch.equal(value, before[name]), name
 
@@ -82,9 +82,14 @@ def test_the_rate_rises_stays_and_falls() -> None:
     assert rates[-1] < 1e-4
 
 
-def test_loss_is_a_mean_of_grey_levels() -> None:
+def test_loss_is_the_mean_error_over_what_the_noise_makes_expect() -> None:
     clean = torch.zeros(2, 1, 4, 4)
-    assert float(loss_of(clean + torch.tensor([1.0, 3.0]).view(2, 1, 1, 1) / 255, clean)) == pytest.approx(2, rel=1e-3)
+    denoised, noisy = (
+        torch.tensor(levels).view(2, 1, 1, 1).expand(2, 1, 4, 4) / 255 for levels in ([1.0, 3], [5.0, 19])
+    )
+    assert errors(denoised, clean).tolist() == pytest.approx([1, 3], rel=1e-3)
+    wanted = (1 / 6**EXPECTED + 3 / 20**EXPECTED) / 2
+    assert float(loss_of(denoised, clean, noisy)) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_the_network_without_the_filter_has_as_many_weights_at_least() -> None:
@@ -134,11 +139,31 @@ def test_scenes_are_grey_or_in_colour_and_have_noise_of_their_own() -> None:
 
 def test_the_benchmark_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figures.json"
-    denoising.main(["--quick", "--noise", "25", "--networks", "--wrong", "--out", str(out)])
+    denoising.main(["--quick", "--noise", "25", "--methods", "noisy", "ours", "--wrong", "--out", str(out)])
     figures = json.loads(out.read_text())
     assert set(figures) == {"grey, 25", "colour, 25"}
     assert figures["grey, 25"]["ours"]["camera"]["psnr"] > figures["grey, 25"]["noisy"]["camera"]["psnr"]
-    assert "estimated noise" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "estimated noise" in printed
+    denoising.main(["--quick", "--noise", "25", "--kinds", "grey", "--methods", "rule", "--out", str(out)])
+    assert set(json.loads(out.read_text())["grey, 25"]) == {"noisy", "ours", "rule"}
+
+    page = tmp_path / "page.md"
+    page.write_text("above\n{}\n{}\nbelow".format(*denoising_tables.MARKERS))
+    denoising_tables.main([str(out), "--docs", str(page)])
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("above", "below")
+    row = next(line for line in lines if line.startswith("| ours"))
+    mean = sum(found["psnr"] for found in figures["grey, 25"]["ours"].values()) / 2
+    assert f"{mean:.2f}" in row
+
+
+def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> None:
+    page, figures = tmp_path / "page.md", tmp_path / "figures.json"
+    page.write_text("no markers")
+    figures.write_text('{"grey, 25": {"ours": {"camera": {"psnr": 30.0, "ssim": 0.9, "seconds": 1.0}}}}')
+    with pytest.raises(ValueError, match="the file must hold the lines '<!-- denoising"):
+        denoising_tables.main([str(figures), "--docs", str(page)])
 
 
 @pytest.mark.parametrize(

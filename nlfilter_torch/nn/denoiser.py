@@ -22,8 +22,8 @@ from nlfilter_torch.operator.build import operator_from_features
 
 TRAINED = Path(__file__).with_name("denoiser.safetensors")
 
-WIDTH, FEATURES, ORDER = 36, 20, 3  # planes of the network and of the guide; k of the sliders
-DILATIONS = (1, 2, 3, 4, 3, 2)  # of the convolutions before the filter: 33x33 pixels are in sight
+WIDTH, FEATURES, ORDER = 48, 20, 3  # planes of the network and of the guide; k of the sliders
+BEFORE, AFTER = (1, 2, 3, 4), (3,)  # dilations before and after the filter: 33x33 pixels are in sight
 PLANES, LEVELS = 3, 2  # of colours, and of the noise in them
 PIXELS = 85  # for each landmark
 BANDWIDTHS = (0.15, 12.0)  # of the guide, and in pixels, before training
@@ -39,7 +39,7 @@ class NonlocalDenoiser(nn.Module):
     """Noisy to denoised, in grey or colour, for noise of known strength that may differ from pixel to pixel.
 
     A network of convolutions computes, at every pixel, a guide, from which :func:`operator_from_features` builds W, and
-    sliders, by which pixels become means of those that the guide finds alike: this removes most of the noise. Two more
+    sliders, by which pixels become means of those that the guide finds alike: this removes most of the noise. Further
     convolutions correct what is left. Colours are split into luminance and two differences, so that one network serves
     grey images, whose differences are free of noise. Larger images are worked on in tiles that overlap, at places that
     do not depend on the size of the image.
@@ -58,10 +58,12 @@ class NonlocalDenoiser(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.first = _convolution(PLANES + LEVELS, WIDTH)
-        self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in DILATIONS)
+        self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in BEFORE)
         self.guide = _convolution(WIDTH, FEATURES + LEVELS * (ORDER + 1))
         self.log_bandwidths = nn.Parameter(torch.tensor([math.log(bandwidth) for bandwidth in BANDWIDTHS]))
-        self.after = nn.ModuleList([_convolution(WIDTH + 2 * PLANES, WIDTH), _convolution(WIDTH, PLANES)])
+        self.join = _convolution(WIDTH + 2 * PLANES, WIDTH)
+        self.after = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in AFTER)
+        self.last = _convolution(WIDTH, PLANES)
 
     @classmethod
     def trained(
@@ -145,9 +147,10 @@ class NonlocalDenoiser(nn.Module):
             features = features + layer(_bent(features))
         levels = levels[:, (0, 1, 1)]
         found = (planes - self.smooth(features, planes)) * (levels / FAINT).clamp(max=1.0)
-        left = torch.cat([_bent(features), 2 * (planes - found - middle), 2 * found], dim=1)
+        features = self.join(torch.cat([_bent(features), 2 * (planes - found - middle), 2 * found], dim=1))
         for layer in self.after:
-            left = layer(left if left.shape[1] > WIDTH else _bent(left))
+            features = features + layer(_bent(features))
+        left = self.last(_bent(features))
         return join_colours(found + levels * left.to(planes), noisy.shape[1]) * scale
 
     def smooth(self, features: Tensor, planes: Tensor) -> Tensor:

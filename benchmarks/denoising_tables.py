@@ -1,0 +1,76 @@
+"""Tables of denoisers: ``python -m benchmarks.denoising_tables FILE [--docs FILE] [--readme FILE]``.
+
+FILE is the JSON of ``python -m benchmarks.denoising --out FILE``. Prints means over photographs of PSNR in dB, SSIM and
+CPU seconds, and puts them between the markers of the named files: those of all methods into ``--docs``, those of a few
+into ``--readme``.
+"""
+
+import argparse
+import json
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import between, table
+from nlfilter_torch.io.photographs import open_beside
+
+MARKERS = ("<!-- denoising: written by python -m benchmarks.denoising_tables -->", "<!-- end of denoising -->")
+SHOWN = ("ours", "ours, 4 turns", "plain", "BM3D")  # in the README
+Results = dict[str, dict[str, Any]]
+
+
+def mean(results: Results, kind: str, level: str, method: str, figure: str) -> float | None:
+    """The mean of a figure over the photographs, None if it was not measured."""
+    found = results.get(f"{kind}, {level}", {}).get(method)
+    return None if found is None else statistics.mean(each[figure] for each in found.values())
+
+
+def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tuple[str, str, str]]) -> str:
+    """A table for each kind of photograph: a method a row, a noise level a column."""
+    parts = []
+    for kind in dict.fromkeys(key.split(", ")[0] for key in results):
+        levels = [key.split(", ")[1] for key in results if key.startswith(f"{kind}, ")]
+        photographs = list(next(iter(results[f"{kind}, {levels[0]}"].values())))
+        named = dict.fromkeys(name for level in levels for name in results[f"{kind}, {level}"])
+        rows = []
+        for name in named:
+            if methods is not None and name not in methods:
+                continue
+            row = ["CBM3D" if (kind, name) == ("colour", "BM3D") else name]
+            for _, figure, form in figures:
+                found = [mean(results, kind, level, name, figure) for level in levels]
+                if figure == "seconds":  # much the same at all levels
+                    known = [value for value in found if value is not None]
+                    found = [statistics.mean(known)] if known else [None]
+                row += ["" if value is None else format(value, form) for value in found]
+            rows.append(row)
+        header = [f"{kind}, noise of"]
+        for title, figure, _ in figures:
+            header += [title] if figure == "seconds" else [f"{title} {level}".strip() for level in levels]
+        parts.append(table(header, rows) + f"\n\nMeans over {', '.join(photographs)}.")
+    return "\n\n".join(parts)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables, and write them."""
+    parser = argparse.ArgumentParser(description="Tables of denoisers.")
+    parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.denoising")
+    parser.add_argument("--docs", type=Path, help="file for the table of all methods")
+    parser.add_argument("--readme", type=Path, help="file for the table of a few methods")
+    options = parser.parse_args(arguments)
+    results: Results = json.loads(options.file.read_text())
+    seconds = ("CPU s", "seconds", ".1f")
+    whole = tables(results, None, [("", "psnr", ".2f"), ("SSIM", "ssim", ".3f"), seconds])
+    for path, text in (
+        (options.docs, whole),
+        (options.readme, tables(results, SHOWN, [("", "psnr", ".2f"), seconds])),
+    ):
+        if path is not None:
+            with open_beside(path) as stream:
+                stream.write(between(path.read_text(), text, *MARKERS).encode())
+    print(whole)
+
+
+if __name__ == "__main__":
+    main()
