@@ -71,6 +71,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.streaming_strokes --quick
 	$(BIN)/python -m benchmarks.streaming_cpu --quick
 	$(BIN)/python -m benchmarks.streaming_busy --quick
+	$(BIN)/python -m benchmarks.compilation --quick --only export
 	$(BIN)/python -m benchmarks.fuzz --cases 20
 	$(BIN)/python -m benchmarks.masks --quick
 	$(BIN)/python -m benchmarks.recolor --quick

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._ops import OpOverload
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import _disable_current_modes
 
@@ -36,7 +35,7 @@ CONVERGED = 1e-12  # all eigenvalues of the Newton-Schulz iteration tend to 1
 
 
 class PortableForms(TorchFunctionMode):
-    """Inside, operators of ``torch.ops.nlfilter`` are recorded in their portable forms."""
+    """Inside, operators of ``torch.ops.nlfilter``, and what ONNX has not, are recorded in their portable forms."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -173,7 +172,13 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
     return (factor @ images.mT).double()
 
 
-FORMS: dict[OpOverload, Callable[..., Any]] = {
+def hypot(down: Tensor, right: Tensor) -> Tensor:
+    """As :func:`torch.hypot`, which ONNX has not, but that squares of values above 1e19 overflow."""
+    return (down.square() + right.square()).sqrt()
+
+
+FORMS: dict[Callable[..., Any], Callable[..., Any]] = {
+    torch.hypot: hypot,
     torch.ops.nlfilter.choose.default: choose,
     torch.ops.nlfilter.columns.default: columns,
     torch.ops.nlfilter.invert.default: inverse_root,

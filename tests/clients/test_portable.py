@@ -1,9 +1,8 @@
-"""Layers in ONNX and compiled ahead of time, where nothing of this package runs: portable forms of its operators."""
+"""Exported programs that run without this package; docs/clients.md runs a layer in ONNX."""
 
 import shutil
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -11,25 +10,17 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from nlfilter_torch import NonlocalFilter, Portable
+from nlfilter_torch import NonlocalFilter, Portable, nonlocal_operator
 from nlfilter_torch.operator import portable
 from nlfilter_torch.operator.nystrom import JITTER, invert
 from tests.problems import colour, noise
+from tests.test_modules_transforms import Fitted
 
 NLFILTER = torch.ops.nlfilter
 
 
-def small(landmarks: Any = "kmeans") -> NonlocalFilter:
-    options: dict[str, Any] = {"num_landmarks": 3, "patch_size": 1, "photometric_bandwidth": 0.2}
-    return NonlocalFilter((3.0, 1.05), landmarks=landmarks, learn=("alpha", "photometric_bandwidth"), **options)
-
-
-def photograph() -> Tensor:
-    return colour("chelsea", 8, 9)
-
-
+@pytest.mark.client("ONNX, AOTInductor", "building included, by `Portable`; for images of one size")
 @pytest.mark.parametrize(
     "options",
     [
@@ -48,6 +39,8 @@ def test_the_exported_computation_is_the_layer(options: dict[str, Any], monkeypa
     monkeypatch.setattr(portable, "FORMS", forms)
     monkeypatch.setattr("torch.compiler.is_compiling", lambda: True)
     torch.testing.assert_close(Portable(layer)(picture), expected, atol=1e-4, rtol=0)
+    automatic = forms.pop(torch.hypot)
+    assert automatic.called == ("photometric_bandwidth" not in options)
     assert all(form.called for form in forms.values())
 
 
@@ -74,37 +67,24 @@ def test_a_model_is_wanted() -> None:
         Portable(lambda image: image)  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(
-    not (find_spec("onnxruntime") and find_spec("onnxscript")), reason="there is no ONNX, or no runtime"
-)
-@pytest.mark.filterwarnings("ignore:`isinstance.treespec, LeafSpec.` is deprecated:FutureWarning")
-def test_onnx(tmp_path: Path) -> None:
-    import onnxruntime
-
-    layer, path = small(), str(tmp_path / "layer.onnx")
-    torch.onnx.export(Portable(layer).eval(), (photograph(),), path, dynamo=True, verbose=False)
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    for picture in (photograph(), colour("coffee", 8, 9)):
-        (found,) = session.run(None, {session.get_inputs()[0].name: picture.numpy()})
-        torch.testing.assert_close(torch.from_numpy(found), layer(picture).detach(), atol=1e-4, rtol=0)
-
-
+@pytest.mark.client("ONNX, AOTInductor", "building included, by `Portable`; for images of one size")
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
 @pytest.mark.filterwarnings("ignore:`isinstance.treespec, LeafSpec.` is deprecated:FutureWarning")
+@pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated:DeprecationWarning")
 def test_compiled_ahead_of_time(tmp_path: Path) -> None:
-    """It runs in a process that does not import this package."""
-    layer, package, result = small("uniform").requires_grad_(False), tmp_path / "layer.pt2", tmp_path / "result.npy"
-    program = torch.export.export(Portable(layer), (photograph(),))
+    """A fitted operator in a process that does not import this package; benchmarks.compilation compiles building."""
+    fitted = Fitted(nonlocal_operator(colour("chelsea", 8, 9), num_landmarks=3, patch_size=1)).requires_grad_(False)
+    picture, package = colour("coffee", 8, 9), tmp_path / "fitted.pt2"
+    program = torch.export.export(Portable(fitted), (picture,))
     torch._inductor.aoti_compile_and_package(program, package_path=str(package))
-    np.save(tmp_path / "picture.npy", colour("coffee", 8, 9).numpy())
+    np.save(tmp_path / "picture.npy", picture.numpy())
     script = (
         "import sys, numpy, torch\n"
-        "image = torch.from_numpy(numpy.load(sys.argv[2]))\n"
-        "numpy.save(sys.argv[3], torch._inductor.aoti_load_package(sys.argv[1])(image).numpy())\n"
+        "image = torch.from_numpy(numpy.load('picture.npy'))\n"
+        "numpy.save('result.npy', torch._inductor.aoti_load_package('fitted.pt2')(image).numpy())\n"
         "assert 'nlfilter_torch' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", script, package, tmp_path / "picture.npy", result], check=True, cwd=tmp_path)
-    expected = layer(colour("coffee", 8, 9))
-    torch.testing.assert_close(torch.from_numpy(np.load(result)), expected, atol=1e-4, rtol=0)
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
+    found = torch.from_numpy(np.load(tmp_path / "result.npy"))
+    torch.testing.assert_close(found, fitted(picture), atol=1e-5, rtol=0)

@@ -126,6 +126,7 @@ def test_every_public_name_is_tried() -> None:
     assert {name.split()[0] for name in (*CASES, *READS)} | CLASSES >= set(nlf.__all__)
 
 
+@pytest.mark.client("GPUs, without one", "no public function reads values but those [listed](training.md)")
 @pytest.mark.slow
 @pytest.mark.usefixtures("anywhere")
 @pytest.mark.parametrize("case", list(CASES))
@@ -134,6 +135,7 @@ def test_forward_on_a_gpu_reads_no_value_and_mixes_no_devices(case: str) -> None
         assert CASES[case](Inputs("cuda")).device.type == "cuda"
 
 
+@pytest.mark.client("GPUs, without one", "no public function reads values but those [listed](training.md)")
 @pytest.mark.slow
 @pytest.mark.usefixtures("anywhere")
 @pytest.mark.parametrize("case", list(CASES))
