@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.nn import NonlocalDenoiser as NonlocalDenoiser
     from nlfilter_torch.nn import NonlocalFilter as NonlocalFilter
     from nlfilter_torch.nn import PolynomialSliders as PolynomialSliders
+    from nlfilter_torch.nn import Portable as Portable
     from nlfilter_torch.nn import SegmentMask as SegmentMask
     from nlfilter_torch.operator.build import nonlocal_operator as nonlocal_operator
     from nlfilter_torch.operator.build import operator_from_features as operator_from_features
@@ -90,6 +91,7 @@ _DEFINES: dict[str, tuple[str, ...]] = {
         "NonlocalDenoiser",
         "NonlocalFilter",
         "PolynomialSliders",
+        "Portable",
         "SegmentMask",
     ),
     "operator.build": ("nonlocal_operator", "operator_from_features"),

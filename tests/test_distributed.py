@@ -61,6 +61,7 @@ def work(rank: int, folder: str) -> None:
         dist.destroy_process_group()
 
 
+@pytest.mark.client("`DistributedDataParallel`", "yes")
 @pytest.mark.slow
 @pytest.mark.skipif(not dist.is_available() or not dist.is_gloo_available(), reason="this torch has no gloo")
 def test_two_processes_learn_what_one_learns(tmp_path: Path) -> None:

@@ -14,11 +14,17 @@ import torch
 from PIL import Image
 
 import nlfilter_torch
-from benchmarks import accuracy, guide_pictures
+from benchmarks import accuracy, guide_pictures, support
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.presets import PRESETS, PURPOSES
 from tests.pages import DOCS, ROOT, Page
 
+CLIENTS = (
+    "onnxruntime",
+    "onnxscript",
+    "pytorch_lightning",
+    "huggingface_hub",
+)  # what the page of that name imports and not every installation has
 PAGES = {page.path.stem: page for page in DOCS}
 
 
@@ -34,8 +40,14 @@ def test_there_are_pages() -> None:
     assert {"index", "presets", "choosing", "how-it-works", "training", "paper"} <= PAGES.keys()
 
 
+# torch's own, and Lightning's advice.
+@pytest.mark.filterwarnings("ignore:`isinstance.treespec, LeafSpec.` is deprecated:FutureWarning")
+@pytest.mark.filterwarnings("ignore:The 'train_dataloader' does not have many workers")
+@pytest.mark.filterwarnings("ignore:The number of training batches")
 @pytest.mark.parametrize("page", DOCS, ids=lambda page: page.path.stem)
 def test_code_and_commands_run(page: Page, folder: Path) -> None:
+    for name in CLIENTS if page.path.stem == "clients" else ():
+        pytest.importorskip(name)
     assert {kind for kind, _ in page.blocks()} <= {"python", "sh", "text", "{toctree}"}
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -147,6 +159,11 @@ def test_the_table_of_presets_is_theirs() -> None:
         assert tuple(map(float, sliders.split(","))) == preset.alpha
         assert bandwidth == (preset.bandwidth if isinstance(preset.bandwidth, str) else f"{preset.bandwidth:g}")
         assert purpose == PURPOSES[name]
+
+
+def test_the_table_of_clients_is_made_from_their_tests() -> None:
+    assert f"\n\n{support.table()}\n" in PAGES["clients"].text
+    assert len(support.table().splitlines()) > 15
 
 
 def test_every_claim_about_training_has_its_test() -> None:

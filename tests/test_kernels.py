@@ -13,7 +13,7 @@ from nlfilter_torch.operator import build  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
-DERIVED = ("spread", "moment")
+DERIVED = ("spread", "moment", "invert")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -40,6 +40,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "gram": (factor, weights),
         "pivots": (features, torch.linspace(0.1, 0.9, LANDMARKS, dtype=dtype), 1e-4),
         "lloyd": (features, landmarks, 3, 1e-6),
+        "invert": (factor @ factor.mT + torch.eye(LANDMARKS, dtype=dtype),),
         "choose": (features, 1, PIXELS, LANDMARKS, "kmeans"),
         "settle": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }

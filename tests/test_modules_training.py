@@ -67,6 +67,7 @@ def test_gradient_checkpointing(reentrant: bool) -> None:
         torch.testing.assert_close(parameter.grad, exact[name], atol=1e-8, rtol=1e-6)
 
 
+@pytest.mark.client("`state_dict`, pickle, deep copy", "with the generator's state")
 @pytest.mark.parametrize("generator", [False, True])
 def test_state_dict_pickle_and_deep_copy(generator: bool) -> None:
     layer = everything(generator=seeded(3) if generator else None)

@@ -58,6 +58,10 @@ def test_compiled_layer_gives_the_same(learn: tuple[str, ...]) -> None:
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4 * theirs.abs().max().item())
 
 
+@pytest.mark.client(
+    "`torch.compile(fullgraph=True)`",
+    "building included, for images of one size; a `generator`, a `group`, `residual` and spectra break the graph",
+)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
 def test_the_whole_layer_compiles_as_one_graph() -> None:
@@ -86,6 +90,10 @@ def test_a_generator_keeps_building_out_of_the_graph() -> None:
     assert not torch.equal(landmarks(image()), nonlocal_operator(image(), **OPTIONS).kernel.landmarks)
 
 
+@pytest.mark.client(
+    "`torch.export`",
+    "building included; import `nlfilter_torch.operator.build` before a program is loaded, or export `Portable`",
+)
 @pytest.mark.slow
 def test_export_of_a_layer_that_builds_its_operator() -> None:
     layer = NonlocalFilter(ALPHA, **OPTIONS)
@@ -171,6 +179,7 @@ class Fitted(nn.Module):
         return self.sliders(self.operator, picture)
 
 
+@pytest.mark.client("`torch.export` of a fitted operator", "yes")
 @pytest.mark.parametrize("strict", [False, True])
 def test_export_of_applying_a_fitted_operator(strict: bool) -> None:
     fitted = Fitted(nonlocal_operator(image(batch=1), **OPTIONS))
@@ -185,6 +194,7 @@ def test_export_of_applying_a_fitted_operator(strict: bool) -> None:
         torch.testing.assert_close(loaded(image(3, batch)), fitted(image(3, batch)), atol=3e-6, rtol=0)
 
 
+@pytest.mark.client("`vmap`, `jvp`, `hessian` of a fitted operator", "in image and alpha")
 def test_vmap_over_images_and_over_sliders_of_a_fitted_operator() -> None:
     operator = nonlocal_operator(image(batch=1), **OPTIONS)
     spectrum = operator.spectrum()
@@ -202,6 +212,7 @@ def test_vmap_over_images_and_over_sliders_of_a_fitted_operator() -> None:
         torch.testing.assert_close(vmap(function)(inputs), torch.stack([function(x) for x in inputs]))
 
 
+@pytest.mark.client("`vmap`, `jvp`, `hessian` of a fitted operator", "in image and alpha")
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")  # in torch.func itself
 def test_jvp_and_hessian_in_image_and_sliders_of_a_fitted_operator() -> None:
     operator = nonlocal_operator(image(batch=1), **OPTIONS)

@@ -181,10 +181,10 @@ def dtypes(plan: Plan) -> Iterator[Record]:
 
 
 def threads(plan: Plan) -> Iterator[Record]:
-    """The main operator on one thread, and on all."""
+    """The main operator, filtering with it and the backward pass on one thread, and on all; tiles: streaming_busy."""
     for count in plan.thread_counts():
         case = plan.case(threads=count)
-        calls = {"operator": discard(case.operator, case.image())}
+        calls = filter_calls(case, backward=True)
         yield measured("threads", case, calls, seconds=plan.seconds, least=plan.least)
 
 

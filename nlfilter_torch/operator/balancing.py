@@ -197,7 +197,7 @@ def balance_in_rounds(
     return Rounds(factor, diagonal, found, worst, tuple(before), removed)
 
 
-def _chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
+def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
     """Weights (momentum, gradient) of the semi-iteration for a spectrum in [low, high]."""
     centre, radius = (high + low) / 2, (high - low) / 2
     sigma = centre / radius
@@ -217,7 +217,7 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
     move = torch.zeros_like(scaling)
     watched = not is_hidden(factor)
     worst, slow = float("inf"), 0
-    for sweeps, (momentum, gain) in enumerate(_chebyshev_weights(1.0, 2.0), start=1):
+    for sweeps, (momentum, gain) in enumerate(chebyshev_weights(1.0, 2.0), start=1):
         current, following = total.to(factor).mT, torch.empty_like(scaling)
         next_total, residual = torch.zeros_like(total), scaling.new_zeros(scaling.shape[0])
         # One read of the factor: while a block is cached, its row sums, its update and its part of the next moment.

@@ -109,13 +109,17 @@ def clusters(
     """Which of the points (B, D, S) start the clusters of k-means, (B, 1, M), and the cluster of each, (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
     points = points.clamp(-LARGEST, LARGEST).float()  # a choice needs no more, and the kernels in C take no more
-    # Half of them start the clusters, drawn at random.
-    few = torch.randperm(points.shape[2], generator=generator, device=generator.device)
-    few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)].to(points.device)
+    few = draw_few(points.shape[2], count, generator).to(points.device)
     chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
     start = among.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
     assignment = among.broadcast(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps))
     return start, assignment
+
+
+def draw_few(candidates: int, count: int, generator: torch.Generator) -> Tensor:
+    """Indices of the candidates, half of them, among which those are that M clusters start from."""
+    few = torch.randperm(candidates, generator=generator, device=generator.device)
+    return few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)]
 
 
 def means_of_clusters(subset: Tensor, assignment: Tensor, start: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.autograd import factors_of, once_differentiable
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
+from nlfilter_torch.core.kernels.library import register
 from nlfilter_torch.core.values import is_hidden
 
 Completion = Literal["diagonal", "none"]
@@ -27,9 +28,20 @@ def inverse_cholesky(landmarks: Tensor) -> Tensor:
     squared = _squared_distances(points)
     identity = torch.eye(landmarks.shape[2], dtype=torch.float64, device=landmarks.device)
     # The distance of a landmark to itself is zero by definition, whatever the rounding of the three terms.
-    affinity = torch.exp(-squared.clamp(min=0.0) * (1 - identity)) + JITTER * identity
+    return invert(torch.exp(-squared.clamp(min=0.0) * (1 - identity)) + JITTER * identity).to(landmarks)
+
+
+@register(
+    "invert(Tensor affinity) -> Tensor",
+    None,
+    lambda affinity: affinity.new_empty(affinity.shape),
+    differentiable=True,
+)
+def invert(affinity: Tensor) -> Tensor:
+    """Inverse Cholesky factor (B, M, M) of positive definite matrices (B, M, M)."""
     lower = torch.linalg.cholesky(affinity)
-    return torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False).to(landmarks)
+    identity = torch.eye(affinity.shape[1], dtype=affinity.dtype, device=affinity.device)
+    return torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False).contiguous()
 
 
 def _squared_distances(points: Tensor) -> Tensor:

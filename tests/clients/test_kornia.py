@@ -22,6 +22,7 @@ def test_one_image_without_a_batch_is_a_batch_of_one() -> None:
     torch.testing.assert_close(layer()(picture[0]), layer()(picture)[0], atol=0, rtol=0)
 
 
+@pytest.mark.client("kornia's containers", "`(B, C, H, W)` and `(C, H, W)`")
 @pytest.mark.parametrize("batched", [True, False])
 def test_containers_run_the_layer(batched: bool) -> None:
     picture = image(batch=1) if batched else image(batch=1)[0]

@@ -59,6 +59,7 @@ def edited(operator: NonlocalOperator, picture: Tensor) -> Tensor:
 # --- moved
 
 
+@pytest.mark.client("`operator.to(device or dtype)`", "float32 and float64; spectra and fitted filters, too")
 @pytest.mark.parametrize("target", [torch.float64, torch.zeros((), dtype=torch.float64)])
 def test_an_operator_in_another_precision_is_the_same_filter(target: Any) -> None:
     single, picture = operator(spatial_bandwidth=9.0, landmarks="uniform"), image(1, 1)
@@ -92,6 +93,10 @@ def test_moving_keeps_gradients() -> None:
 # --- saved
 
 
+@pytest.mark.client(
+    "`torch.load(..., weights_only=True)`",
+    "after `from nlfilter_torch import NonlocalOperator` (or `Spectrum`, `FittedFilter`)",
+)
 @pytest.mark.parametrize("landmarks", ["kmeans", "uniform"])
 def test_operators_spectra_and_fitted_filters_load_as_weights_only(landmarks: str) -> None:
     picture = image(1, 1)
@@ -116,6 +121,7 @@ def build_and_filter(picture: Tensor, **options: Any) -> Tensor:
     return (layer.to("meta") if picture.is_meta else layer)(picture)  # torch converts no fake parameters
 
 
+@pytest.mark.client('device "meta", `FakeTensorMode`', "yes")
 @pytest.mark.parametrize("options", [{}, {"landmarks": "uniform"}, {"completion": "none"}])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) -> None:
@@ -133,6 +139,7 @@ def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) ->
 # --- empty batches, and the order of numbers in memory
 
 
+@pytest.mark.client("empty batches", "yes; edits of photographs refuse them")
 def test_empty_batches_stay_empty() -> None:
     none = image()[:0]
     layer = NonlocalFilter(ALPHA, learn=("alpha", "residual"), residual=0.5, **OPTIONS)
@@ -148,6 +155,7 @@ def test_empty_batches_stay_empty() -> None:
     assert operator_from_features(torch.zeros(0, 3, 20), size=(4, 5), num_landmarks=6).factor.shape == (0, 6, 20)
 
 
+@pytest.mark.client("channels-last images", "stay so")
 @pytest.mark.parametrize("order", [torch.contiguous_format, torch.channels_last])
 def test_the_order_in_memory_is_kept(order: torch.memory_format) -> None:
     picture = image().contiguous(memory_format=order)
@@ -194,6 +202,7 @@ BUILDERS: list[Callable[[Tensor], Tensor]] = [
 ]
 
 
+@pytest.mark.client("`jit.trace`, `vmap`, `jvp` of building an operator", "refused")
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*is deprecated:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning")
 @pytest.mark.parametrize("build", BUILDERS)

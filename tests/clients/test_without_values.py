@@ -88,6 +88,7 @@ CASES: dict[str, Case] = {
     "NonlocalFilter": lambda x: nlf.NonlocalFilter(learn=(), num_landmarks=20)(x.image(), alpha=x.zeros(4)),
     "NonlocalAffinity": lambda x: nlf.NonlocalAffinity(num_landmarks=20)(x.image()).factor,
     "NonlocalDenoiser": lambda x: nlf.NonlocalDenoiser.trained(device=x.device)(x.image(), 0.1),
+    "Portable": lambda x: nlf.Portable(nlf.NonlocalFilter(num_landmarks=20))(x.image()),
     "PolynomialSliders": lambda x: nlf.PolynomialSliders(learn=())(x.operator(), x.image(), x.zeros(4)),
 }
 # The functions that read values, in the order of the table in docs/training.md.
@@ -125,6 +126,7 @@ def test_every_public_name_is_tried() -> None:
     assert {name.split()[0] for name in (*CASES, *READS)} | CLASSES >= set(nlf.__all__)
 
 
+@pytest.mark.client("GPUs, without one", "no public function reads values but those [listed](training.md)")
 @pytest.mark.slow
 @pytest.mark.usefixtures("anywhere")
 @pytest.mark.parametrize("case", list(CASES))
@@ -133,6 +135,7 @@ def test_forward_on_a_gpu_reads_no_value_and_mixes_no_devices(case: str) -> None
         assert CASES[case](Inputs("cuda")).device.type == "cuda"
 
 
+@pytest.mark.client("GPUs, without one", "no public function reads values but those [listed](training.md)")
 @pytest.mark.slow
 @pytest.mark.usefixtures("anywhere")
 @pytest.mark.parametrize("case", list(CASES))

@@ -1,0 +1,94 @@
+"""What compilers and exporters take for a layer that builds its operator, and how far their results are from its own.
+
+    python -m benchmarks.compilation
+
+``torch.compile(fullgraph=True)`` by inductor, its first call and later ones beside the layer itself; ``torch.export``;
+ONNX, run by onnxruntime; AOTInductor. Each in a table: seconds to make it, milliseconds of a call, the largest
+difference from the layer. ``--only`` takes some of them, ``--quick`` an image of a few pixels and four landmarks.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+import torch
+from torch import Tensor
+
+from benchmarks.photographs import photograph
+from nlfilter_torch import NonlocalFilter, Portable
+
+Call = Callable[[Tensor], Tensor]
+Maker = Callable[[NonlocalFilter, Tensor, Path], Call]
+
+
+def compiled(layer: NonlocalFilter, image: Tensor, folder: Path) -> Call:
+    """One graph, compiled by inductor in the first call."""
+    fast = torch.compile(layer, fullgraph=True)
+    fast(image)
+    return fast
+
+
+def exported(layer: NonlocalFilter, image: Tensor, folder: Path) -> Call:
+    """A program of torch.export."""
+    return torch.export.export(layer, (image,)).module()
+
+
+def in_onnx(layer: NonlocalFilter, image: Tensor, folder: Path) -> Call:
+    """A session of onnxruntime."""
+    import onnxruntime
+
+    path = str(folder / "layer.onnx")
+    torch.onnx.export(Portable(layer), (image,), path, input_names=["image"], dynamo=True, verbose=False)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return lambda image: torch.from_numpy(session.run(None, {"image": image.numpy()})[0])
+
+
+def ahead_of_time(layer: NonlocalFilter, image: Tensor, folder: Path) -> Call:
+    """A library that is compiled from C++."""
+    program, path = torch.export.export(Portable(layer), (image,)), str(folder / "layer.pt2")
+    return torch._inductor.aoti_load_package(torch._inductor.aoti_compile_and_package(program, package_path=path))
+
+
+MAKERS: dict[str, Maker] = {"compile": compiled, "export": exported, "onnx": in_onnx, "ahead": ahead_of_time}
+
+
+def milliseconds(call: Call, image: Tensor, repeats: int) -> float:
+    """The median of some calls."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call(image)
+        times.append(1000 * (time.perf_counter() - start))
+    return median(times)
+
+
+def main() -> None:
+    """Make and call each of them, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=list(MAKERS), default=list(MAKERS))
+    parser.add_argument("--side", type=int, default=256, help="of the image, in pixels")
+    parser.add_argument("--landmarks", type=int, default=32)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--quick", action="store_true", help="that it runs, not how fast")
+    options = parser.parse_args()
+    side, landmarks = (12, 4) if options.quick else (options.side, options.landmarks)
+    image = photograph("chelsea", side, side)
+    layer = NonlocalFilter((3.0, 3.0, 4.0, 1.05), learn=(), num_landmarks=landmarks, photometric_bandwidth=0.1).eval()
+    expected = layer(image)
+    print(f"{side}x{side}, {landmarks} landmarks, {torch.get_num_threads()} threads, torch {torch.__version__}")
+    print("| | s to make | ms a call | largest difference |\n|---|---|---|---|")
+    print(f"| the layer | 0 | {milliseconds(layer, image, options.repeats):.1f} | 0 |")
+    with TemporaryDirectory() as folder, torch.no_grad():
+        for name in options.only:
+            start = time.perf_counter()
+            call = MAKERS[name](layer, image, Path(folder))
+            made = time.perf_counter() - start
+            difference = float((call(image) - expected).abs().max())
+            print(f"| {name} | {made:.1f} | {milliseconds(call, image, options.repeats):.1f} | {difference:.1e} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""What works with other projects and with torch itself, from the tests that show it: a table in docs/clients.md.
+
+    python -m benchmarks.support docs/clients.md
+
+A test with the marker ``client("what", "how")`` is a row. Without a file the table is printed.
+"""
+
+import argparse
+import ast
+from collections.abc import Iterator
+from itertools import dropwhile
+from pathlib import Path
+
+TESTS = Path(__file__).parent.parent / "tests"
+HEAD = "| | | test |\n|---|---|---|\n"
+MARKER = "pytest.mark.client"
+
+
+def rows() -> Iterator[tuple[str, str, str]]:
+    """What each marked test is about, how that works, and the name of the test."""
+    for path in sorted(TESTS.rglob("test_*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            for call in node.decorator_list:
+                if isinstance(call, ast.Call) and ast.unparse(call.func) == MARKER:
+                    what, how = map(ast.literal_eval, call.args)
+                    yield what, how, node.name
+
+
+def table() -> str:
+    """The table, by the names of what the tests are about."""
+    lines: dict[tuple[str, str], list[str]] = {}
+    for what, how, test in rows():
+        lines.setdefault((what, how), []).append(f"`{test}`")
+    ordered = sorted(lines.items(), key=lambda line: line[0][0].strip("`").lower())
+    return HEAD + "".join(f"| {what} | {how} | {', '.join(tests)} |\n" for (what, how), tests in ordered)
+
+
+def main() -> None:
+    """Print the table, or write it into a page in the place of the one there."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", type=Path, nargs="?", help="the page of Markdown that has the table")
+    page = parser.parse_args().page
+    if page is None:
+        print(table(), end="")
+        return
+    before, found, rest = page.read_text(encoding="utf-8").partition(HEAD)
+    if not found:
+        parser.error(f"{page} must have a table that begins with {HEAD.splitlines()[0]}; add these two lines")
+    after = "".join(dropwhile(lambda line: line.startswith("|"), rest.splitlines(keepends=True)))
+    page.write_text(f"{before}{table()}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""Exported programs without operators of this package: for ONNX, and for programs that run without Python.
+
+A program of ``torch.export`` calls ``torch.ops.nlfilter`` where an operator is built and applied. The forms below
+compute the same from operations that every runtime has. They read no value and take a fixed number of steps: ONNX has
+no Cholesky decomposition, in whose place stands the inverse square root by Newton-Schulz iteration, and Chebyshev's
+semi-iteration balances. As on accelerators, pixels are not isolated, and eigenvalues above 1 are not reduced.
+"""
+
+from collections.abc import Callable
+from itertools import islice
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import _disable_current_modes
+
+from nlfilter_torch.core.kernels.affinity import PLAIN_EXPONENT, SMALLEST_EXPONENT
+from nlfilter_torch.core.kernels.clusters import chance, pick
+from nlfilter_torch.operator.balancing import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
+from nlfilter_torch.operator.landmarks import (
+    CAPTURED,
+    DRAWN_SINGLY,
+    ITERATIONS,
+    LARGEST,
+    TIE,
+    Sampling,
+    candidate_pixels,
+    draw_few,
+)
+from nlfilter_torch.operator.nystrom import JITTER
+
+SWEEPS = 16
+CONVERGED = 1e-12  # all eigenvalues of the Newton-Schulz iteration tend to 1
+
+
+class PortableForms(TorchFunctionMode):
+    """Inside, operators of ``torch.ops.nlfilter``, and what ONNX has not, are recorded in their portable forms."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Call the portable form of an operator, or another function as it is."""
+        return FORMS.get(func, func)(*args, **(kwargs or {}))
+
+
+def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`nlfilter_torch.operator.landmarks.choose`; what is drawn at random is a constant of the program."""
+    with _disable_current_modes():
+        generator = torch.Generator().manual_seed(0)
+        drawn = candidate_pixels((height, width), count, sampling, generator)
+        few = draw_few(len(drawn), count, generator)
+        draws = torch.rand(count, generator=generator, dtype=torch.float64).float()
+    pixels, first = (torch.tensor(constant.tolist(), device=features.device) for constant in (drawn, few))
+    batch = features.shape[0]
+    if len(pixels) == count:
+        return pixels, pixels.new_zeros(batch, 1, count), pixels.new_zeros(batch, count)
+    if count > DRAWN_SINGLY:
+        raise ValueError(
+            f"num_landmarks must be at most {DRAWN_SINGLY} in a portable program with landmarks='kmeans', got {count}; "
+            "use landmarks='uniform'"
+        )
+    points = pick(features, pixels.expand(batch, 1, -1))
+    points = (points - points.mean(dim=2, keepdim=True)).clamp(-LARGEST, LARGEST).float()
+    chosen = _pivots(pick(points, first.expand(batch, 1, -1)), draws.tolist())  # (B, M)
+    start = first.expand(batch, -1).gather(1, chosen).unsqueeze(1)
+    return pixels, start, _lloyd(points, pick(points, start))
+
+
+def _pivots(points: Tensor, draws: list[float]) -> Tensor:
+    """As :func:`nlfilter_torch.core.kernels.clusters.pivots`."""
+    size, last = points.shape[1], points.shape[2] - 1
+    norms = points.square().sum(1, keepdim=True)
+    rows, residual = points[:, :0], torch.ones_like(norms)
+    found = []
+    for draw in draws:
+        summed = chance(residual, CAPTURED).double().cumsum(2)
+        pivot = (summed < draw * summed[:, :, -1:]).sum(2, keepdim=True).clamp(max=last)
+        known = torch.cat([points, norms, rows], dim=1)
+        point, norm, before = pick(known, pivot).split([size, 1, len(found)], dim=1)
+        affinities = (2 * torch.bmm(point.mT, points) - norms - norm).clamp(PLAIN_EXPONENT, 0.0).exp()
+        row = affinities - torch.bmm(before.mT, rows) if found else affinities
+        row = row / row.gather(2, pivot).clamp(min=CAPTURED).sqrt()
+        residual = residual - row.square()
+        rows = torch.cat([rows, row], dim=1)
+        found.append(pivot)
+    return torch.cat(found, dim=2).squeeze(1)
+
+
+def _lloyd(points: Tensor, start: Tensor) -> Tensor:
+    """As :func:`nlfilter_torch.core.kernels.clusters.lloyd`."""
+    margin = TIE * torch.finfo(points.dtype).eps
+    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)
+    rows = extended.mT
+    slack = margin * points.square().sum(1).unsqueeze(2)
+    numbers = torch.arange(start.shape[2], device=points.device)
+    centres = start
+    for step in range(ITERATIONS + 1):
+        score = torch.bmm(rows, torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1))
+        best = score.amax(2, keepdim=True)
+        nearest = (score >= best - (slack + margin * best.abs())).byte().argmax(2)
+        if step == ITERATIONS:
+            break
+        sums = torch.bmm(extended, (nearest.unsqueeze(2) == numbers).to(points.dtype))
+        sizes = sums[:, -1:]
+        centres = torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), start)
+    return nearest
+
+
+def columns(features: Tensor, landmarks: Tensor, inverse: Tensor, limited: bool) -> tuple[Tensor, Tensor]:
+    """As :func:`nlfilter_torch.core.kernels.columns.columns`, for all pixels at once."""
+    centre = landmarks.mean(dim=2, keepdim=True)
+    points, centred = landmarks - centre, features - centre
+    norms, lengths = centred.square().sum(1, keepdim=True), points.square().sum(1).unsqueeze(2)
+    exponents = 2 * torch.bmm(points.mT, centred) - norms - lengths
+    factor = torch.bmm(inverse, exponents.clamp(SMALLEST_EXPONENT if limited else PLAIN_EXPONENT, 0.0).exp())
+    norms = factor.square().sum(1)
+    if not limited:
+        return factor, torch.ones_like(norms)
+    return factor * norms.clamp(min=1.0).rsqrt().unsqueeze(1), norms
+
+
+def inverse_root(affinity: Tensor) -> Tensor:
+    """The inverse square root (B, M, M) of affinities between landmarks, in the place of the inverse Cholesky factor.
+
+    Either, times affinities of pixels, is a Nystrom factor; these differ by a rotation. In the coupled iteration of
+    Newton and Schulz all eigenvalues tend to 1; scaled by what the smallest of them may be, it takes half the steps.
+    """
+    batch, count, _ = affinity.shape
+    identity = torch.eye(count, dtype=affinity.dtype, device=affinity.device).expand(batch, -1, -1)
+    most = affinity.sum(2, keepdim=True).amax(1, keepdim=True)  # bounds the eigenvalues; at most M + JITTER
+    root, inverse = affinity / most, identity
+    least = (JITTER / (count + JITTER)) ** 0.5
+    while least < 1 - CONVERGED:
+        scale = (3 / (1 + least + least * least)) ** 0.5
+        step = torch.baddbmm(identity, inverse, root, beta=1.5 * scale, alpha=-0.5 * scale**3)
+        root, inverse = torch.bmm(root, step), torch.bmm(step, inverse)
+        least = scale * least * (3 - (scale * least) ** 2) / 2
+    return inverse / most.sqrt()
+
+
+def settle(
+    factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """As :func:`nlfilter_torch.operator.balancing.settle`, by Chebyshev's semi-iteration alone."""
+    diagonal = diagonal.unsqueeze(2)
+    rows = factor.mT
+
+    def row_sums(scaling: Tensor) -> tuple[Tensor, Tensor]:
+        total = torch.bmm(factor, scaling)
+        return scaling * (torch.bmm(rows, total) + diagonal * scaling), total
+
+    scaling = row_sums(torch.ones_like(diagonal))[0].clamp(min=SMALLEST_SUM).rsqrt()
+    move = torch.zeros_like(scaling)
+    for momentum, gain in islice(chebyshev_weights(1.0, 2.0), SWEEPS):
+        move = momentum * move - gain * row_sums(scaling)[0].clamp(*TRUSTED).log()
+        scaling = (scaling * move.exp()).clamp(max=LARGEST_SCALING)
+    sums, total = row_sums(scaling)
+    identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
+    moments = total.double().unsqueeze(0).expand(Rounds.MOST + 1, -1, -1, -1)
+    residual, removed = (sums - 1).abs().amax((1, 2)), torch.zeros_like(scaling, dtype=torch.bool)
+    return scaling.squeeze(2), moments, residual, identity, removed.squeeze(2)
+
+
+def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
+    """As :func:`nlfilter_torch.core.kernels.tall_skinny.spread`."""
+    return rows @ factor if scaling is None else rows @ factor * scaling.unsqueeze(1)
+
+
+def moment(factor: Tensor, images: Tensor) -> Tensor:
+    """As :func:`nlfilter_torch.core.kernels.tall_skinny.moment`, but that it adds up in the precision of the factor."""
+    return (factor @ images.mT).double()
+
+
+def hypot(down: Tensor, right: Tensor) -> Tensor:
+    """As :func:`torch.hypot`, which ONNX has not, but that squares of values above 1e19 overflow."""
+    return (down.square() + right.square()).sqrt()
+
+
+FORMS: dict[Callable[..., Any], Callable[..., Any]] = {
+    torch.hypot: hypot,
+    torch.ops.nlfilter.choose.default: choose,
+    torch.ops.nlfilter.columns.default: columns,
+    torch.ops.nlfilter.invert.default: inverse_root,
+    torch.ops.nlfilter.moment.default: moment,
+    torch.ops.nlfilter.settle.default: settle,
+    torch.ops.nlfilter.spread.default: spread,
+}
