@@ -124,8 +124,7 @@ class Training:
             ),
             torch.optim.Adam([{"params": others}, {"params": bandwidths}], lr=rate),
         ]
-        self.rates = [(self.optimizers[0].param_groups[0], rate)]
-        self.rates += zip(self.optimizers[1].param_groups, (ADAM_RATE, BANDWIDTH_RATE * ADAM_RATE), strict=True)
+        self.rates = (rate, ADAM_RATE, BANDWIDTH_RATE * ADAM_RATE)
         self.half = half
         self.crops = Crops(side, seed)
         aside = Crops(side, ASIDE_SEED)
@@ -143,7 +142,8 @@ class Training:
     def step(self, steps: int) -> None:
         """One step of so many."""
         number = len(self.losses)
-        for group, rate in self.rates:
+        groups = [group for optimizer in self.optimizers for group in optimizer.param_groups]
+        for group, rate in zip(groups, self.rates, strict=True):
             group["lr"] = rate * rate_at(number, steps)
         clean, noisy, told = self.crops.batch(BATCH, grey=number % 2 == 0)
         loss = loss_of(self.denoise(self.model, noisy, told), clean, noisy)
@@ -229,7 +229,7 @@ def curve(losses: Sequence[float]) -> Figure:
 def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments, checked before anything is trained."""
     parser = argparse.ArgumentParser(description="Train the denoiser.")
-    parser.add_argument("--steps", type=int, default=9000, help=f"of {BATCH} crops each; default %(default)s")
+    parser.add_argument("--steps", type=int, default=11500, help=f"of {BATCH} crops each; default %(default)s")
     parser.add_argument("--side", type=int, default=SIDE, help="of crops, in pixels; default %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of weights, crops and noise; default %(default)s")
     parser.add_argument("--rate", type=float, default=RATE, help="of Muon, for convolutions; default %(default)s")
