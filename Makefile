@@ -76,6 +76,7 @@ bench-quick: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.recolor --quick
 	$(BIN)/python -m benchmarks.looks --quick
 	$(BIN)/python -m benchmarks.denoising --quick --noise 25
+	$(BIN)/python -m benchmarks.whole --quick
 
 # The weights of the denoiser, from nothing, with their figures and learning curve: about an hour on a processor with AMX.
 # A training that was stopped goes on.
