@@ -70,6 +70,7 @@ bench-quick: $(VENV)/.installed-test
 
 QUICK := \
 	'speed --quick --out out/quick/speed.json' \
+	'whole --quick' \
 	'streaming --quick' \
 	'streaming_strokes --quick' \
 	'streaming_cpu --quick' \

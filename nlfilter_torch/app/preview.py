@@ -1,9 +1,7 @@
 """A reduced picture under an edit, fast enough to follow a slider.
 
-The filter of a reduced picture differs from that of the photograph: its patches are larger parts of the scene, and
-neighbouring pixels differ by more. The preview therefore compares every n-th patch of the photograph itself, and
-filters the reduced picture with the resulting operator. This halves the error against the reduced result of the whole
-photograph.
+A photograph is reduced to the size at which edits of brightness look at it, so that the preview holds the very picture
+that these work on. What depends on the pixels of the photograph itself comes from there: :class:`Reduced`.
 
 Slow results are cached with the settings they depend on: the layers that the sliders weigh, the filter for masks, the
 filter of the step that is being changed, and the picture after each step.
@@ -17,15 +15,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared, viewed_stride
+from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared
 from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, nearby_or_far
 from nlfilter_torch.edits.detail import activity, change_of_mean, held_back, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
-from nlfilter_torch.edits.parameters import DETAIL, MASK
+from nlfilter_torch.edits.parameters import DETAIL, MASK, VIEWING_SIZE
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size
+from nlfilter_torch.edits.viewing import MEGAPIXEL, Coarse, viewed_size
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
@@ -33,16 +32,7 @@ from nlfilter_torch.operator.kernel import GuideFeatures
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
-PIXELS = 1_000_000  # of a preview, at most
-
-
-def stride_for(height: int, width: int, pixels: int = PIXELS) -> int:
-    """The reduction of a preview that has at most ``pixels``.
-
-    >>> stride_for(4000, 6000), stride_for(600, 800)
-    (5, 1)
-    """
-    return max(1, math.ceil(math.sqrt(height * width / pixels)))
+PIXELS = round(VIEWING_SIZE.default * MEGAPIXEL)  # of a preview, at most
 
 
 def reduce(image: Tensor, stride: int) -> Tensor:
@@ -86,25 +76,26 @@ class Preview:
 
     Args:
         photograph: (1, C, H, W), in [0, 1] except for files of floats.
-        pixels: largest number of pixels of the preview.
+        pixels: largest number of pixels of the preview, about.
+
+    Attributes:
+        size: (height, width) of the preview.
+        stride: every how many pixels of the photograph it has one.
     """
 
     def __init__(self, photograph: Tensor, pixels: int = PIXELS) -> None:
-        self.stride = stride_for(photograph.shape[-2], photograph.shape[-1], pixels)
+        whole = (photograph.shape[-2], photograph.shape[-1])
+        self.size = viewed_size(whole, pixels / MEGAPIXEL)
+        self.stride = math.sqrt(whole[0] * whole[1] / (self.size[0] * self.size[1]))
         self.photograph = photograph
-        self.pixels = reduce(photograph.float(), self.stride)
+        self.pixels = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
         self._layers: Layers | None = None
-        self._source = InMemory(self.pixels, {})  # with the filter of the masks
+        self._source = InMemory(self.pixels, {}, self.stride)  # with the filter of the masks
         self._compared_by: Key = ()  # the settings of that filter
         self._mask: tuple[Key, Tensor] | None = None
-        self._active: tuple[int, Tensor] | None = None
+        self._active: tuple[tuple[int, int], Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
         self._pictures: dict[int, tuple[Key, Tensor]] = {}
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) of the preview."""
-        return (self.pixels.shape[-2], self.pixels.shape[-1])
 
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
@@ -119,7 +110,7 @@ class Preview:
                 stride,
                 detail,
                 bandwidth=estimate_bandwidth(luminance) if bandwidth == "auto" else bandwidth,
-                distance=self._distance(detail, luminance, stride),
+                distance=self._distance(detail, luminance),
                 channels="luminance",
                 patch_size=detail["patch_size"],
             )
@@ -128,25 +119,29 @@ class Preview:
         return self._layers
 
     def _compared(self, detail: Step) -> tuple[int, Tensor]:
-        """What the filter of a step compares: every so many patches of the photograph, or those of the preview.
+        """What the filter of a step compares: every so many patches of a picture, of about the viewing size."""
+        viewed = self._viewed(detail)
+        stride = max(1, round(viewed[0] / self.size[0]))
+        if stride == 1:
+            return 1, self.pixels
+        return stride, resize(self.photograph.float(), (self.size[0] * stride, self.size[1] * stride))
 
-        Patches of a photograph larger than the viewing size are those of its reduction, which the preview is close to.
-        """
-        size = (self.photograph.shape[-2], self.photograph.shape[-1])
-        larger = viewed_size(size, detail["viewing_size"]) != size
-        return (1, self.pixels) if larger else (self.stride, self.photograph.float())
+    def _viewed(self, step: Step) -> tuple[int, int]:
+        """(H, W) at which a step looks at the photograph."""
+        return viewed_size((self.photograph.shape[-2], self.photograph.shape[-1]), step["viewing_size"])
 
     def _activity(self, detail: Step) -> Tensor:
         """The activity of what the filter of a step compares, in the size of the preview."""
-        stride, shown = self._compared(detail)
-        if self._active is None or self._active[0] != stride:
-            self._active = (stride, reduce(activity(shown), stride))
+        viewed = self._viewed(detail)
+        if self._active is None or self._active[0] != viewed:
+            stride, shown = self._compared(detail)
+            self._active = (viewed, reduce(activity(shown), stride))
         return self._active[1]
 
-    def _distance(self, detail: Step, guide: Tensor, stride: int) -> float | Tensor | None:
+    def _distance(self, detail: Step, guide: Tensor) -> float | Tensor | None:
         """The spatial bandwidth of a step in pixels of a guide."""
         size = (guide.shape[-2], guide.shape[-1])
-        scale = viewed_stride(detail, self.size, self.stride) if stride != self.stride else 1
+        scale = self._viewed(detail)[0] / size[0]
         return nearby_or_far(
             detail.arguments(size, scale)["spatial_bandwidth"], DETAIL["spatial_bandwidth"].share, size
         )
@@ -159,7 +154,7 @@ class Preview:
         if self._mask is None or self._mask[0] != key:
             fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
             if (detail["tolerance"], fewer) != self._compared_by:
-                self._source, self._compared_by = InMemory(self.pixels, {}), (detail["tolerance"], fewer)
+                self._source, self._compared_by = InMemory(self.pixels, {}, self.stride), (detail["tolerance"], fewer)
             (inner,), others = scribbles_of(detail, self.size)
             names = ("mask_bandwidth", "reach")
             bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
@@ -190,7 +185,7 @@ class Preview:
             if not step.changes():
                 continue
             before, key = key, (*key, step)
-            if not before and is_of_layers(step):
+            if not before and self._is_of_layers(step):
                 result = self._blend(step)
                 continue
             cached = self._pictures.get(i)
@@ -201,6 +196,12 @@ class Preview:
                 drawn = True
             result = cached[1]
         return result.clamp(0, 1)
+
+    def _is_of_layers(self, step: Step) -> bool:
+        """Whether a step weighs layers of luminance, which are cached."""
+        if step.edit != "detail" or step["residual"] is not None or step["channels"] != "luminance":
+            return False
+        return self._viewed(step) >= self.size
 
     def _blend(self, detail: Step) -> Tensor:
         layers, mask = self.layers(detail).layers, self.mask(detail)
@@ -217,7 +218,11 @@ class Preview:
         balance = None
         if detail["limits"] == "soft" and brighter is not None:
             balance = balance_in_memory(self.pixels, change, brighter)
-        return change_luminance(self.pixels, change, detail["limits"], balance)
+        if self.stride == 1:
+            return change_luminance(self.pixels, change, detail["limits"], balance)
+        luminance = reduce_channels(self.pixels, "luminance")
+        coarse = Coarse.of(self.pixels, luminance, change, detail["limits"], balance)
+        return coarse.seen(self.pixels, luminance, self.stride)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""
@@ -230,10 +235,3 @@ class Preview:
         if keep:
             self._filter = (key, edit)
         return edit
-
-
-def is_of_layers(step: Step) -> bool:
-    """Whether a step weighs layers of luminance, which are cached."""
-    if step.edit != "detail" or step["residual"] is not None or step["channels"] != "luminance":
-        return False
-    return step["viewing_size"] == 0 or step["viewing_size"] * MEGAPIXEL >= PIXELS

@@ -82,7 +82,7 @@ def fit_step(
     scribbles: tuple[Any, ...],
     named: dict[str, Any],
     *,
-    stride: int = 1,
+    stride: float = 1,
     generator: torch.Generator | None = None,
 ) -> Fitted:
     """What a step does to a source, under scribbles in place of those of the step; see :func:`scribbles_of`.
@@ -121,12 +121,12 @@ def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None =
     return apply_to(step, image, *scribbles_of(step, (image.shape[-2], image.shape[-1])), generator=generator)
 
 
-def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], Tensor]:
+def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step], Tensor]:
     """What steps that agree in :func:`shared` make of an image (1, C, H, W) in [0, 1].
 
     The filter is made once, for the first of them. The image has one pixel in ``stride`` of the photograph.
     """
-    source = InMemory(image.to(working_dtype(image)), {})
+    source = InMemory(image.to(working_dtype(image)), {}, stride)
 
     def edit(step: Step) -> Tensor:
         fitted = fit_step(step, source, *scribbles_of(step, source.size), stride=stride)
@@ -135,7 +135,7 @@ def prepare(step: Step, image: Tensor, *, stride: int = 1) -> Callable[[Step], T
     return edit
 
 
-def viewed_stride(step: Step, size: tuple[int, int], stride: int) -> float:
+def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
     """Every how many of the pixels in which the step counts lengths a picture has one.
 
     Args:
@@ -145,7 +145,7 @@ def viewed_stride(step: Step, size: tuple[int, int], stride: int) -> float:
     """
     if stride == 1 or "viewing_size" not in step.arguments(size):
         return stride
-    photograph = (size[0] * stride, size[1] * stride)
+    photograph = (round(size[0] * stride), round(size[1] * stride))
     return stride * viewed_size(photograph, step["viewing_size"])[0] / photograph[0]
 
 

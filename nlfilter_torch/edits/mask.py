@@ -142,7 +142,7 @@ class Regions:
     """
 
     reduced: Tensor
-    step: int
+    step: float
     functions: Tensor
     scribbles: list[Scribbles]
 
@@ -221,7 +221,8 @@ def fit_regions(
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
     check_count(options["num_landmarks"], "num_landmarks")
-    step = math.ceil(math.sqrt(source.size[0] * source.size[1] / SOLVED))
+    blocks = math.ceil(source.stride * math.sqrt(source.size[0] * source.size[1] / SOLVED))  # in the photograph
+    step = blocks if source.stride == 1 else max(1.0, blocks / source.stride)
     small = source.blocks(step, FLOATS + options["num_landmarks"])
     marks = [blocks_of(marked, small, source.size[1], step) for marked in both]
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
@@ -241,7 +242,7 @@ def fit_regions(
     return Regions(small.image, step, fit_borders(small.image, torch.cat(rough, dim=1), front, back), both)
 
 
-def blocks_of(marked: Scribbles, small: InMemory, width: int, step: int) -> Scribbles:
+def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Scribbles:
     """Scribbles on a reduced picture: each block has the weights of the pixels scribbled on, as a share of all.
 
     Args:
@@ -252,10 +253,11 @@ def blocks_of(marked: Scribbles, small: InMemory, width: int, step: int) -> Scri
     """
     if step == 1:
         return marked
-    columns = small.size[1]
-    places, block = (marked.places // width // step * columns + marked.places % width // step).unique(
-        return_inverse=True
+    row, column = (
+        ((at + 0.5) / step).long().clamp(max=count - 1)
+        for at, count in zip((marked.places // width, marked.places % width), small.size, strict=True)
     )
+    places, block = (row * small.size[1] + column).unique(return_inverse=True)
     weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
     weights = weights.index_add(2, block, marked.weights) / step**2
     return Scribbles(places, weights, small.colours(places))

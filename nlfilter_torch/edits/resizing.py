@@ -85,7 +85,7 @@ def cubic(distance: Tensor) -> Tensor:
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
 
 
-def enlarged(blocks: Tensor, step: int, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
+def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
     """A part (B, C, h, w) of a picture from values (B, C, n, m) of its blocks, between whose middles they are linear.
 
     Args:
@@ -94,9 +94,21 @@ def enlarged(blocks: Tensor, step: int, corner: tuple[int, int], size: tuple[int
         corner: row and column of its first pixel.
         size: (h, w).
     """
+    if step != round(step):
+        across = (_between(first, n, step, m) for first, n, m in zip(corner, size, blocks.shape[-2:], strict=True))
+        rows, columns = (weights.to(blocks) for weights in across)
+        return rows @ blocks @ columns.mT
+    step = round(step)
     low, left = (max(0, first // step - 1) for first in corner)
     high, right = ((first + count - 1) // step + 2 for first, count in zip(corner, size, strict=True))
     part = blocks[:, :, low:high, left:right]
     if step > 1:
         part = F.interpolate(part, scale_factor=step, mode="bilinear", align_corners=False)
     return part[:, :, corner[0] - low * step :, corner[1] - left * step :][:, :, : size[0], : size[1]]
+
+
+def _between(first: int, count: int, step: float, blocks: int) -> Tensor:
+    """Weights (count, blocks) of the blocks of an axis for pixels from a first one on."""
+    position = ((torch.arange(first, first + count, dtype=torch.float64) + 0.5) / step - 0.5).clamp(0, blocks - 1)
+    distance = (position.unsqueeze(1) - torch.arange(blocks, dtype=torch.float64)).abs()
+    return (1 - distance).clamp(min=0.0)

@@ -5,6 +5,7 @@ pixels once these sums are known. A :class:`Source` has the sums: here of an ima
 batch; in :mod:`nlfilter_torch.tiled.source` of a picture that is read a few rows at a time.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -123,6 +124,10 @@ class Source(Protocol):
     def whole(self) -> bool:
         """Whether all pixels are at hand at once."""
 
+    @property
+    def stride(self) -> float:
+        """Every how many pixels of a photograph, each way, it has one; 1 but for previews."""
+
     def operator(self, guide: Guide) -> Operator:
         """The filter of the picture."""
 
@@ -164,8 +169,10 @@ class Source(Protocol):
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means (B, C, H / step, W / step), rounded up, over blocks of ``step`` pixels in both directions."""
 
-    def blocks(self, step: int, floats: int) -> "InMemory":
+    def blocks(self, step: float, floats: int) -> "InMemory":
         """The picture reduced by means over blocks of ``step`` pixels in both directions, in memory.
+
+        The step is an integer, but for previews.
 
         Raises:
             MemoryError: if there is no room for so many ``floats`` for each of its pixels.
@@ -181,13 +188,14 @@ class InMemory:
     Args:
         image: (B, C, H, W), float32 or float64.
         kept: its operators by their options, if they are to be kept.
+        stride: every how many pixels of a photograph, each way, it has one.
     """
 
     first = 0
     whole = True
 
-    def __init__(self, image: Tensor, kept: dict[Any, Any] | None = None) -> None:
-        self.image, self.kept, self.dtype = image, kept, image.dtype
+    def __init__(self, image: Tensor, kept: dict[Any, Any] | None = None, stride: float = 1) -> None:
+        self.image, self.kept, self.stride, self.dtype = image, kept, stride, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
 
@@ -232,7 +240,7 @@ class InMemory:
             return self
         return InMemory(resize(self.image, size))
 
-    def blocks(self, step: int, floats: int) -> "InMemory":
+    def blocks(self, step: float, floats: int) -> "InMemory":
         """The image reduced by :func:`block_means`."""
         if step == 1:
             return self
@@ -352,9 +360,27 @@ def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> 
     return operator.each(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
 
 
-def block_means(planes: Tensor, step: int) -> Tensor:
-    """Means over blocks of ``step`` pixels in both directions, those at the lower and right borders smaller."""
-    return planes if step == 1 else F.avg_pool2d(planes, step, ceil_mode=True, count_include_pad=False)
+def block_means(planes: Tensor, step: float) -> Tensor:
+    """Means over blocks of ``step`` pixels in both directions, those at the lower and right borders smaller.
+
+    Of a fractional step, pixels count by the share of them that is in the block.
+    """
+    if step == round(step):
+        step = round(step)
+        return planes if step == 1 else F.avg_pool2d(planes, step, ceil_mode=True, count_include_pad=False)
+    rows, columns = (_shares(length, step).to(planes) for length in planes.shape[-2:])
+    return rows @ planes @ columns.mT
+
+
+def _shares(length: int, step: float) -> Tensor:
+    """Weights (n, length) of the pixels of an axis in blocks of a fractional step."""
+    count = math.ceil(length / step - 0.01)  # no sliver at the end
+    ends = torch.arange(count + 1, dtype=torch.float64) * step
+    ends[-1] = length
+    first = torch.arange(length, dtype=torch.float64)
+    inside = torch.minimum(ends[1:, None], first + 1) - torch.maximum(ends[:-1, None], first)
+    inside = inside.clamp(min=0.0)
+    return inside / inside.sum(1, keepdim=True)
 
 
 def luminance(pixels: Pixels) -> Tensor:

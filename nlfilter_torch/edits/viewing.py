@@ -14,6 +14,8 @@ it is. The average of the result over a pixel of the small picture is the small 
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import torch
@@ -22,10 +24,11 @@ from torch import Tensor
 
 from nlfilter_torch.edits.colour import Balance, Limits, balance_of, change_luminance, limited_change, move_luminance
 from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes, corner
-from nlfilter_torch.edits.resizing import resized
+from nlfilter_torch.edits.resizing import interpolation, resized
 from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
+PASSED = 4  # pixels around one that its enlargement depends on once it is reduced again
 FAINT = (2 / 255) ** 2  # variance below which a slope over brightness is taken for 0
 
 
@@ -47,6 +50,10 @@ class Reducible(Protocol):
     @property
     def size(self) -> tuple[int, int]:
         """(H, W)."""
+
+    @property
+    def stride(self) -> float:
+        """Every how many pixels of a photograph, each way, it has one."""
 
     def resized(self, size: tuple[int, int]) -> Any:
         """The picture in a smaller size."""
@@ -86,8 +93,9 @@ def fit_change(
         return held, balance_of(lambda function: of.mean_of(held, function), brighter)
 
     small = viewed_size(source.size, size)
-    if small == source.size:
-        fitted, balance = balanced(source, change(source))
+    reduced: Any = source if small == source.size else source.resized(small)
+    fitted, balance = balanced(reduced, change(reduced))
+    if small == source.size and source.stride == 1:
         if fitted.finish is None:
             return Fitted(lambda pixels: change_luminance(pixels.image, fitted.pixels(pixels), limits, balance))
         finish = fitted.finish
@@ -96,30 +104,93 @@ def fit_change(
             lambda image, found: change_luminance(image, finish(image, found), limits, balance),
             fitted.margin,
         )
-    reduced = source.resized(small)
-    fitted, balance = balanced(reduced, change(reduced))
     before, after = reduced.all(Fitted(planes)), reduced.all(fitted)
-    saturation = None
-    if limits == "soft":
-        image = reduced.all(Fitted(lambda pixels: pixels.image))
-        after, saturation = limited_change(image, after, balance)
-    parts = [before, after, slope(before, after), *([] if saturation is None else [saturation])]
-    coarse = torch.cat(parts, dim=1)
-    count = before.shape[1]
+    image = reduced.all(Fitted(lambda pixels: pixels.image)) if limits == "soft" else before
+    coarse = Coarse.of(image, before, after, limits, balance)
+    if small == source.size:
+        return Fitted(lambda pixels: coarse.seen(pixels.image, planes(pixels), source.stride))
 
     def edit(pixels: Pixels) -> Tensor:
         (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
         columns = None if width == pixels.width else range(left, left + width)
         found = resized(
-            lambda start, stop: coarse[:, :, start:stop], small, source.size, range(top, top + height), columns
+            lambda start, stop: coarse.planes[:, :, start:stop],
+            small,
+            source.size,
+            range(top, top + height),
+            columns,
         )
-        blurred, changed, steepness = found[:, : 3 * count].chunk(3, dim=1)
-        moved = changed + steepness * (planes(pixels) - blurred)
-        if limits == "none":
-            return pixels.image + moved
-        return move_luminance(pixels.image, moved, None if saturation is None else found[:, 3 * count :])
+        return coarse.change(pixels.image, planes(pixels), found)
 
     return Fitted(edit)
+
+
+@dataclass(frozen=True, eq=False)
+class Coarse:
+    """A change of brightness at the viewing size.
+
+    Attributes:
+        planes: what is changed, its change, the slope of the change over it, and for ``soft`` limits of luminance the
+            change of saturation, (B, S, h, w).
+        count: channels of each of the first three.
+        limits: of :func:`change_luminance`.
+    """
+
+    planes: Tensor
+    count: int
+    limits: Limits
+
+    @staticmethod
+    def of(image: Tensor, before: Tensor, change: Tensor, limits: Limits, balance: Balance | None) -> "Coarse":
+        """The change of some planes of an image, as far as the limits allow it."""
+        saturation = None
+        if limits == "soft":
+            change, saturation = limited_change(image, change, balance)
+        parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
+        return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
+
+    def change(self, image: Tensor, planes: Tensor, found: Tensor) -> Tensor:
+        """Pixels of the picture, of which ``planes`` are changed, under the part of :attr:`planes` that they see."""
+        blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
+        moved = changed + steepness * (planes - blurred)
+        if self.limits == "none":
+            return image + moved
+        saturation = found[:, 3 * self.count :]
+        return move_luminance(image, moved, saturation if saturation.shape[1] else None)
+
+    def seen(self, image: Tensor, planes: Tensor, stride: float) -> Tensor:
+        """The picture of the viewing size under what is left of the change where it was enlarged and is reduced."""
+        return self.change(image, planes, enlarged_and_reduced(self.planes, stride))
+
+
+def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:
+    """Planes (B, C, H, W) as they are once they were made ``stride`` times as large, and resized back.
+
+    At borders, and for a stride that is no integer, to an approximation.
+    """
+    kernel = _passed(stride).to(planes)
+    reach = len(kernel) // 2
+    padded = F.pad(planes, (reach,) * 4, mode="replicate").flatten(0, 1).unsqueeze(1)
+    rows = F.conv2d(padded, kernel.view(1, 1, -1, 1))
+    return F.conv2d(rows, kernel.view(1, 1, 1, -1)).view_as(planes)
+
+
+@lru_cache(maxsize=8)
+def _passed(stride: float) -> Tensor:
+    """The weights (2 PASSED + 1,) of the pixels around one, along an axis, mean over the places in between."""
+    length, places = 64, range(28, 36)
+    large = round(length * stride)
+    used, down = interpolation(places, large, length)
+    rows = torch.stack([weights @ _up(used, length, large) for weights in down])  # (8, 64)
+    around = [rows[i, place - PASSED : place + PASSED + 1] for i, place in enumerate(places)]
+    found = torch.stack(around).mean(0)
+    return (found + found.flip(0)) / (2 * found.sum())
+
+
+def _up(used: slice, length: int, large: int) -> Tensor:
+    """Weights (n, length) of the pixels of an axis for some places of its enlargement."""
+    part, weights = interpolation(range(used.start, used.stop), length, large)
+    return F.pad(weights, (part.start, length - part.stop))
 
 
 def slope(before: Tensor, change: Tensor) -> Tensor:

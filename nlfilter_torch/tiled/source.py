@@ -38,6 +38,7 @@ class Tiled:
 
     batch = 1
     whole = False
+    stride = 1
 
     def __init__(self, picture: Picture, passes: Passes, strokes: str = "strokes") -> None:
         self.picture, self.passes, self.strokes = picture, passes, strokes
@@ -254,19 +255,19 @@ class Tiled:
         yield function(next(each))
         yield from in_order(function, each, self.passes.workers(1))
 
-    def blocks(self, step: int, floats: int) -> InMemory:
-        """The picture reduced by means over blocks, in memory.
+    def blocks(self, step: float, floats: int) -> InMemory:
+        """The picture reduced by means over blocks of an integer number of pixels each way, in memory.
 
         Raises:
             MemoryError: if there is no room for so many floats for each of its pixels.
         """
-        needed = math.prod(-(-side // step) for side in self.size) * floats * self.dtype.itemsize
+        needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
         if needed > self.passes.memory:
             raise MemoryError(
                 f"{self.picture.name} needs {needed / 1e6:.0f} MB of memory at least, but "
                 f"{self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
-        return InMemory(self.reduced(lambda pixels: pixels.image, step))
+        return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
 
     @torch.no_grad()
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:

@@ -1,0 +1,126 @@
+"""What the editor shows, against what it saves: ``python -m benchmarks.preview [--pictures FOLDER]``.
+
+Each photograph is opened in a session of the editor, edited, and saved. Printed is the root mean square difference in
+grey levels between the picture on the screen, before it becomes a JPEG, and the saved file resized to its size: for
+each edit the mean over all photographs and strides and the largest, the mean of each stride, and by how much the edit
+changes the picture.
+
+A photograph is resized to ``stride`` times the side of the preview, and the viewing size has the proportion to the
+preview that it has in the editor, 1, so that small previews show what large ones would; ``--pixels 1500000`` measures
+these.
+"""
+
+import argparse
+import math
+import statistics
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.photographs import pictures
+from nlfilter_torch.app.preview import PIXELS
+from nlfilter_torch.app.session import Session
+from nlfilter_torch.edits.parameters import VIEWING_SIZE
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+
+NAMES = ("chelsea", "coffee", "rocket", "motorcycle", "astronaut", "retina")
+HERE, THERE = ((0.45, 0.5), (0.52, 0.5)), ((0.1, 0.1), (0.16, 0.1))
+SOFTER = tuple((i / 16) ** 0.9 for i in range(17))
+EDITS = {
+    "detail": Step("detail", alpha=(2.0, 2.0, 2.0, 1.0)),
+    "detail of a region": Step("detail", (Stroke(HERE, 0.03, "in"),), alpha=(1.0,) * 4, inside=(3.0, 3.0, 2.0, 1.0)),
+    "tone": Step("tone", contrast=1.2, clarity=2.0),
+    "sharpen": Step("sharpen"),
+    "denoise": Step("denoise"),
+    "recolor": Step("recolor", (Stroke(HERE, 0.03, "#2040e0"),)),
+    "colorize": Step("colorize", (Stroke(HERE, 0.03, "#b03020"), Stroke(THERE, 0.03, "#20b0e0"))),
+    "defocus": Step("defocus", (Stroke(HERE, 0.03, "in"),)),
+    "abstract": Step("abstract"),
+    "abstract, lines and tones": Step("abstract", edges=0.8, tones=8),
+    "look": Step("look", alpha=(2.0, 1.5, 1.0, 1.0), red=SOFTER, saturation=(1.2,) * 5),
+}
+RECIPES = {name: Recipe((step,)) for name, step in EDITS.items()}
+RECIPES["detail, recolor and defocus"] = Recipe((EDITS["detail"], EDITS["recolor"], EDITS["defocus"]))
+
+
+def scaled(recipe: Recipe, pixels: int) -> Recipe:
+    """A recipe whose viewing sizes have the same proportion to a preview of so many pixels as in the editor."""
+    size = VIEWING_SIZE.default * pixels / PIXELS
+    changed = [step.changed(viewing_size=size) if "viewing_size" in names(step) else step for step in recipe.steps]
+    return Recipe(tuple(changed))
+
+
+def names(step: Step) -> set[str]:
+    """Of the parameters of a step."""
+    return {parameter.name for parameter in step.declared}
+
+
+def sized(picture: Tensor, pixels: int, stride: int) -> Tensor:
+    """A photograph (1, 3, H, W) of which a preview of at most so many pixels has one in ``stride`` each way."""
+    scale = math.sqrt(pixels / (picture.shape[-2] * picture.shape[-1]))
+    size = [int(length * scale) * stride for length in picture.shape[-2:]]
+    return F.interpolate(picture.float(), size, mode="bicubic", antialias=True).clamp(0, 1)
+
+
+def errors(picture: Tensor, pixels: int, stride: int, recipes: dict[str, Recipe]) -> Iterator[tuple[str, float, float]]:
+    """For each recipe its name, the difference between preview and saved file, and how much the edit changes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "photograph.tif"
+        photograph = Photograph(sized(picture, pixels, stride))
+        write_photograph(replace(photograph, depth="uint16"), path)
+        session = Session(Path(folder), pixels)
+        session.open(path)
+        assert round(session.preview.stride) == stride
+        for name, recipe in recipes.items():
+            session.load(scaled(recipe, pixels))
+            shown = session.render()
+            saved = resize(read_photograph(session.save("saved.tif")).pixels, session.preview.size).clamp(0, 1)
+            yield name, levels(shown - saved), levels(saved - session.preview.pixels.clamp(0, 1))
+
+
+def levels(difference: Tensor) -> float:
+    """Root mean square in grey levels of 255."""
+    return float(255 * difference.square().mean().sqrt())
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pictures", type=Path, help="a folder of photographs in place of scikit-image's")
+    parser.add_argument("--pixels", type=int, default=150_000, help="of the preview, at most")
+    parser.add_argument("--strides", type=int, nargs="+", default=[2, 3, 5, 8])
+    parser.add_argument("--edits", nargs="+", choices=RECIPES, default=list(RECIPES), metavar="EDIT")
+    parser.add_argument("--most", type=int, default=6, help="photographs")
+    parser.add_argument("--quick", action="store_true", help="one photograph, a small preview of stride 2")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.pixels, options.strides, options.most = 6_000, [2], 1
+    recipes = {name: RECIPES[name] for name in options.edits}
+    found = list(pictures(options.pictures, 1 << 20, NAMES).items())[: options.most]
+    results: dict[str, dict[int, list[tuple[float, float]]]] = {name: {} for name in recipes}
+    for stride in options.strides:
+        for title, picture in found:
+            for name, error, change in errors(picture, options.pixels, stride, recipes):
+                results[name].setdefault(stride, []).append((error, change))
+                print(f"{title}, stride {stride}, {name}: {error:.2f} of {change:.1f}", flush=True)
+    print(f"\n{len(found)} photographs, previews of {options.pixels} pixels, {torch.get_num_threads()} threads")
+    strides = "".join(f"{f'stride {stride}':>10}" for stride in options.strides)
+    print(f"{'RMS difference in grey levels':<32}{'mean':>8}{'largest':>9}{strides}{'change':>9}")
+    for name, by_stride in results.items():
+        pairs = [pair for some in by_stride.values() for pair in some]
+        mean, change = (statistics.mean(column) for column in zip(*pairs, strict=True))
+        each = "".join(f"{statistics.mean(error for error, _ in by_stride[s]):>10.2f}" for s in options.strides)
+        print(f"{name:<32}{mean:>8.2f}{max(error for error, _ in pairs):>9.2f}{each}{change:>9.1f}")
+
+
+if __name__ == "__main__":
+    main()
