@@ -19,9 +19,10 @@ from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared
 from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, nearby_or_far
 from nlfilter_torch.edits.detail import activity, change_of_mean, held_back, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
-from nlfilter_torch.edits.parameters import DETAIL, MASK, VIEWING_SIZE
+from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import MEGAPIXEL, Coarse, viewed_size

@@ -72,7 +72,7 @@ def _pivots(points: Tensor, draws: list[float]) -> Tensor:
     size, last = points.shape[1], points.shape[2] - 1
     norms = points.square().sum(1, keepdim=True)
     rows, residual = points[:, :0], torch.ones_like(norms)
-    found = []
+    found: list[Tensor] = []
     for draw in draws:
         summed = chance(residual, CAPTURED).double().cumsum(2)
         pivot = (summed < draw * summed[:, :, -1:]).sum(2, keepdim=True).clamp(max=last)
