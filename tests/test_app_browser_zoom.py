@@ -220,6 +220,7 @@ def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: E
     assert (saved - cat(1)).abs().max() > 5 / 255
     tab.assert_shown(saved)
 
+    expect(page.locator(".q-notification")).to_have_count(0)  # they cover the slider
     tab.drag(tab.slider("Before and after"), 0.0, 0.5)
     expect(page.locator(".originals img")).to_have_count(1)
     edge = page.locator(".edge").bounding_box()

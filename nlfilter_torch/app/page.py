@@ -259,7 +259,7 @@ class Editor:
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")
             if self.session.recipe != Recipe():
-                ui.notify("The edit is as you left it. Reset begins anew.", position="top", timeout=4000)
+                ui.notify("The edit is as you left it. Reset begins anew.", position="bottom-left", timeout=4000)
 
     async def _take_preset(self, event: events.UploadEventArguments) -> None:
         content = await event.file.read()
@@ -321,7 +321,7 @@ class Editor:
             return
         self._show_state()
         with self._client:
-            ui.notify(f"Saved {path.resolve()}", type="positive", position="top", timeout=6000)
+            ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
 
     # Work
 
@@ -344,7 +344,7 @@ class Editor:
         if not self._client.is_deleted:
             with self._client:
                 self._error = ui.notification(
-                    sentence, type="negative", position="top", timeout=LASTING, close_button="OK", multi_line=True
+                    sentence, type="negative", position="bottom", timeout=LASTING, close_button="OK", multi_line=True
                 )
 
     def _clear_error(self) -> None:

@@ -8,7 +8,6 @@ body { background: #17181b; }
   box-shadow: 0 0 0 2px #17181b, 0 0 0 4px #ffd54a !important; border-radius: 3px; }
 .topbar { background: #101114; height: 52px; gap: 6px; padding: 0 16px; }
 .title { min-width: 0; }
-.q-notifications__list--top { top: 52px; right: 376px; }  /* over the photograph, beside all controls */
 .dialog { width: 460px; max-width: 94vw; background: #2a2d33; }
 .editor { display: flex; width: 100vw; height: calc(100dvh - 52px); }
 .viewer { flex: 1; min-width: 0; display: flex; flex-direction: column; padding: 16px 20px 8px; gap: 10px; }
@@ -72,7 +71,6 @@ body { background: #17181b; }
   .bar { padding-left: 12px; }
   .working { position: fixed; top: 58px; left: 10px; background: #000c; padding: 4px 10px; border-radius: 14px; }
   .panel { width: 300px; flex-wrap: nowrap; }
-  .q-notifications__list--top { right: 300px; }
   .panel > * { flex: none; }
   .viewer { padding: 10px 10px 6px; }
 }
@@ -81,7 +79,6 @@ body { background: #17181b; }
   .viewer { padding: 6px; gap: 4px; min-height: 0; }
   .bar { gap: 8px; padding: 0 4px 0 12px; }
   .welcome { padding: 24px; }
-  .q-notifications__list--top { right: 0; }
   .panel { width: 100%; height: 44%; flex-wrap: nowrap; border-radius: 14px 14px 0 0; padding: 0 8px 12px; }
   .folded .panel { height: 40px; overflow: hidden; }
   .handle { display: inline-flex; width: 100%; min-height: 36px; flex: none; position: sticky; top: 0; z-index: 5;
