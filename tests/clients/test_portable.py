@@ -1,21 +1,15 @@
 """Exported programs that run without this package; docs/clients.md runs a layer in ONNX."""
 
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import NonlocalFilter, Portable, nonlocal_operator
+from nlfilter_torch import NonlocalFilter, Portable
 from nlfilter_torch.operator import portable
 from nlfilter_torch.operator.nystrom import JITTER, invert
 from tests.problems import colour, noise
-from tests.test_modules_transforms import Fitted
 
 NLFILTER = torch.ops.nlfilter
 
@@ -65,26 +59,3 @@ def test_landmarks_are_those_of_the_operator() -> None:
 def test_a_model_is_wanted() -> None:
     with pytest.raises(TypeError, match=r"module must be a Module, got .*; pass a layer such as"):
         Portable(lambda image: image)  # type: ignore[arg-type]
-
-
-@pytest.mark.client("ONNX, AOTInductor", "building included, by `Portable`; for images of one size")
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
-@pytest.mark.filterwarnings("ignore:`isinstance.treespec, LeafSpec.` is deprecated:FutureWarning")
-@pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated:DeprecationWarning")
-def test_compiled_ahead_of_time(tmp_path: Path) -> None:
-    """A fitted operator in a process that does not import this package; benchmarks.compilation compiles building."""
-    fitted = Fitted(nonlocal_operator(colour("chelsea", 8, 9), num_landmarks=3, patch_size=1)).requires_grad_(False)
-    picture, package = colour("coffee", 8, 9), tmp_path / "fitted.pt2"
-    program = torch.export.export(Portable(fitted), (picture,))
-    torch._inductor.aoti_compile_and_package(program, package_path=str(package))
-    np.save(tmp_path / "picture.npy", picture.numpy())
-    script = (
-        "import sys, numpy, torch\n"
-        "image = torch.from_numpy(numpy.load('picture.npy'))\n"
-        "numpy.save('result.npy', torch._inductor.aoti_load_package('fitted.pt2')(image).numpy())\n"
-        "assert 'nlfilter_torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
-    found = torch.from_numpy(np.load(tmp_path / "result.npy"))
-    torch.testing.assert_close(found, fitted(picture), atol=1e-5, rtol=0)
