@@ -114,6 +114,11 @@ def _denoiser(image: Tensor, noise: float | Tensor = 0.1) -> Tensor:
     return nlf.NonlocalDenoiser()(image, noise)
 
 
+def _portable(image: Tensor, alpha: list[float]) -> Tensor:
+    """A layer in its portable form, which is itself but while it is exported."""
+    return nlf.Portable(nlf.NonlocalFilter(alpha, num_landmarks=10))(image)
+
+
 def _sliders(operator: nlf.NonlocalOperator, image: Tensor, **options: Any) -> Tensor:
     return nlf.PolynomialSliders(options.pop("alpha"), **options)(operator, image)
 
@@ -280,6 +285,7 @@ FUNCTIONS = {
     ),
     "NonlocalAffinity": Function(_affinity, {"image": _image(1, 3)}, FILTER | GUIDED | {"learn": _one_of(())}),
     "NonlocalDenoiser": Function(_denoiser, {"image": _image(1, 3)}, {"noise": _number(0, 0.3)}),
+    "Portable": Function(_portable, LIST | {"image": _image(1, 3)}, {}),
     "PolynomialSliders": Function(_sliders, OPERATOR | IMAGE | LIST, RESIDUAL | {"learn": _one_of((), ("alpha",))}),
     "DiffusionMask": Function(
         _diffusion_module, SPECTRUM | REGION, NUMBERS | {"learn": _one_of((), ("time", "width"))}
