@@ -1,10 +1,10 @@
-"""Soft masks of things from scribbles on them and on what is around. Goes beyond the paper's Sec. IV.
+"""Soft object masks from foreground and background scribbles. Goes beyond the paper's Sec. IV.
 
-The scribbles train a regression on the filter's covariance, see :mod:`nlfilter_torch.filtering.scribbles`, whose guide
-compares colours, their surroundings and texture; local solves then lay the borders along those of the picture. All of
-this is done to a picture that is reduced to about :data:`SOLVED` pixels, so that its cost hardly grows with the size.
-It ends in a linear function of the colours for each place, which gives the mask of any pixel from its own colours; so
-tiles are exact.
+A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
+texture separates foreground from background. Two local solves (:mod:`nlfilter_torch.edits.matting`) then align the
+borders of the mask with those of the picture. Both run on a copy reduced to about :data:`SOLVED` pixels, so the cost
+hardly grows with the size of the picture. The result is a linear function of the colour for each place, which gives the
+mask of any pixel from its own colour; results in tiles are therefore exact.
 """
 
 import math
@@ -29,16 +29,16 @@ from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 
 SOLVED = 1 << 17  # pixels
 CHROMA = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
-AROUND, GRAIN, TEXTURE = 2.0, 1.5, 3.0  # standard deviations in pixels: surroundings, grain, mean of its strength
+AROUND, GRAIN, TEXTURE = 2.0, 1.5, 3.0  # Gaussians, in pixels: surrounding colour, grain, average of its strength
 TEXTURED = 1.5  # weight of texture
-PLANES = 9  # of the guide
-FLOATS = 80  # of a pixel of the reduced picture, about, beside those of its operator
+PLANES = 9  # channels of the guide
+FLOATS = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 SMOOTHNESS = 0.25  # of the regression
-FRAME = 64  # points along the upper or left border of a picture, about
-CONTRAST = 4.0  # with which a likelihood becomes a rough mask
+FRAME = 64  # approximate number of points along the upper or left border of a picture
+CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
 TRUST, CERTAIN = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
-COMPARED = 512  # scribbled pixels, about, that the frame is compared with
-ODD = 0.1  # share of the scribbled pixels that has to be like a point of the frame for this to be no background
+COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
+ODD = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
 TINY = 1e-6
 
 
@@ -52,7 +52,7 @@ def lab_of(image: Tensor) -> Tensor:
 
 
 def region_guide(image: Tensor) -> Tensor:
-    """What masks compare, (B, 9, H, W): colours, those around, and the strength of grain and of its two directions."""
+    """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of grain and of both gradients."""
     lab = lab_of(image)
     lightness = lab[:, :1]
     colours = lab * lab.new_tensor([LIGHTNESS, CHROMA, CHROMA]).view(1, 3, 1, 1)
@@ -75,23 +75,23 @@ def region_mask(
     num_landmarks: int = MASK.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
-    """Soft masks of regions from scribbles on each and on what is around them.
+    """Soft object masks from foreground and background scribbles.
 
-    A regression on colour and texture tells object from background: pixels like the scribbles belong to the region,
-    those like scribbles of the background do not. Points along the borders of the picture count as background, too, the
-    less the more they resemble the region, so that one scribble is enough. The borders of the mask then follow the
-    picture's. :func:`diffusion_mask` is the paper's mask, of all that is similar to one region.
+    A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
+    similar to background scribbles do not. Points along the borders of the picture also count as background unless they
+    resemble the region, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
+    :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        scribbles: (B, K, H, W) in [0, 1], above 0 on some or all of each of K regions; a rough mask will do. Those of
-            other regions are background, where they do not overlap.
-        background: (B, 1 or K, H, W) in [0, 1], above 0 on some of what is in no region, or not in that one; scribbles
-            paint over it. None is no such scribble.
-        reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
-            alike.
+        scribbles: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions; a rough mask is fine. Scribbles
+            of other regions are background, except where they overlap.
+        background: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions or of each;
+            ``scribbles`` take precedence. None means no background scribbles.
+        reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
+            include less similar pixels.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
-        spatial_bandwidth: in pixels; None is 0.6 of the short side, ``math.inf`` no limit: all that is alike anywhere.
+        spatial_bandwidth: in pixels; None is 0.6 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         num_landmarks: M of the operator.
         **options: further ones of :func:`nonlocal_operator`, such as ``generator``.
 
@@ -132,13 +132,13 @@ def fit_mask(source: Source, scribbles: Any, background: Any = None, **options: 
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Masks of K regions, for an edit that needs them.
+    """Masks of K regions, as other edits use them.
 
     Attributes:
-        reduced: the picture that they were found in, (B, C, h, w).
-        step: rows and columns of the picture that are one of this one.
-        functions: from colours to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
-        scribbles: on each and on what is around it.
+        reduced: the reduced picture in which the masks were computed, (B, C, h, w).
+        step: size of a pixel of ``reduced``, in pixels of the picture.
+        functions: linear functions from colours to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
+        scribbles: for each region, weights on the region and on its background.
     """
 
     reduced: Tensor
@@ -148,16 +148,16 @@ class Regions:
 
     @property
     def around(self) -> Tensor:
-        """Largest weight of what is scribbled as background of each region, (B, K)."""
+        """Largest weight of a background scribble of each region, (B, K)."""
         return torch.stack([marked.weights[:, 1].amax(1) for marked in self.scribbles], dim=1)
 
     def rows(self, planes: Tensor, pixels: Any) -> Tensor:
-        """The part (B, C, h, w) that some pixels have of planes of the reduced picture."""
+        """Planes of the reduced picture, enlarged to the given pixels, (B, C, h, w)."""
         height, width = pixels.image.shape[-2:]
         return enlarged(planes, self.step, corner(pixels), (height, width))
 
     def masks(self, pixels: Any) -> Tensor:
-        """The masks (B, K, h, w) of some pixels."""
+        """Masks (B, K, h, w) of the given pixels."""
         image, found = pixels.image - 0.5, []
         for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = linear_mask(image, self.rows(functions, pixels)).clamp(0.0, 1.0)
@@ -166,7 +166,7 @@ class Regions:
         return torch.cat(found, dim=1)
 
     def reduced_masks(self) -> Tensor:
-        """The masks (B, K, h, w) of the reduced picture."""
+        """Masks (B, K, h, w) of the reduced picture."""
         image = self.reduced - 0.5
         return torch.cat([linear_mask(image, f).clamp(0.0, 1.0) for f in self.functions.unbind(1)], dim=1)
 
@@ -179,7 +179,7 @@ def select_regions(
     names: tuple[str, str] = ("scribbles", "background"),
     **options: Any,
 ) -> Regions:
-    """The masks of regions from scribbles in whatever form a source has these; ``names`` are theirs in errors.
+    """Compute the masks of regions from scribbles in the form that the source takes; ``names`` name them in errors.
 
     Further arguments are those of :func:`region_mask`.
     """
@@ -210,9 +210,15 @@ def fit_regions(
     spatial_bandwidth: float | Tensor | None = None,
     **options: Any,
 ) -> Regions:
-    """The masks of regions from the scribbles on each, and on the background of all of them or of each; or none.
+    """Compute the masks of regions from scribbles on each.
 
-    Further arguments are those of :func:`region_mask`.
+    Args:
+        source: the picture.
+        inside: scribbles on each region.
+        background: scribbles on the background: none, one for all regions, or one for each.
+        reach: as for :func:`region_mask`.
+        spatial_bandwidth: likewise.
+        **options: further arguments of :func:`region_mask`.
     """
     MASK["reach"].check_argument(reach, source.batch)
     count, several = len(inside), len(background) > 1
@@ -243,13 +249,13 @@ def fit_regions(
 
 
 def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Scribbles:
-    """Scribbles on a reduced picture: each block has the weights of the pixels scribbled on, as a share of all.
+    """Scribbles on the reduced picture; the weight of a block is the mean weight of its pixels.
 
     Args:
-        marked: scribbles.
-        small: the picture, reduced.
+        marked: scribbles on the picture.
+        small: the reduced picture.
         width: W of the picture.
-        step: rows and columns of a block.
+        step: side of a block, in pixels.
     """
     if step == 1:
         return marked
@@ -264,7 +270,7 @@ def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Sc
 
 
 def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:
-    """The scribbles of a region and, as the second of two, those of all that is not in it."""
+    """Two planes of scribbles: on one region, and on everything outside it."""
     rest = [other for k, other in enumerate(inside) if k != number] + background
     own = inside[number]
     if not rest:
@@ -277,7 +283,7 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
 
 
 def frame_places(size: tuple[int, int]) -> Tensor:
-    """Numbers (n,), ascending, of pixels spread along the borders of a picture, one pixel away from them if it can."""
+    """Indices (n,), ascending, of pixels spaced along the borders of a picture, one pixel inside where possible."""
     height, width = size
     spacing = max(1, (height + width) // FRAME)
     top, left = min(1, height - 1), min(1, width - 1)
@@ -288,15 +294,15 @@ def frame_places(size: tuple[int, int]) -> Tensor:
 
 
 def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
-    """How much the colours of other pixels (B, C, k) are like any of scribbled ones (B, C, n), (B, 1, k) in [0, 1].
+    """Similarity, in [0, 1], of the colours of other pixels to those of scribbled pixels, (B, 1, k).
 
-    The spatial term has no part in it: a sky that the scribble is far from is still the same sky.
+    Position does not matter: the far end of a sky still counts as the same sky.
 
     Args:
-        scribbled: colours.
-        weights: (B, n), above 0 where they count.
-        others: colours.
-        bandwidth: photometric, of the regression.
+        scribbled: colours (B, C, n) of scribbled pixels.
+        weights: their weights (B, n); pixels of weight 0 do not count.
+        others: colours (B, C, k) of the other pixels.
+        bandwidth: photometric bandwidth of the regression.
     """
     every = max(1, scribbled.shape[2] // COMPARED)
     some, counted = (t[..., ::every] for t in (scribbled, weights.detach() > 0))
@@ -311,15 +317,15 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
 def _regression(
     source: Source, operator: Operator, marked: Scribbles, frame: Blocks, unlike: Tensor, reach: float | Tensor
 ) -> Planes:
-    """How likely any pixel belongs to a region: about 1 if it does, about 0 if not; not clamped.
+    """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
 
     Args:
         source: the picture.
-        operator: of it.
-        marked: scribbles on the region and on what is around.
-        frame: columns of pixels along the borders of the picture.
-        unlike: how much these differ from the scribbles on the region, (B, 1, n).
-        reach: as of :func:`region_mask`.
+        operator: its operator.
+        marked: scribbles on the region and on its background.
+        frame: columns of the pixels along the borders of the picture.
+        unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
+        reach: as for :func:`region_mask`.
     """
     columns, weights = operator.at(marked.places), marked.weights
     total = weights.sum(1, keepdim=True).clamp(max=1.0)
@@ -336,13 +342,13 @@ def _regression(
 
 
 def fit_borders(image: Tensor, likely: Tensor, front: Tensor, back: Tensor) -> Tensor:
-    """Functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
+    """Linear functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
 
     Args:
         image: (B, C, H, W).
-        likely: how likely pixels are in the regions, (B, K, H, W).
-        front: weights of the scribbles on the regions, likewise.
-        back: of those on what is around.
+        likely: likelihood of the regions, (B, K, H, W).
+        front: weights of the scribbles on the regions, (B, K, H, W).
+        back: weights of the scribbles on their background, (B, K, H, W).
     """
     bound = math.tanh(CONTRAST / 2)
     rough = (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)  # 0 and 1 stay as they are

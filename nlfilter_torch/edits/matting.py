@@ -1,10 +1,10 @@
-"""A rough mask to a soft one whose borders follow those of the picture: two solves over neighbours.
+"""Refine a rough mask to a soft one whose borders follow those of the picture, by two solves.
 
 The first minimises ``sum_ij w_ij (a_i - a_j)^2 + sum_i c_i (a_i - t_i)^2`` over pixels and their eight neighbours, with
-weights w that fall with the difference of colours, a rough mask t and confidences c in it; a few Jacobi steps on each
-level of a pyramid solve it nearly. The second starts from it and is closed-form matting (Levin, Lischinski and Weiss,
-2008): in every small window the mask is to be a linear function of the colours, which hairs and soft borders obey.
-These functions then give the mask of any pixel of a larger picture from its own colours (:class:`LinearMasks`).
+weights w that decrease with the difference in colour, a rough mask t and confidences c in it; a few Jacobi steps on
+each level of a pyramid solve it approximately. The second starts from that solution and is closed-form matting (Levin,
+Lischinski and Weiss, 2008): in every small window the mask is a linear function of the colour, which models hair and
+soft borders. These functions also give the mask of any pixel of a larger picture (:class:`LinearMasks`).
 """
 
 import math
@@ -16,40 +16,40 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.neighbours import SIDES, neighbour_weights
 
-STEPS = (2, 4, 8)  # on each level from the finest on; the last number holds for all further ones, and the coarsest
-COARSEST = 48  # pixels of the short side on the coarsest level, at least
-LEVELS = 4  # at most, beside the picture itself
-STEEPNESS = 300.0  # of the weights, per mean squared difference of the channels
-LEAST = 1e-4  # weight of neighbours that differ as much as they can
-REFINED, CONTRAST = 2, 0.03  # rounds; difference of colours from which on they tell how much of each a pixel holds
-BESIDE = 4  # coarsest pixels that the colours on either side of a border are averaged over, to each direction
-KNOWN = 0.02  # share of a side, of what is nearby, at which its colour counts as half known
-TINY = 1e-4  # weight of pixels that hardly belong to a side
-REFERENCE = 112  # short side for which confidences are meant
-WINDOW, NOISE = 2, 1e-5  # pixels to each side in which masks are linear in colours; variance of what is no colour
-LINEAR_LEVELS, LINEAR_STEPS = 2, 8  # levels of the pyramid that the second solve works on, and steps on each
-DOUBT = 0.1  # masks closer than this to 0 and 1 are that
-SLOWEST = 0.03  # smallest eigenvalue that these steps are to damp
-LINEAR_TRUST, LINEAR_CERTAIN = 3e-3, 10.0  # confidence where the rough mask is 0 or 1, and in scribbles
+STEPS = (2, 4, 8)  # Jacobi steps per level, finest first; the last number is for all coarser levels
+COARSEST = 48  # minimum short side of the coarsest level, in pixels
+LEVELS = 4  # maximum number of reduced levels
+STEEPNESS = 300.0  # decay of the weights with the mean squared difference of the channels
+LEAST = 1e-4  # smallest weight
+REFINED, CONTRAST = 2, 0.03  # rounds of refinement; colour difference at which it is half trusted
+BESIDE = 4  # radius over which the colours on each side of a border are averaged, in pixels of the coarsest level
+KNOWN = 0.02  # share of nearby pixels on one side at which the colour of that side is half trusted
+TINY = 1e-4  # smallest weight of a pixel on either side
+REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
+WINDOW, NOISE = 2, 1e-5  # radius of the windows in which masks are linear in colour; variance of noise
+LINEAR_LEVELS, LINEAR_STEPS = 2, 8  # of the second solve: levels of the pyramid, steps on each
+DOUBT = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
+SLOWEST = 0.03  # smallest eigenvalue that the steps of the second solve damp
+LINEAR_TRUST, LINEAR_CERTAIN = 3e-3, 10.0  # confidence in a rough mask of 0 or 1, and in scribbles
 
 
 def pyramid_levels(short: int) -> int:
-    """How often a picture with so many pixels on its short side is halved."""
+    """Number of times a picture with that short side is halved."""
     return max(0, min(LEVELS, int(math.log2(max(short / COARSEST, 1)))))
 
 
 def steps_on(level: int, levels: int) -> int:
-    """Steps on a level, 0 is the finest, of a pyramid."""
+    """Number of Jacobi steps on a level, where 0 is the finest."""
     return STEPS[-1] if level == levels else STEPS[min(level, len(STEPS) - 1)]
 
 
 def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
-    """The soft mask (B, K, H, W) of the first solve.
+    """Solve for the soft masks (B, K, H, W) of the first problem.
 
     Args:
         image: (B, C, H, W), C = 1 or 3.
         rough: t, (B, K, H, W).
-        confidence: c, (B, K, H, W), for a picture whose short side is at most :data:`REFERENCE`.
+        confidence: c, (B, K, H, W), for a short side of at most :data:`REFERENCE` pixels; rescaled for larger pictures.
     """
     height, width = image.shape[-2:]
     short = min(height, width)
@@ -71,7 +71,7 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
 
 
 def halved(planes: Tensor, levels: int) -> list[Tensor]:
-    """Planes (B, C, H, W), and as many times half the size; a last row or column that is left over stands alone."""
+    """A pyramid of planes (B, C, H, W), each level half the size; an odd last row or column is kept as it is."""
     pyramid = [planes]
     for _ in range(levels):
         pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
@@ -79,13 +79,13 @@ def halved(planes: Tensor, levels: int) -> list[Tensor]:
 
 
 def doubled(planes: Tensor, like: Tensor) -> Tensor:
-    """Planes of a level of a pyramid on the level before, which has the size of ``like``."""
+    """Planes of one level, enlarged to the next finer level, which has the size of ``like``."""
     twice = F.interpolate(planes, scale_factor=2, mode="bilinear", align_corners=False)
     return twice[..., : like.shape[-2], : like.shape[-1]]
 
 
 def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps: int) -> Tensor:
-    """Steps towards the solution from ``found``, given products of confidences with the rough mask, and the former."""
+    """Jacobi steps from ``found``, given ``target``, confidence times rough mask, and ``trust``, the confidence."""
     total = trust.clone()
     links = [weights[:, k : k + 1, *here] for k, (here, _) in enumerate(SIDES)]
     for (here, there), weight in zip(SIDES, links, strict=True):
@@ -93,7 +93,7 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps:
         total[..., *there] += weight
     inverse = 1 / total
     for _ in range(steps):
-        # A new tensor each time, which the gradient needs.
+        # Not in place: the gradient needs every iterate.
         following = target.clone()
         for (here, there), weight in zip(SIDES, links, strict=True):
             following[..., *here].addcmul_(weight, found[..., *there])
@@ -104,12 +104,12 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps:
 
 @dataclass(frozen=True, eq=False)
 class LinearMasks:
-    """Masks that are a linear function of colours in every window of a picture. Those of neighbours overlap.
+    """Masks that are a linear function of colour in every window of a picture; windows overlap.
 
     Attributes:
-        image: less its middle value, (B, C, H, W).
-        mean: of windows, likewise.
-        inverse: of the covariance of colours in windows, (B, C, C, H, W).
+        image: the image minus 0.5, (B, C, H, W).
+        mean: mean colour of the window around each pixel, (B, C, H, W).
+        inverse: inverse covariance of the colours in it, (B, C, C, H, W).
     """
 
     image: Tensor
@@ -118,7 +118,7 @@ class LinearMasks:
 
     @staticmethod
     def of(image: Tensor) -> "LinearMasks":
-        """From (B, C, H, W)."""
+        """The model of an image (B, C, H, W)."""
         image = image - 0.5
         count = image.shape[1]
         mean = window_means(image)
@@ -128,9 +128,9 @@ class LinearMasks:
         return LinearMasks(image, mean, inverse.to(image).permute(0, 3, 4, 1, 2).contiguous())
 
     def fit(self, mask: Tensor) -> Tensor:
-        """The functions nearest to a mask (B, 1, H, W), means of those of all windows around a pixel, (B, C+1, H, W).
+        """Fit the linear functions (B, C+1, H, W) of a mask (B, 1, H, W), averaged over all windows around a pixel.
 
-        Their last channel is what is added to the product of the others with the colours less 0.5.
+        The last channel is the constant; the others multiply the colour minus 0.5.
         """
         moments = window_means(torch.cat([mask, mask * self.image], dim=1))
         mean = moments[:, :1]
@@ -139,17 +139,17 @@ class LinearMasks:
         return window_means(torch.cat([slopes, rest], dim=1))
 
     def smoothed(self, mask: Tensor) -> Tensor:
-        """The mask by these functions."""
+        """The mask that the fitted functions give."""
         return linear_mask(self.image, self.fit(mask))
 
 
 def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
-    """The mask (B, 1, H, W) of an image less 0.5 by functions of :meth:`LinearMasks.fit`."""
+    """Mask (B, 1, H, W) that functions of :meth:`LinearMasks.fit` give for an image minus 0.5."""
     return (functions[:, :-1] * image).sum(1, keepdim=True) + functions[:, -1:]
 
 
 def window_means(planes: Tensor) -> Tensor:
-    """Means over the window around each pixel; nothing is outside the picture."""
+    """Means over the window around each pixel, cut off at the borders of the picture."""
     size = 2 * WINDOW + 1
     for axis, pad in ((2, (0, 0, WINDOW, WINDOW)), (3, (WINDOW, WINDOW))):
         length = planes.shape[axis]
@@ -164,14 +164,14 @@ def window_means(planes: Tensor) -> Tensor:
 
 
 def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
-    """The functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit` for the masks of the second solve.
+    """Solve the second problem for the functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit`.
 
     Args:
         image: (B, C, H, W).
-        start: masks (B, K, H, W) to start from.
-        rough: those to stay near, the nearer the closer to 0 or 1 they are.
-        front: weights of what is certainly inside, likewise.
-        back: of what is certainly outside.
+        start: initial masks, (B, K, H, W).
+        rough: rough masks, (B, K, H, W); values near 0 or 1 have a higher confidence.
+        front: weights of foreground scribbles, (B, K, H, W).
+        back: weights of background scribbles, (B, K, H, W).
     """
     trust = LINEAR_TRUST * ((2 * rough - 1).square() + 0.01)
     levels = min(LINEAR_LEVELS - 1, pyramid_levels(min(image.shape[-2:])))
@@ -195,16 +195,16 @@ def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, bac
 
 
 def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
-    """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S of :meth:`LinearMasks.smoothed`.
+    """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S being :meth:`LinearMasks.smoothed`.
 
-    The preconditioned system has its eigenvalues in [0, 1]; parts of the error whose eigenvalue is below
+    The eigenvalues of the preconditioned system lie in [0, 1]; error components with an eigenvalue below
     :data:`SLOWEST` are left to coarser levels.
 
     Args:
-        model: of the picture.
-        mask: to start from.
-        target: c t.
-        trust: c.
+        model: the linear model of the picture.
+        mask: initial mask.
+        target: c t, confidence times rough mask.
+        trust: c, the confidence.
     """
     middle, half = (1 + SLOWEST) / 2, (1 - SLOWEST) / 2
     ratio, step = half / middle, torch.zeros(())
@@ -225,10 +225,9 @@ class Sides:
     """Colours on both sides of a border.
 
     Attributes:
-        inside: the mean colours nearby of what is inside a mask, (B, C, H, W).
-        outside: likewise of what is outside.
-        known: how far these are known, (B, 1, H, W) in [0, 1]: hardly where nearly all or nearly nothing nearby is
-            inside.
+        inside: mean colour of nearby pixels inside the mask, (B, C, H, W).
+        outside: mean colour of nearby pixels outside it, (B, C, H, W).
+        known: confidence in both, (B, 1, H, W) in [0, 1]; low where nearly all nearby pixels are on one side.
     """
 
     inside: Tensor
@@ -236,9 +235,9 @@ class Sides:
     known: Tensor
 
     def refine(self, image: Tensor, mask: Tensor) -> Tensor:
-        """A mask (B, 1, H, W) whose border pixels hold as much of the inside as their own colours say.
+        """Replace border values of a mask (B, 1, H, W) by the mixing ratio of the two colours in each pixel.
 
-        For things of one colour on grounds of another; of textures it would make patterns.
+        Meant for plain colours on both sides; in textures it would produce patterns.
         """
         across = self.inside - self.outside
         contrast = across.square().mean(1, keepdim=True)
@@ -248,14 +247,14 @@ class Sides:
 
 
 def colours_beside(image: Tensor, mask: Tensor) -> Sides:
-    """The colours on both sides of the borders of a mask (B, 1, H, W) of an image (B, C, H, W)."""
+    """Colours on both sides of the borders of a mask (B, 1, H, W) of an image (B, C, H, W)."""
     (height, width), step = image.shape[-2:], 1 << pyramid_levels(min(image.shape[-2:]))
     weights = torch.cat([mask, 1 - mask], dim=1).pow(4) + TINY  # (B, 2, H, W)
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
     planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
     coarse = F.avg_pool2d(planes, step)
     size = 2 * BESIDE + 1
-    # Along one axis after the other; nothing is outside the picture.
+    # Separable box sums; pixels outside the picture do not count.
     sums = F.avg_pool2d(coarse, (size, 1), 1, (BESIDE, 0))
     sums = F.avg_pool2d(sums, (1, size), 1, (0, BESIDE))
     means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
@@ -268,7 +267,7 @@ def colours_beside(image: Tensor, mask: Tensor) -> Sides:
 
 
 def refine_mask(image: Tensor, mask: Tensor) -> Tensor:
-    """A mask (B, 1, H, W), refined by the colours beside its borders, which are worked out anew in each round."""
+    """Refine a mask (B, 1, H, W) by the colours beside its borders, which are computed anew in each round."""
     for _ in range(REFINED):
         mask = colours_beside(image, mask).refine(image, mask)
     return mask
