@@ -1,10 +1,12 @@
 """The command line: what it writes, what it keeps, and one sentence with exit status 2 for everything it cannot use."""
 
 import json
+import signal
 import subprocess
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -313,6 +315,15 @@ def test_interrupted_work_says_so(
     assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C interrupts, as it does not in background jobs of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_that_python_loses_comes_again(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
