@@ -1,4 +1,4 @@
-"""Colorization of a grey photograph from a few strokes of colour. Paper: Sec. V-B, Fig. 16.
+"""Colouring of a grey photograph from a few strokes of colour. Paper: Sec. V-B, Fig. 16.
 
 Two estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart;
 :class:`LocalValues` relates pixels that are connected without an edge between them. Their errors are in different

@@ -41,7 +41,7 @@ def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft", bal
     """Brighten and darken an image without clipping, so that highlights and shadows keep their detail.
 
     A change d of luminance becomes ``h (1 - exp(-|d| / h))``, with h the headroom towards white (or black): small
-    changes are added as they are, large ones stay below white. The headroom is mostly that of luminance and to a
+    changes are added as they are, large ones end before white. The headroom is mostly that of luminance and to a
     quarter that of the channel with the least; with separate headroom for each channel, colours would lose 2 to 25 % of
     their chroma at a detail gain of 2. Chroma is kept as far as the headroom of the channels allows. No channel uses
     more than nine tenths of its headroom, or the last 8-bit level.
@@ -155,7 +155,7 @@ def _limited(image: Tensor, change: Tensor) -> Tensor:
 
 
 def _curved(image: Tensor, change: Tensor, curve: float | Tensor) -> Tensor:
-    """Limit the change, and add that of a tone curve after it."""
+    """Limit the change, and apply the tone curve after it."""
     moved = _limited(image, change)
     after = _before(image, change) + moved
     return moved - curve * after * (1 - after)

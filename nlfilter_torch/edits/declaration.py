@@ -155,7 +155,7 @@ class Parameter:
         )
 
     def is_idle(self, value: Any) -> bool:
-        """Whether a value equals :attr:`idle`; False for parameters without an idle value."""
+        """Whether a value, or all numbers of a list, equal :attr:`idle`; False for parameters without an idle value."""
         if isinstance(self.idle, tuple):
             return bool(value == self.idle)
         return all(v == self.idle for v in value) if isinstance(value, tuple) else bool(value == self.idle)

@@ -55,7 +55,7 @@ def enhance(
         image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
         alpha: sliders, fine to coarse: (k+1,) or (B, k+1) without regions; with regions one row for each, (K, k+1), or
             (k+1,) for all of them.
-        regions: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions, as the scribbles of
+        regions: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions, like the scribbles of
             :func:`region_mask`; None edits the whole image.
         negative: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions, or of each region.
         outside: sliders (k+1,) outside all regions; None leaves these pixels unchanged.
@@ -146,7 +146,7 @@ def fit_detail(
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
-    sliders = alpha - 1  # their change is 0 to the last bit where they are 1
+    sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit
 
     if regions is not None:
         check_positive(mask_bandwidth, "mask_bandwidth", source.batch)

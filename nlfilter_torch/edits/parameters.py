@@ -362,7 +362,7 @@ ABSTRACT = Edit(
             2,
             "%",
             domain="positive",
-            least=0.3,  # pixels cannot show thinner lines
+            least=0.3,  # thinnest line that pixels can show
             former=(("width", 0.1),),
             slider=Slider("Width of lines", 0.05, 0.6, 0.01),
         ),

@@ -149,5 +149,5 @@ REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 
 
 def reach_of_time(time: float) -> float:
-    """Convert the diffusion time in files of a former version to a reach; the default, 1, becomes the default, 0.6."""
+    """Convert a diffusion time, as in files of former versions, to a reach; the defaults, 1 and 0.6, correspond."""
     return time / (time + 2 / 3) if time > 0 else time

@@ -83,10 +83,10 @@ class Operator(Protocol):
 
     @property
     def pairs(self) -> RitzPairs:
-        """The eigenvalues and what defines the eigenvectors, without their values at pixels."""
+        """Spectrum of W, without the values of the eigenvectors at pixels."""
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
-        """Apply a function to the columns of each pixel; it returns (B, C, n)."""
+        """Apply a function, which returns (B, C, n), to the columns of the pixels."""
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Detail layers (B, k+1, C, h, W) of planes of the picture."""
@@ -155,7 +155,7 @@ class Source(Protocol):
         """Compute the result of an edit and keep it in memory, if there is room for it."""
 
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means (B, S, 1, 1) of a function of the image and of the result of an edit; it returns (B, S, h, W)."""
+        """Means (B, S, 1, 1) of a function of the image and of an edit's result; the function returns (B, S, h, W)."""
 
     def regions(self, masks: Any, name: str) -> list[Scribbles]:
         """Read the scribbles of several regions, see :meth:`scribbles`."""
@@ -322,12 +322,12 @@ class InMemoryOperator:
         return lambda _: planes
 
     def layers(self, planes: Planes, order: int) -> Planes:
-        """:func:`detail_layers`."""
+        """Compute :func:`detail_layers`."""
         layers = detail_layers(self.operator, planes(self.source), order=order)
         return lambda _: layers
 
     def coefficients(self, planes: Planes) -> Tensor:
-        """:meth:`Spectrum.coefficients`."""
+        """Compute :meth:`Spectrum.coefficients`."""
         return cast(Spectrum, self.pairs).coefficients(planes(self.source))
 
     def mean(self, planes: Planes) -> Tensor:

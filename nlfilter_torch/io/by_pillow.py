@@ -24,7 +24,7 @@ def read_by_pillow(
             with warnings.catch_warnings():
                 # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
+                warnings.simplefilter("ignore", UserWarning)  # warnings about EXIF, see exif.split
                 image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
         except Image.DecompressionBombError as error:
             raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error

@@ -30,7 +30,7 @@ def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
     dropped, since they do not affect the pixels.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, about damaged blocks
+        warnings.simplefilter("ignore")  # Pillow warns about damaged blocks
         try:
             exif = read()
             fields = dict(exif)

@@ -87,7 +87,7 @@ def _read(path: Path) -> Extras:
         pair = None if scale is None else tuple(_ratio(values.get(code)) * scale for code in (282, 283))
         return Extras(_upright(values.get(tiff.XMP)), _sound(pair))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, about sizes and damaged EXIF
+        warnings.simplefilter("ignore")  # Pillow warns about sizes and damaged EXIF
         with Image.open(path) as image:
             xmp = image.info.get("xmp", image.info.get(PNG_KEY))
             return Extras(_upright(xmp.encode() if isinstance(xmp, str) else xmp), _sound(image.info.get("dpi")))

@@ -1,6 +1,6 @@
 """Image files in memory: PNG, JPEG, TIFF, WebP and AVIF at their own depth, with alpha, EXIF and colour profile.
 
-Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil); nothing else in the package imports this module.
+Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
 import os
