@@ -129,7 +129,7 @@ def _network(image: Tensor) -> NonlocalDenoiser:
 
 
 def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
-    """Fit denoising by the network; it has the same tiles in memory and for a picture read by rows."""
+    """Fit denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
     if isinstance(noise, Tensor) and noise.ndim == 4 and not source.whole:
         raise ValueError("noise_level must be a number for a picture in tiles, got a map; denoise it in memory")
 
@@ -152,7 +152,7 @@ def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Te
     }
     operator = source.operator(Guide(options, blur=GUIDE_BLUR))
     layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
-    energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of (B, ORDER, H, W)
+    energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of planes (B, ORDER, H, W)
     noise = assumed.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)
 
     def cleaned(pixels: Pixels) -> Tensor:

@@ -56,10 +56,10 @@ class Noise:
 def estimate_noise(image: Tensor) -> Tensor:
     """Estimate the standard deviation of white noise, at the mean brightness if it depends on brightness.
 
-    The estimate is the median response to Immerkaer's mask ("Fast Noise Variance Estimation", 1996), which is zero for
-    anything linear in rows or columns, in those of many windows of 9x9 pixels whose local means have the smallest
-    slopes. It is robust to slopes and clipped pixels; texture that fills the whole picture raises it by one or two grey
-    levels.
+    Of many windows of 9x9 pixels, those whose local means have the smallest slopes are used. The estimate is their
+    median response to Immerkaer's mask ("Fast Noise Variance Estimation", 1996), which is zero for anything linear in
+    rows or columns. It is robust to slopes and clipped pixels; texture that fills the whole picture biases it by one or
+    two grey levels.
 
     Args:
         image: (B, C, H, W), at least 3x3.
