@@ -22,10 +22,10 @@ from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.operator.spectrum import Spectrum
 
 DPI = 100
-POINTS = 72  # in an inch, as DPI pixels
+POINTS = 72  # typographic points per inch
 SIDE = 512  # pixels along the longer side of a picture
 LABEL = 35  # pixels above a picture for its title
-BREADTH, LINE = 0.6, 1.2  # of a letter and a line, over the height of letters
+BREADTH, LINE = 0.6, 1.2  # width of a letter and height of a line, relative to the letter height
 GAP = 15  # pixels between pictures
 FAR = 0.995  # colour scales end at this quantile, so that one outlier does not compress the others
 
@@ -33,14 +33,14 @@ FAR = 0.995  # colour scales end at this quantile, so that one outlier does not 
 def show_images(
     images: Mapping[str, Tensor], *, columns: int | None = None, side: int = SIDE, letters: int | None = None
 ) -> Figure:
-    """Titled pictures side by side.
+    """Draw titled pictures side by side.
 
     Args:
         images: each (1, C, H, W) or (C, H, W) in [0, 1], by its title.
         columns: Pictures in a row; None is all.
         side: Length in pixels of the longer side of each picture.
-        letters: Height of the titles in pixels, which are broken into lines as wide as the pictures; None is one line
-            of letters so small that it fits.
+        letters: Letter height of the titles in pixels; titles are wrapped to the width of the pictures. None is a
+            single line in a size that fits.
     """
     pictures = {title: _picture(image) for title, image in images.items()}
     shape = next(iter(pictures.values())).shape
@@ -57,7 +57,7 @@ def show_images(
 
 
 def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
-    """Detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the last layer unchanged."""
+    """Draw detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the last layer unchanged."""
     stack = layers[0].mean(1).numpy(force=True)  # (k+1, H, W)
     figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))), side=side)
     for number, (axis, layer) in enumerate(zip(axes, stack[:-1], strict=False), start=1):
@@ -71,9 +71,9 @@ def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
 def show_eigenvectors(
     spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50), *, side: int = SIDE
 ) -> Figure:
-    """Eigenvectors by their number from 1, as in the paper's Fig. 1; numbers beyond the last are left out.
+    """Draw eigenvectors, numbered from 1, as in the paper's Fig. 1; numbers beyond the last are left out.
 
-    A flat picture has only the constant eigenvector, which is then shown.
+    If none remains, as for a flat picture, the first, constant eigenvector is drawn.
     """
     vectors = spectrum.eigenvectors[0].numpy(force=True)
     shown = [number for number in numbers if number <= len(vectors)] or [1]
@@ -86,7 +86,7 @@ def show_eigenvectors(
 
 
 def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) -> Figure:
-    """A photograph with a region outlined, the region's mask, and the photograph in colour where the mask is.
+    """Draw a photograph with a region outlined, the region's mask, and the photograph faded outside the mask.
 
     Args:
         image: (1, C, H, W) in [0, 1].
@@ -107,7 +107,7 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) 
 
 
 def plot_eigenvalues(spectrum: Spectrum) -> Figure:
-    """Eigenvalues against their number; they fall faster for images of fewer patterns."""
+    """Plot eigenvalues against their number; they fall faster for images with fewer patterns."""
     figure, axis = _plot()
     values = spectrum.eigenvalues[0].numpy(force=True)
     axis.plot(np.arange(1, len(values) + 1), values, marker="o", markersize=3)
@@ -116,7 +116,7 @@ def plot_eigenvalues(spectrum: Spectrum) -> Figure:
 
 
 def plot_response(alpha: Tensor, spectrum: Spectrum) -> Figure:
-    """Gain of the sliders for each eigenvalue, eq. (14), with the eigenvalues of the image marked on the curve."""
+    """Plot the gain of the sliders, eq. (14), with the eigenvalues of the image marked on the curve."""
     figure, axis = _plot()
     line = torch.linspace(0, 1, 401, dtype=torch.float64)
     values = spectrum.eigenvalues[0].double().cpu()
@@ -145,20 +145,20 @@ def _plot() -> tuple[Figure, Axes]:
 
 
 def _picture(image: Tensor) -> NDArray[Any]:
-    """(1, C, H, W) or (C, H, W) as (H, W, 3) in [0, 1]."""
+    """Convert (1, C, H, W) or (C, H, W) to (H, W, 3) in [0, 1]."""
     channels = image.detach().reshape(-1, *image.shape[-2:]).clamp(0, 1)
     return channels.expand(3, -1, -1).permute(1, 2, 0).numpy(force=True)
 
 
 def _limit(values: NDArray[Any]) -> float:
-    """Limit of a symmetric colour scale; positive even for a plane of zeros."""
+    """Compute the limit of a symmetric colour scale; positive even for a plane of zeros."""
     return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
 
 
 def _panels(
     shape: tuple[int, ...], count: int, columns: int | None, side: int, label: int = LABEL
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels for pictures of that height and width, placed to the pixel."""
+    """Create a figure of ``count`` panels for pictures of that height and width, aligned to pixels."""
     across = min(columns or count, count)
     down = math.ceil(count / across)
     height, width = (round(length * side / max(shape[:2])) for length in shape[:2])
@@ -181,7 +181,7 @@ def _draw(
     colours: str = "gray",
     letters: int | None = None,
 ) -> None:
-    """One titled picture, with the colour scale ±limit if given and [0, 1] otherwise."""
+    """Draw a titled picture, with the colour scale ±limit if given and [0, 1] otherwise."""
     lowest, highest = (0.0, 1.0) if limit is None else (-limit, limit)
     axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
     fitting = min(11.0, max(6.0, axis.get_window_extent().width / 28))  # fits 36 letters

@@ -1,4 +1,4 @@
-"""A photograph as a painting: flat areas, and edges and tones drawn out where wanted. Paper: Sec. V-D, Fig. 18.
+"""Abstraction of a photograph to flat areas, with optional edge lines and few tones. Paper: Sec. V-D, Fig. 18.
 
 Edges and tones after Winnemoeller, Olsen and Gooch, "Real-Time Video Abstraction", SIGGRAPH 2006 (the paper's [30]).
 """
@@ -15,15 +15,15 @@ from nlfilter_torch.edits.parameters import ABSTRACT
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, synthesize
 from nlfilter_torch.operator.features import blur, blur_margin
 
-# The residual of the eigenvectors is multiplied by the power of W's diagonal part r, with this many times the exponent:
-# it vanishes where a pixel has similar ones, stays where it has none, such as on a border, and is whole at power 0.
+# The residual of the eigenvectors is multiplied by a power of W's diagonal part r, with the exponent times this factor:
+# it vanishes where similar pixels exist, remains where none do, such as on a border, and is unchanged at power 0.
 TIMES_RESIDUAL = 10
-LEAST = 1e-4  # of r
-# Of the difference of Gaussians, on luminance from 0 to 100: scale of the wider one, weight of it, and steepness.
+LEAST = 1e-4  # lower limit of r
+# Difference of Gaussians on luminance from 0 to 100: scale and weight of the wider one, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
-SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones where the image is flat, and where it has an edge
-FLAT = 1e-12  # of squared gradients; keeps the derivative of their root finite
-EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, at which a step is crisp
+SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones in flat areas and at edges
+FLAT = 1e-12  # lower limit of squared gradients; keeps the derivative of their square root finite
+EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, from which on steps have the steepness CRISP
 
 
 @full_precision
@@ -40,22 +40,23 @@ def abstract(
     num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
-    """Take the small detail out of a photograph and keep its outlines: ``W^k y`` with a fractional k.
+    """Remove small detail from a photograph and keep its outlines: ``W^k y`` with a fractional k.
 
-    Paper: Sec. V-D. The kernel compares colours and has a spatial term, so that the filter paints locally. Lines along
-    edges and a luminance of few tones are added where asked for.
+    Paper: Sec. V-D. The kernel compares colours and has a spatial term, so that the filter is local. Lines along edges
+    and quantized luminance are optional.
 
     Args:
-        image: (B, C, H, W) in [0, 1]; lines and tones want C = 1 or 3.
-        power: k >= 0, a number or a tensor of shape () or (B,). At 0 the image comes back.
-        edges: darkness of the lines, 0 for none, 1 for black ones.
-        edge_width: of the lines, in pixels, at most half the short side; None is 0.2 % of it, and at least 0.3 pixels.
-        tones: number of tones of luminance, from 2 to 65536; None leaves it continuous.
-        photometric_bandwidth: h_y; larger makes larger flat areas.
+        image: (B, C, H, W) in [0, 1]; lines and tones require C = 1 or 3.
+        power: k >= 0, a number or a tensor of shape () or (B,); 0 changes nothing.
+        edges: darkness of the lines, 0 for none, 1 for black.
+        edge_width: width of the lines in pixels, at most half the short side; None is 0.2 % of the short side, and at
+            least 0.3 pixels.
+        tones: number of luminance levels, from 2 to 65536; None does not quantize.
+        photometric_bandwidth: h_y; larger gives larger flat areas.
         spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
-        patch_size: of the patches that are compared.
-        num_landmarks: M; fewer make coarser pictures.
-        **options: further ones of :func:`nonlocal_operator`.
+        patch_size: width of the compared patches.
+        num_landmarks: M; fewer give coarser pictures.
+        **options: further options of :func:`nonlocal_operator`.
 
     Returns:
         (B, C, H, W). Differentiable in image and power.
@@ -105,7 +106,7 @@ def fit_abstract(
         "guide_channels": "all",
     }
     operator = source.operator(Guide(options, spectral=True))
-    # W keeps constants, but the span of the factor need not hold them: the mean takes no part.
+    # W preserves constants, but the span of the factor need not contain them: filter without the mean.
     mean = source.mean(lambda pixels: pixels.image)
 
     def varying(pixels: Pixels) -> Tensor:
@@ -127,7 +128,7 @@ def fit_abstract(
 
 
 def draw(flat: Tensor, edges: float, width: float, tones: int | None) -> Tensor:
-    """An image (B, C, H, W) in a few tones, with lines along its edges."""
+    """Quantize the luminance of an image (B, C, H, W) and draw lines along its edges."""
     luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
     toned = luminance if tones is None else quantize(luminance, tones)
     toned = toned * (1 - edges * (1 - edge_lines(luminance, width)))
@@ -135,19 +136,19 @@ def draw(flat: Tensor, edges: float, width: float, tones: int | None) -> Tensor:
 
 
 def edge_lines(luminance: Tensor, width: float) -> Tensor:
-    """Lines (B, 1, H, W) from a difference of Gaussians: 1 on paper, towards 0 in the middle of a line."""
+    """Compute lines (B, 1, H, W) from a difference of Gaussians: 1 off the lines, towards 0 in their middle."""
     near, far = blur(luminance, width), blur(luminance, WIDER * width)
     difference = 100 * (near - SENSITIVITY * far)
     return 1 + torch.tanh(FALLOFF * difference.clamp(max=0.0))
 
 
 def quantize(luminance: Tensor, tones: int) -> Tensor:
-    """Luminance (B, 1, H, W) in ``tones`` tones, with soft steps in flat areas and crisp ones at edges."""
+    """Quantize luminance (B, 1, H, W) to ``tones`` levels, with soft steps in flat areas and steep ones at edges."""
     from kornia.filters import spatial_gradient  # kornia takes half a second to import
 
     step = 1 / (tones - 1)
     nearest = (luminance / step).round() * step
     gradient = 100 * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=FLAT).sqrt()
     steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
-    # Steepness is per tone, so that the transition looks alike for any number of them.
+    # Steepness is relative to a step, so that transitions look alike for any number of tones.
     return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)

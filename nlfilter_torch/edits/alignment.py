@@ -1,4 +1,4 @@
-"""Bring a photograph before an edit and one after it onto the same pixels."""
+"""Registration of a photograph before an edit with one after it."""
 
 import math
 
@@ -9,23 +9,24 @@ from torch import Tensor
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.operator.features import reduce_channels
 
-SAME_SHAPE = 0.02  # difference of the ratios of sides up to which an edited picture is taken for a resized one
-LIKE = 0.6  # correlation that a crop must have with its place
-SEARCHED = 400  # pixels of the short side in which the place of a crop is first looked for
-FAR = 0.1  # share of the short side by which a picture may be shifted
+SAME_SHAPE = 0.02  # largest difference of log aspect ratios at which an edited picture counts as resized
+LIKE = 0.6  # correlation required between a crop and its position
+SEARCHED = 400  # short side in pixels of the reduced picture in which a crop is searched for first
+FAR = 0.1  # largest shift, as a share of the short side
 
 
 def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:
-    """The same part of two photographs (1, C, H, W), before and after an edit, at the same size.
+    """Return the common part of two photographs (1, C, H, W), before and after an edit, at the same size.
 
-    An edited picture of another size is resized if it has the same shape, or looked for in the other one; a shift of a
-    few pixels is taken back.
+    An edited picture of another size is resized if it has the same aspect ratio, or searched for as a crop of the
+    original; a shift of a few pixels is undone.
 
     Returns:
-        Both, and what was done, in words for the user; empty for nothing.
+        Both pictures, and a description of the changes for the user, empty if there are none.
 
     Raises:
-        ValueError: if the edited picture is not found in the other one. ``name`` and ``edited`` are theirs in it.
+        ValueError: if the edited picture is not found in the original. ``name`` and ``edited`` are the names of the two
+            in the message.
     """
     size, other = before.shape[-2:], after.shape[-2:]
     if size == other:
@@ -62,7 +63,7 @@ def _correlation(first: Tensor, second: Tensor) -> float:
 
 
 def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
-    """By how many pixels (down, right) a picture is shifted; 0 unless that makes the two more alike."""
+    """Estimate the shift (down, right) of a picture in pixels; 0 unless undoing it increases the correlation."""
     from skimage.registration import phase_cross_correlation
 
     first, second = _grey(before), _grey(after)
@@ -76,7 +77,7 @@ def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
 
 
 def _overlap(first: Tensor, second: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
-    """The part (..., h, w) that two pictures share, the second of which is shifted by so many pixels."""
+    """Crop two pictures, the second shifted by ``down`` and ``right`` pixels, to their common part (..., h, w)."""
     height, width = first.shape[-2:]
     return (
         first[..., max(0, -down) : height - max(0, down), max(0, -right) : width - max(0, right)],
@@ -85,7 +86,7 @@ def _overlap(first: Tensor, second: Tensor, down: int, right: int) -> tuple[Tens
 
 
 def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
-    """Where a smaller picture is in a larger one, (row, column), and how well it fits there."""
+    """Find the position (row, column) of a smaller picture in a larger one, and the correlation there."""
     from skimage.feature import match_template
 
     whole, part = _grey(before), _grey(after)
@@ -102,7 +103,7 @@ def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
     row, column = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
     if scale == 1:
         return (row, column), float(found.max())
-    reach = math.ceil(2 * scale)  # the place is exact to a few pixels; it is looked for again around there
+    reach = math.ceil(2 * scale)  # the position is accurate to a few pixels; search again around it
     top, left = (
         min(max(0, round(place * scale) - reach), room)
         for place, room in zip(

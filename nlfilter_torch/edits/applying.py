@@ -1,4 +1,4 @@
-"""What a step does to an image, and what of it can be kept for the next step of its kind."""
+"""Applying a step to an image, and caching what later steps of the same kind can reuse."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,7 +24,7 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.tone import fit_tone
 from nlfilter_torch.edits.viewing import viewed_size
 
-#: What each edit learns from a source, the scribbles on it and parameters.
+#: For each edit, the function that fits it to a source, given the scribbles and the parameters.
 FITS: dict[str, Callable[..., Fitted]] = {
     "denoise": fit_denoise,
     "detail": fit_detail,
@@ -39,7 +39,7 @@ FITS: dict[str, Callable[..., Fitted]] = {
 
 
 def seeded(seed: int = 0) -> torch.Generator:
-    """The randomness that the command line starts with."""
+    """Return a generator with the seed; 0 is the seed of the command line."""
     return torch.Generator().manual_seed(seed)
 
 
@@ -55,13 +55,13 @@ def scribbles_of(
     colours: Callable[[Sequence[Stroke], tuple[int, int]], tuple[Any, ...]] = paint,
     mask: Callable[[Sequence[Stroke], tuple[int, int]], Any] = mask_of,
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The strokes of a step: those that its function takes after the image, and those it takes by name.
+    """Convert the strokes of a step to the function's arguments after the image, positional and by keyword.
 
     Args:
-        step: of an edit.
+        step: step of an edit.
         size: (H, W) of the image.
-        colours: makes colours and their mask of strokes, here as tensors.
-        mask: makes a mask of strokes, likewise.
+        colours: function that rasterises strokes to colours and their mask, by default as tensors.
+        mask: function that rasterises strokes to a mask, by default as a tensor.
     """
     if step.edit in ("recolor", "colorize"):
         keep = mask(step.painted("keep"), size)
@@ -85,14 +85,14 @@ def fit_step(
     stride: float = 1,
     generator: torch.Generator | None = None,
 ) -> Fitted:
-    """What a step does to a source, under scribbles in place of those of the step; see :func:`scribbles_of`.
+    """Fit a step to a source, with the given scribbles in place of the step's own; see :func:`scribbles_of`.
 
     Args:
-        step: of an edit.
-        source: the picture; in its form are the scribbles, also those in ``named``.
-        scribbles: what the edit takes after the picture.
+        step: step of an edit.
+        source: the picture; scribbles, also those in ``named``, are in the form that it takes.
+        scribbles: positional arguments of the edit after the picture.
         named: further arguments of the edit.
-        stride: every how many pixels of the photograph the source has one.
+        stride: sampling step of the source relative to the photograph, in pixels along each axis.
         generator: source of randomness; None is that of the command line.
     """
     check_channels(step.edit, source.channels)
@@ -111,20 +111,21 @@ def apply_to(
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """The edited image under scribbles, see :func:`scribbles_of`, in place of those of the step."""
+    """Apply a step to an image, with the given scribbles in place of the step's own; see :func:`scribbles_of`."""
     check_photograph(image, "image")
     return edited(image, partial(fit_step, step), scribbles, named, generator=generator)
 
 
 def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-    """The edited image, from (B, C, H, W) in [0, 1]; without a generator, with the randomness of the command line."""
+    """Apply a step to an image (B, C, H, W) in [0, 1]; without a generator, with the seed of the command line."""
     return apply_to(step, image, *scribbles_of(step, (image.shape[-2], image.shape[-1])), generator=generator)
 
 
 def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step], Tensor]:
-    """What steps that agree in :func:`shared` make of an image (1, C, H, W) in [0, 1].
+    """Return a function that applies steps with equal :func:`shared` to an image (1, C, H, W) in [0, 1].
 
-    The filter is made once, for the first of them. The image has one pixel in ``stride`` of the photograph.
+    The filter is computed once, for the first of them. ``stride`` is the sampling step of the image relative to the
+    photograph.
     """
     source = InMemory(image.to(working_dtype(image)), {}, stride)
 
@@ -136,12 +137,12 @@ def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step],
 
 
 def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
-    """Every how many of the pixels in which the step counts lengths a picture has one.
+    """Sampling step of a picture relative to the size at which the step counts pixels, the viewing size if it has one.
 
     Args:
-        step: of an edit.
+        step: step of an edit.
         size: (H, W) of the picture.
-        stride: every how many pixels of the photograph it has one.
+        stride: sampling step of the picture relative to the photograph.
     """
     if stride == 1 or "viewing_size" not in step.arguments(size):
         return stride
@@ -150,5 +151,5 @@ def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
 
 
 def shared(step: Step) -> tuple[object, ...]:
-    """What steps must agree in, beside their kind, to share what :func:`prepare` makes."""
+    """Return the values that steps of one kind must have in common to share the filter of :func:`prepare`."""
     return tuple(step[p.name] for p in step.declared if p.keyword in FILTER)

@@ -1,8 +1,8 @@
-"""A grey photograph and a few strokes of colour to a colour photograph. Paper: Sec. V-B, Fig. 16.
+"""Colouring of a grey photograph from a few strokes of colour. Paper: Sec. V-B, Fig. 16.
 
-Two estimates of the chroma are mixed: the regression on the strokes knows which pixels are alike, however far apart,
-and :class:`LocalValues` which are connected without a border between them. They err in different places, so that their
-mean is better than either of them.
+Two estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart;
+:class:`LocalValues` relates pixels that are connected without an edge between them. Their errors are in different
+places, so that the mean is better than either.
 """
 
 import math
@@ -35,14 +35,14 @@ Method = Literal["regression", "kmeans"]
 
 @dataclass(frozen=True)
 class Stage:
-    """One regression of several, each on what the ones before leave of the strokes' chroma.
+    """One of several regressions, each on the residual of the strokes' chroma after the previous ones.
 
     Attributes:
-        spatial: bandwidth, as a multiple of that of the call.
-        photometric: likewise.
-        patch_size: of the patches, at most.
-        reach: of :func:`propagate_strokes`.
-        smoothness: likewise.
+        spatial: factor of the spatial bandwidth.
+        photometric: factor of the photometric bandwidth.
+        patch_size: largest width of the patches.
+        reach: that of :func:`propagate_strokes`.
+        smoothness: that of :func:`propagate_strokes`.
     """
 
     spatial: float
@@ -55,7 +55,7 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
-SHARE = 0.5  # of the local values on a stroke
+SHARE = 0.5  # weight of the local values on a stroke
 
 
 @full_precision
@@ -73,30 +73,31 @@ def colorize(
     num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Colour a grey image from strokes; its luminance stays as it is.
+    """Colour a grey image from strokes; its luminance is kept.
 
-    Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first far, then
-    what is left of it near the strokes, and mixes it with chroma that spreads from neighbour to neighbour up to edges,
-    half and half where strokes determine the latter. ``"kmeans"`` is the paper's way: the image is cut into as many
-    pieces as there are colours, by :func:`segment_mask`.
+    Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
+    distances, then the residual near the strokes. Chroma propagated between neighbouring pixels up to edges is blended
+    in, with equal weight where strokes determine it. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides
+    the image into one segment per colour.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
-        strokes: (B, 3, H, W), RGB; their chroma counts, their luminance does not.
-        stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted. Grey paint keeps its likes grey.
+        strokes: (B, 3, H, W), RGB, of which only the chroma is used.
+        stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted. Grey strokes keep similar pixels grey.
         method: ``"regression"`` or ``"kmeans"``.
-        strength: in [0, 1]: at 1 every pixel takes colour, at 0 what resembles no stroke stays grey. For the
-            regression.
-        time: diffusion time t > 0 of the pieces. For k-means.
-        photometric_bandwidth: in units of the image; how much grey levels may differ under one colour.
+        strength: for the regression, in [0, 1]: at 1 every pixel is coloured, at 0 pixels similar to no stroke stay
+            grey.
+        time: for k-means, diffusion time t > 0 of the segments.
+        photometric_bandwidth: in units of the image; how much grey levels of one colour may differ.
         spatial_bandwidth: in pixels; None is 0.5625 of the short side.
-        patch_size: of the patches that are compared.
+        patch_size: width of the compared patches.
         num_landmarks: M of the operator.
         generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
-        RGB (B, 3, H, W) in [0, 1] where ``grey`` is; a colour too strong for its luminance is weakened. Differentiable
-        in image, strokes, mask and bandwidths under ``"regression"``, in the strokes only under ``"kmeans"``.
+        RGB (B, 3, H, W), in [0, 1] where ``grey`` is; chroma is scaled down where the luminance requires it.
+        Differentiable in image, strokes, mask and bandwidths with ``"regression"``, in the strokes only with
+        ``"kmeans"``.
 
     Raises:
         TypeError, ValueError: if a tensor has another size, the mask leaves [0, 1], or nothing is painted.
@@ -143,7 +144,7 @@ def fit_colorize(
     num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     **options: Any,
 ) -> Fitted:
-    """:func:`colorize` for any source; of colours the luminance is taken."""
+    """:func:`colorize` for any source; a colour picture is reduced to its luminance."""
     COLORIZE["method"].check_argument(method)
     if method == "kmeans" and not source.whole:
         raise ValueError(
@@ -196,7 +197,7 @@ def fit_colorize(
         )
         wanted = wanted - torch.cat([fitted(block) for block in columns()], dim=2)
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
-        del operator  # the factor of one is freed before that of the other is made
+        del operator  # frees its factor before the next one is computed
     far, near = parts
 
     def coloured(some: Any) -> Tensor:

@@ -1,4 +1,4 @@
-"""What edits share: luminance edited with the colours kept, chroma in gamut, the default of spatial bandwidths."""
+"""Functions shared by edits: change of luminance at constant chroma, chroma within gamut, spatial bandwidths."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,26 +11,26 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.features import reduce_channels
 
-ROOM = 0.9  # share of the room towards white or black that a channel may take
-LEVEL = 1 / 255  # of 8 bits, kept from white and black so that rounding does not clip
-CHANNELS = 0.25  # weight of the channel with the least room
-SATURATION = 2.0  # by how many times a change of luminance, relative to it, saturation may grow
-DARK = 0.02  # luminance below which the relative change does not grow any more
-STEEPEST = 0.9  # of a tone curve; 1 would flatten it at one end
+ROOM = 0.9  # share of its headroom towards white or black that a channel may use
+LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that rounding does not clip
+CHANNELS = 0.25  # weight of the channel with the least headroom
+SATURATION = 2.0  # limit of the relative growth of saturation, as a multiple of that of luminance
+DARK = 0.02  # lower limit of the luminance that the change of luminance is divided by
+STEEPEST = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
 LEAST = 1e-9
-LIGHTNESS = 0.3  # weight of lightness beside hue and saturation: a fold in a red cloth is still red
-CONVERTED = 8192  # pixels that one thread converts at once
-VECTOR = 64  # a multiple of the floats that a processor works on at once
+LIGHTNESS = 0.3  # weight of lightness relative to hue and saturation: a fold in a red cloth is still red
+CONVERTED = 8192  # pixels converted at once by one thread
+VECTOR = 64  # a multiple of the SIMD width in floats
 Limits = Literal["soft", "none"]
 
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """What a limited change of brightness is corrected by, so that a picture keeps its mean brightness and chroma.
+    """Correction of a limited change of brightness, so that a picture keeps its mean brightness and chroma.
 
     Attributes:
-        curve: k of the tone curve ``y - k y (1 - y)`` after the change, (B, 1 or C, 1, 1).
-        colour: share in [0, 1] of the saturation that changed pixels may gain, (B, 1, 1, 1).
+        curve: k of the tone curve ``y - k y (1 - y)`` applied after the change, (B, 1 or C, 1, 1).
+        colour: fraction in [0, 1] of the possible gain in saturation that is applied, (B, 1, 1, 1).
     """
 
     curve: float | Tensor = 0.0
@@ -38,24 +38,24 @@ class Balance:
 
 
 def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft", balance: Balance | None = None) -> Tensor:
-    """Brighten and darken an image without clipping it: highlights and shadows keep what they show.
+    """Brighten and darken an image without clipping, so that highlights and shadows keep their detail.
 
-    A change d of luminance becomes ``h (1 - exp(-|d| / h))``, with h the room towards white (or black): small changes
-    are added as they are, large ones end before white. The room is mostly that of luminance and to a quarter that of
-    the channel with the least; with that of each channel by itself, colours would lose 2 to 25 % of their chroma at a
-    detail gain of 2. Chroma is kept as far as the room of the channels allows. No channel takes more than nine tenths
-    of its room, or the last level of 8 bits.
+    A change d of luminance becomes ``h (1 - exp(-|d| / h))``, with h the headroom towards white (or black): small
+    changes are added as they are, large ones end before white. The headroom is mostly that of luminance and to a
+    quarter that of the channel with the least; with separate headroom for each channel, colours would lose 2 to 25 % of
+    their chroma at a detail gain of 2. Chroma is kept as far as the headroom of the channels allows. No channel uses
+    more than nine tenths of its headroom, or the last 8-bit level.
 
-    What is left of this in the mean of a picture, :func:`balance_of` works out.
+    The remaining shift of the picture's mean is corrected by ``balance``, see :func:`balance_of`.
 
     Args:
-        image: (B, C, H, W) in [0, 1]; what is outside moves inwards only.
-        change: of luminance, (B, 1, H, W), or of every channel by itself, (B, C, H, W).
-        limits: ``"none"`` adds the change.
-        balance: corrections for the whole picture; None is none.
+        image: (B, C, H, W) in [0, 1]; values outside only move inwards.
+        change: change of luminance, (B, 1, H, W), or of each channel, (B, C, H, W).
+        limits: ``"none"`` adds the change as it is.
+        balance: corrections for the whole picture, if any.
 
     Returns:
-        (B, C, H, W); the image to the last bit where the change and the balance are 0. Differentiable in both.
+        (B, C, H, W), bit-identical to the image where the change and the balance are 0. Differentiable in both.
 
     Example:
         >>> import torch
@@ -69,11 +69,11 @@ def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft", bal
 
 
 def limited_change(image: Tensor, change: Tensor, balance: Balance | None = None) -> tuple[Tensor, Tensor | None]:
-    """What :func:`change_luminance` makes of a change.
+    """Limit a change as in :func:`change_luminance`.
 
     Returns:
-        The change within its limits, in the shape of the change; and the change of saturation as a share of it,
-        (B, 1, H, W), or None for a change of every channel by itself.
+        The limited change, in the shape of the change; and the relative change of saturation, (B, 1, H, W), or None for
+        a change of each channel.
     """
     balance = Balance() if balance is None else balance
     moved = _curved(image, change, balance.curve)
@@ -84,7 +84,7 @@ def limited_change(image: Tensor, change: Tensor, balance: Balance | None = None
 
 
 def move_luminance(image: Tensor, moved: Tensor, saturation: Tensor | None) -> Tensor:
-    """An image under what :func:`limited_change` gives, where it leaves its limits cut off at them."""
+    """Add the result of :func:`limited_change` to an image, clamped to the limits of :func:`change_luminance`."""
     before = image if saturation is None else reduce_channels(image, "luminance")
     low, high = _ends(before)
     moved = torch.minimum(torch.maximum(moved, low - before), high - before)
@@ -95,12 +95,12 @@ def move_luminance(image: Tensor, moved: Tensor, saturation: Tensor | None) -> T
 
 
 def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], brighter: float | Tensor = 0.0) -> Balance:
-    """The balance of a picture under a change of brightness.
+    """Compute the balance of a picture under a change of brightness.
 
     Args:
-        mean: means (B, S, 1, 1) over the picture of the planes (B, S, H, W) that a function makes of the image and its
-            change.
-        brighter: by what share of it the mean brightness is to change, (B, 1, 1, 1).
+        mean: returns the means (B, S, 1, 1) over the picture of a function of the image and its change; the function
+            returns (B, S, H, W).
+        brighter: intended relative change of the mean brightness, (B, 1, 1, 1).
     """
 
     def shifts(image: Tensor, change: Tensor) -> Tensor:
@@ -124,24 +124,24 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
 
 
 def balance_in_memory(image: Tensor, change: Tensor, brighter: float | Tensor = 0.0) -> Balance:
-    """:func:`balance_of` an image (B, C, H, W) and its change."""
+    """Compute :func:`balance_of` for an image (B, C, H, W) and its change."""
     return balance_of(lambda function: function(image, change).mean((2, 3), keepdim=True), brighter)
 
 
 def _before(image: Tensor, change: Tensor) -> Tensor:
-    """What is changed: luminance, or all channels."""
+    """Return the planes that the change applies to: luminance, or all channels."""
     return image if change.shape[1] == image.shape[1] else reduce_channels(image, "luminance")
 
 
 def _ends(planes: Tensor) -> tuple[Tensor, Tensor]:
-    """The lowest and highest values that planes may take."""
+    """Return the lowest and highest values that planes may take."""
     low = torch.minimum(((1 - ROOM) * planes).clamp(min=LEVEL), planes)
     high = 1 - torch.minimum(((1 - ROOM) * (1 - planes)).clamp(min=LEVEL), 1 - planes)
     return low, torch.maximum(high, planes)
 
 
 def _limited(image: Tensor, change: Tensor) -> Tensor:
-    """The change within its limits."""
+    """Limit the change to the headroom."""
     before = _before(image, change)
     up = change >= 0
     low, high = _ends(before)
@@ -155,21 +155,21 @@ def _limited(image: Tensor, change: Tensor) -> Tensor:
 
 
 def _curved(image: Tensor, change: Tensor, curve: float | Tensor) -> Tensor:
-    """The change within its limits, and by a tone curve after it."""
+    """Limit the change, and apply the tone curve after it."""
     moved = _limited(image, change)
     after = _before(image, change) + moved
     return moved - curve * after * (1 - after)
 
 
 def _saturation(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
-    """How much chroma has to change for the channels to keep their limits, and how much more it might be: shares of it.
+    """Required and possible relative changes of chroma for the channels to stay within their limits.
 
     Args:
         image: RGB (B, 3, H, W).
         moved: its change of luminance (B, 1, H, W).
 
     Returns:
-        (B, 1, H, W) from -1 to 0, and from 0 to 1.
+        The required decrease, from -1 to 0, and the possible increase, from 0 to 1, both (B, 1, H, W).
     """
     share, luminance = _share(image, moved), reduce_channels(image, "luminance")
     relative = SATURATION * (moved.abs() / luminance.clamp(min=DARK)).clamp(max=1 / SATURATION)
@@ -177,7 +177,7 @@ def _saturation(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _share(image: Tensor, moved: Tensor) -> Tensor:
-    """By what share chroma can grow, at least -1, before a channel leaves its limits, (B, 1, H, W)."""
+    """Largest relative change of chroma, at least -1, at which all channels stay within their limits, (B, 1, H, W)."""
     luminance, chroma = split_luminance(image)
     after, (low, high) = luminance + moved, _ends(image)
     room = torch.where(chroma > 0, high - after, after - low).clamp(min=0.0)
@@ -186,16 +186,16 @@ def _share(image: Tensor, moved: Tensor) -> Tensor:
 
 
 def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
-    """Put ``image`` under another luminance, with the two chroma channels of YCbCr kept.
+    """Edit the luminance of an image and keep the two chroma channels of YCbCr.
 
-    Since Cb and Cr are multiples of B - Y and R - Y, adding the change of Y to R, G and B keeps them. Done so, an edit
-    that changes nothing gives the image back to the last bit, whatever its depth and RGB profile. The alternatives: Lab
-    shifts hues as little, but holds for sRGB only; a ratio of luminances moves the saturation two to three times as
-    much (RMS change of chroma on four photographs).
+    Since Cb and Cr are multiples of B - Y and R - Y, adding the change of Y to R, G and B keeps them. An edit that
+    changes nothing then returns the image bit for bit, whatever its depth and RGB profile. The alternatives: Lab shifts
+    hues as little, but is valid for sRGB only; a ratio of luminances changes the saturation two to three times as much
+    (RMS change of chroma on four photographs).
 
     Args:
-        image: (B, C, H, W); with C = 3 it is RGB, with any other C all channels go through ``edit``.
-        edit: from luminance (B, 1, H, W) to luminance.
+        image: (B, C, H, W); with C = 3 it is RGB, with any other C ``edit`` is applied to all channels.
+        edit: function from luminance (B, 1, H, W) to luminance.
 
     Returns:
         (B, C, H, W); values may leave [0, 1], as those of ``edit`` do. Differentiable.
@@ -213,43 +213,43 @@ def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 MAX_COLOURS = 16
-ALIKE = 0.05  # strokes whose chroma differs by less, in units of RGB, are one colour
+ALIKE = 0.05  # chroma difference in units of RGB below which strokes have the same colour
 
 
 def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Luminance (B, 1, H, W) and chroma ``image - luminance`` (B, 3, H, W), a multiple of YCbCr's, of an RGB image."""
+    """Split RGB into luminance (B, 1, H, W) and chroma ``image - luminance`` (B, 3, H, W), a multiple of YCbCr's."""
     luminance = reduce_channels(image, "luminance")
     return luminance, image - luminance
 
 
 def with_green(chroma: Tensor) -> Tensor:
-    """Chroma (B, 3, H, W) from its red and blue, (B, 2, H, W): it has no luminance."""
+    """Complete chroma (B, 3, H, W) from its red and blue, (B, 2, H, W): its luminance is 0."""
     red, blue = chroma.split(1, dim=1)
     return torch.cat([red, (0.299 * red + 0.114 * blue) / -0.587, blue], dim=1)
 
 
 def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:
-    """RGB (B, 3, H, W) of that luminance, chroma scaled down where a channel would leave [0, 1].
+    """Combine luminance and chroma to RGB (B, 3, H, W), with chroma scaled down where a channel would leave [0, 1].
 
-    Clipping the channels would change luminance instead, which the eye sees first.
+    Clipping the channels would change luminance instead, which is more visible.
     """
-    # Room towards white where a channel goes up, towards black where it goes down.
+    # Headroom towards white where chroma is positive, towards black where it is negative.
     room = torch.where(chroma > 0, 1 - luminance, luminance).clamp(min=0.0)
     scale = (room / chroma.abs().clamp(min=1e-6)).amin(1, keepdim=True).clamp(max=1.0)
     return luminance + scale * chroma
 
 
 def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Tell the colours of strokes apart.
+    """Group the pixels of strokes by colour.
 
     Args:
         chroma: (B, 3, H, W), read where painted.
         weights: (B, 1, H, W), above 0 where painted.
 
     Returns:
-        Regions (B, K, H, W), the weights divided among the K colours; their mean chroma (B, K, 3); and which of them
-        count, (B, K) bool, since an image of fewer colours than others repeats its first one. At most 16 colours:
-        further ones join the nearest. Differentiable in chroma and weights with the grouping held.
+        Regions (B, K, H, W), the weights of the pixels of each of K colours; the mean chroma (B, K, 3) of the regions;
+        and which of them are valid, (B, K) bool, since an image with fewer colours than others repeats its first one.
+        At most 16 colours; further ones join the nearest. Differentiable in chroma and weights at a fixed grouping.
     """
     with torch.no_grad():
         labels = torch.stack([_label(c.flatten(1), w.flatten() > 0) for c, w in zip(chroma, weights, strict=True)])
@@ -261,16 +261,16 @@ def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tens
 
 
 def region_means(image: Tensor, regions: Tensor) -> Tensor:
-    """Means (B, K, C) of an image (B, C, H, W) over regions (B, K, H, W) of weights; summed up in float64.
+    """Weighted means (B, K, C) of an image (B, C, H, W) over regions (B, K, H, W), summed in float64.
 
-    In float32 the sums over megapixels would differ in the fifth digit from those over the painted pixels alone.
+    In float32, sums over megapixels would differ in the fifth digit from those over the painted pixels alone.
     """
     weights = regions.flatten(2).double()
     return (weights @ image.flatten(2).double().mT / weights.sum(2, keepdim=True)).to(image)
 
 
 def _label(chroma: Tensor, painted: Tensor) -> Tensor:
-    """Number (N,) of the colour of every painted pixel of chroma (3, N), -1 for the others."""
+    """Colour index (N,) of each painted pixel of chroma (3, N), -1 for the others."""
     paint = chroma[:, painted]  # (3, n)
     numbers = torch.full_like(paint[0], -1, dtype=torch.long)
     leaders: list[Tensor] = []
@@ -286,7 +286,7 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
 
 
 def nearby_or_far(given: float | Tensor | str | None, share: float, size: Sequence[int]) -> float | Tensor | None:
-    """The same, and None, for no spatial bandwidth, where ``"none"`` is given.
+    """Return :func:`nearby`, or None, for no spatial bandwidth, if ``"none"`` is given.
 
     Raises:
         ValueError: if another word is given.
@@ -298,21 +298,22 @@ def nearby_or_far(given: float | Tensor | str | None, share: float, size: Sequen
 
 
 def nearby(given: float | Tensor | None, share: float, size: Sequence[int]) -> float | Tensor:
-    """A spatial bandwidth in pixels: the one given, or for None a share of the short side of a picture (H, W).
+    """Return a spatial bandwidth in pixels: the one given, or for None a share of the short side of a picture (H, W).
 
-    A share, so that a preview and the photograph agree.
+    It is relative so that a preview and the photograph agree.
     """
     return share * min(size) if given is None else given
 
 
 def colour_guide(image: Tensor) -> Tensor:
-    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), lightness first and with less weight than colour.
+    """CIE Lab of an RGB image in hundredths, (B, 3, H, W), with less weight for lightness than for colour.
 
-    To the last bit the same for a pixel wherever it stands, so that landmarks are the same for a picture read by rows.
+    The result of a pixel is bit-identical wherever it is in the tensor, so that a picture read by rows has the same
+    landmarks.
     """
     from kornia.color import rgb_to_lab  # kornia takes half a second to import
 
-    # Powers round differently in the odd pixels that are left over at the end of a tensor, or of a thread's part of it.
+    # Powers round differently in the scalar remainder at the end of a tensor, or of a thread's part of it.
     parts = []
     for part in image.clamp(0.0, 1.0).flatten(2).split(CONVERTED, dim=2):
         full = F.pad(part, (0, -part.shape[2] % VECTOR)).unsqueeze(2).contiguous()

@@ -15,10 +15,10 @@ class Scribbles:
     """Scribbled pixels of a picture, or of a batch of them.
 
     Attributes:
-        places: numbers (n,) of the pixels along the rows, ascending; of all that are scribbled on in any image.
-        weights: (B, K, n) in [0, 1], of K regions.
-        image: what they cover, (B, C, n).
-        colours: of the scribbles, (B, 3, n), or None.
+        places: row-major indices (n,), ascending, of the pixels that are scribbled on in at least one image.
+        weights: (B, K, n) in [0, 1], for K regions.
+        image: colours of the picture at these pixels, (B, C, n).
+        colours: colours of the scribbles, (B, 3, n), or None.
     """
 
     places: Tensor
@@ -27,7 +27,7 @@ class Scribbles:
     colours: Tensor | None = None
 
     def joined(self, other: "Scribbles") -> "Scribbles":
-        """With the regions of other scribbles after these; where both lie, these count."""
+        """Append the regions of other scribbles; where both cover a pixel, the other scribbles have weight 0."""
         places, back = torch.cat([self.places, other.places]).unique(return_inverse=True)
         own, others = back.split([len(self.places), len(other.places)])
         shape = (len(self.weights), self.weights.shape[1] + other.weights.shape[1], len(places))
@@ -43,11 +43,11 @@ class Scribbles:
         return Scribbles(places, weights, image)
 
     def weighted(self, weights: Tensor) -> "Scribbles":
-        """With other regions, (B, K, n)."""
+        """Replace the weights by others, (B, K, n)."""
         return replace(self, weights=weights)
 
     def planes(self, pixels: Any) -> Tensor:
-        """The weights (B, K, h, w) of some pixels."""
+        """Return the weights (B, K, h, w) at some pixels of the picture."""
         height, width = pixels.image.shape[-2:]
         top, left = corner(pixels)
         ends = torch.tensor([top, top + height]).to(self.places) * pixels.width
@@ -65,10 +65,11 @@ class Scribbles:
 def scribbled_blocks(
     known: Sequence[tuple[Callable[[], Iterable[Tensor]], Tensor, Tensor]],
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Columns (B, M, n), weights (B, 1, n) and values (B, C, n) of pixels, block by block, as a regression takes them.
+    """Yield columns (B, M, n), weights (B, 1, n) and values (B, C, n) of pixels, block by block, for a regression.
 
     Args:
-        known: some pixels and others: their columns, block by block; weights and values of all of them.
+        known: for each set of pixels, a function that returns the blocks of their columns, and the weights and values
+            of the whole set.
     """
     for columns, weights, values in known:
         first = 0

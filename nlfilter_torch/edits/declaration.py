@@ -1,6 +1,6 @@
-"""What a parameter of an edit is: declared once, read by functions, commands, files, the editor and the documentation.
+"""Declaration of edits and their parameters, read by functions, commands, files, the editor and the documentation.
 
-Imports no torch, so that help and lists of the command line appear at once.
+Does not import torch, so that the command line prints help and lists without delay.
 """
 
 import json
@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
-GAINS = (-1e6, 1e6)  # of sliders; beyond these and the following ranges nothing useful is left, and numbers overflow
-BANDWIDTHS = (0.01, 1e6)  # photometric, in grey levels of 255
+# Values outside these ranges give no useful result, and numbers overflow.
+GAINS = (-1e6, 1e6)  # sliders
+BANDWIDTHS = (0.01, 1e6)  # photometric bandwidths, in grey levels from 0 to 255
 DISTANCES = (0.01, 1e6)  # spatial bandwidths, in pixels
 MAX_SLIDERS = 100
 MAX_PATCH = 99  # pixels
@@ -21,7 +22,7 @@ Kind = Literal["number", "count", "odd", "choice", "sliders"]
 Unit = Literal["", "levels", "lab", "px", "%", "gain"]
 Domain = Literal["positive", "not negative", "share", "below 1", "finite", "count", "choice"]
 
-#: Of a unit: how errors call a number of it, and what stands for a value in the help of a command.
+#: For each unit: its name in errors, and the placeholder of a value in the help of a command.
 UNITS: dict[Unit, tuple[str, str | None]] = {
     "": ("", None),
     "levels": ("grey levels", "LEVELS"),
@@ -37,12 +38,12 @@ class Slider:
     """A slider of the editor.
 
     Attributes:
-        label: what the user reads.
-        low: end of its range, which may be narrower than that of the parameter.
-        high: likewise.
-        step: between values.
-        none: value that stands for None, or None.
-        live: whether the picture follows while the slider moves; else when it is released.
+        label: text beside the slider.
+        low: lower end of its range, which may be narrower than that of the parameter.
+        high: upper end of its range.
+        step: difference between adjacent values.
+        none: value that stands for None, if there is one.
+        live: whether the picture is updated while the slider moves, not only when it is released.
     """
 
     label: str
@@ -57,33 +58,33 @@ class Slider:
 class Parameter:
     """A parameter of an edit.
 
-    Commands, files and the editor have one name, unit and range for it. Functions take images in [0, 1] and lengths in
-    pixels: :meth:`argument_of` converts.
+    Commands, files and the editor use the same name, unit and range for it. Functions take images in [0, 1] and lengths
+    in pixels; :meth:`argument_of` converts.
 
     Attributes:
-        name: in files, of the editor's slider, and with dashes of the option.
-        kind: of value.
-        default: of the command and of files, and of the function too, but for parameters that are :attr:`idle` there.
-        help: what it does.
+        name: name in files, of the editor's slider and, with dashes, of the option.
+        kind: kind of value.
+        default: default in the command and in files, and in the function unless that defaults to :attr:`idle`.
+        help: description for the user.
         low: smallest value.
         high: largest value.
-        unit: of the value.
-        domain: what the function accepts, where that is more than the range; see :meth:`check_argument`.
-        zero: what 0 does, for errors.
-        optional: whether None is a value.
-        words: that may stand in place of a number.
-        choices: of a choice.
-        idle: the value that changes nothing, for parameters of which at least one must differ for the edit to change
-            anything.
-        argument: name of the function's argument, if it is another one.
-        share: of the short side that None stands for, for distances; 0 is no limit.
-        least: pixels that a length in hundredths of the short side has at least.
-        former: other names in files, and what values under them are multiplied by, or a function that converts them;
-            those of the same unit are names of the option, too.
-        metavar: stands for a value in the help, where it is not that of the unit.
-        slider: of the editor.
-        is_option: whether the command takes it, beside files.
-        length: of a list; 0 is any.
+        unit: unit of the value.
+        domain: values that the function accepts, if these are more than the range; see :meth:`check_argument`.
+        zero: effect of the value 0, for errors.
+        optional: whether None is allowed.
+        words: words allowed in place of a number.
+        choices: possible values of a choice.
+        idle: value that changes nothing; the edit has an effect only if at least one of its parameters that have such
+            a value differs from it.
+        argument: name of the function's argument, if it differs.
+        share: for distances, the share of the short side that None stands for; 0 is no limit.
+        least: minimum in pixels of a length given in hundredths of the short side.
+        former: former names in files, each with a factor or a function that converts its values; names of the same
+            unit are also accepted as options.
+        metavar: placeholder of a value in the help, if it is not that of the unit.
+        slider: the editor's slider.
+        is_option: whether the command has an option for it.
+        length: length of a list; 0 is any.
     """
 
     name: str
@@ -115,7 +116,7 @@ class Parameter:
 
     @property
     def wanted(self) -> str:
-        """What a value must be, in words.
+        """Description of the valid values, for errors.
 
         >>> Parameter("tones", "count", None, "", 2, 64, optional=True).wanted
         'a whole number from 2 to 64, or null'
@@ -136,7 +137,7 @@ class Parameter:
         return ", or ".join([text, *alternatives])
 
     def is_valid(self, value: Any) -> bool:
-        """Whether a value of JSON is one of this parameter."""
+        """Whether a value read from JSON is valid for this parameter."""
         if value is None:
             return self.optional
         if isinstance(value, str):
@@ -154,18 +155,18 @@ class Parameter:
         )
 
     def is_idle(self, value: Any) -> bool:
-        """Whether the edit changes nothing as far as this value goes; False for parameters without an idle value."""
+        """Whether a value, or all numbers of a list, equal :attr:`idle`; False for parameters without an idle value."""
         if isinstance(self.idle, tuple):
             return bool(value == self.idle)
         return all(v == self.idle for v in value) if isinstance(value, tuple) else bool(value == self.idle)
 
     def argument_of(self, value: Any, size: tuple[int, int], stride: float = 1) -> Any:
-        """The function's argument for a value: grey levels become those of [0, 1], and lengths become pixels.
+        """Convert a value to the function's argument: grey levels to [0, 1], and lengths to pixels.
 
         Args:
-            value: one of this parameter.
+            value: valid value of this parameter.
             size: (height, width) of the image.
-            stride: every how many pixels of the photograph the image has one.
+            stride: sampling step of the image relative to the photograph, in pixels along each axis.
 
         >>> Parameter("radius", "number", 2.5, "", 0.1, 20, "%").argument_of(2.5, (400, 600))
         10.0
@@ -181,14 +182,14 @@ class Parameter:
         return value / stride if self.unit == "px" and self.kind == "number" else value
 
     def pixels(self, given: float | None, size: tuple[int, int]) -> float:
-        """A length for an image of that size: the one given to the function, or the default."""
+        """Return a length in pixels for an image of that size: the one given to the function, or the default."""
         return float(self.argument_of(self.default, size) if given is None else given)
 
     def check_argument(self, value: Any, batch: int | None = None) -> None:
-        """Raise unless a function can take ``value``; with ``batch``, tensors of shape () or (batch,) are numbers too.
+        """Check that a function can take ``value``; with ``batch``, also tensors of shape () or (batch,).
 
         Raises:
-            TypeError, ValueError: with a sentence that names the argument.
+            TypeError, ValueError: if it cannot; the message names the argument.
         """
         from nlfilter_torch.core import checks
 
@@ -211,13 +212,13 @@ class Edit:
     """An edit and its parameters.
 
     Attributes:
-        name: of its command, and of its steps in files.
-        help: text of the command.
-        parameters: those of the edit itself, then those of its filter.
-        hint: a sentence for the editor.
-        brushes: what strokes may say, and how the editor calls it; ``colour`` is any colour.
-        needs: that without strokes it changes nothing.
-        coloured: that it gives colours to a grey photograph.
+        name: name of its command, and of its steps in files.
+        help: help text of the command.
+        parameters: parameters of the edit itself, then those of its filter.
+        hint: sentence shown in the editor.
+        brushes: what strokes can mean, each with its label in the editor; ``colour`` stands for any colour.
+        needs: whether the edit has no effect without strokes.
+        coloured: whether the edit turns a grey photograph into a colour one.
     """
 
     name: str
@@ -229,29 +230,29 @@ class Edit:
     coloured: bool = False
 
     def __iter__(self) -> Iterator[Parameter]:
-        """Its parameters."""
+        """Iterate over the parameters."""
         return iter(self.parameters)
 
     def __getitem__(self, name: str) -> Parameter:
-        """The parameter of that name, or of that name in the function."""
+        """Return the parameter with that name, or with that name of the function's argument."""
         return next(p for p in self if name in (p.name, p.keyword))
 
     @cached_property
     def defaults(self) -> dict[str, Any]:
-        """The defaults of the function's arguments, in its units; None for lengths that depend on the image."""
+        """Defaults of the function's arguments, in its units; None for lengths that depend on the image."""
         return {p.keyword: None if p.unit == "%" else p.argument_of(p.default, (0, 0)) for p in self}
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What strokes may say."""
+        """The words of :attr:`brushes`."""
         return tuple(word for word, _ in self.brushes)
 
 
 def parse_json(text: str, name: str, remedy: str) -> Any:
-    """What the text of the file ``name`` holds.
+    """Parse the text of the file ``name``.
 
     Raises:
-        ValueError: if it is not JSON, or nested deeper than Python can follow.
+        ValueError: if it is not JSON, or too deeply nested for Python.
     """
     try:
         return json.loads(text)
@@ -261,7 +262,7 @@ def parse_json(text: str, name: str, remedy: str) -> Any:
 
 
 def shown(value: Any) -> str:
-    """A value of JSON for a message, however long or deeply nested it is.
+    """Format a JSON value for a message, shortened if it is long or deeply nested.
 
     >>> shown({"a": None}), shown([0] * 100)
     ('{"a": null}', '[0, 0, 0, 0, 0, 0, ...]')
@@ -275,5 +276,5 @@ def shown(value: Any) -> str:
 
 
 def is_within(value: Any, low: float, high: float) -> bool:
-    """Whether a value of JSON is a number in a range of finite ends; NaN is not."""
+    """Whether a JSON value is a number in a closed, finite range; NaN is not."""
     return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high

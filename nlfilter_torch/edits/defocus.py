@@ -1,4 +1,4 @@
-"""A photograph as if taken with a wide aperture: sharp where one chooses, blurred elsewhere. Paper: Sec. V-C."""
+"""Synthetic defocus: a sharp subject before a blurred background, as with a wide aperture. Paper: Sec. V-C."""
 
 import math
 from typing import Any, Literal
@@ -15,10 +15,10 @@ from nlfilter_torch.edits.source import Fitted, Source, edited
 
 Aperture = Literal["disc", "gaussian"]
 
-# A mask below BLURRED is all background, above SHARP all subject. A blurred part of a subject disturbs more than a
-# sharp part of the background: doubts are kept sharp, and a subject reaches further than other regions.
+# A mask below BLURRED counts as background, above SHARP as subject. A blurred part of the subject is more disturbing
+# than a sharp part of the background, so uncertain pixels stay sharp and the reach is larger than for other regions.
 BLURRED, SHARP, REACH = 0.15, 0.4, 0.72
-LEAST = 1e-5  # weight of the subject in the blur of what is behind it
+LEAST = 1e-5  # weight of the subject in the blur of the background
 
 
 @full_precision
@@ -33,25 +33,25 @@ def defocus(
     patch_size: int = DEFOCUS.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
-    """Blur what is behind a subject that stays in focus.
+    """Blur the background of a subject that stays in focus.
 
-    Paper: Sec. V-C, Fig. 17, with :func:`region_mask` in place of its mask. The subject does not bleed into the blur,
-    which is that of the background alone.
+    Paper: Sec. V-C, Fig. 17, with :func:`region_mask` in place of its mask. Only the background is blurred, so the
+    subject does not bleed into it.
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        focus_region: (B, 1, H, W) in [0, 1], above 0 on some or all of what is to stay sharp.
-        radius: of the strongest blur, in pixels, at most half the short side; None is 2.5 % of it.
-        aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, of the same
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject.
+        radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
+        aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
             variance.
-        photometric_bandwidth: as of :func:`region_mask`, in hundredths of Lab.
-        spatial_bandwidth: likewise, in pixels; None is 0.3 of the short side.
-        patch_size: of the patches that are compared.
-        **options: further ones of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
+        photometric_bandwidth: that of :func:`region_mask`, in hundredths of Lab.
+        spatial_bandwidth: that of :func:`region_mask`, in pixels; None is 0.3 of the short side.
+        patch_size: width of the compared patches.
+        **options: further options of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
 
     Returns:
-        (B, C, H, W), equal to ``image`` to rounding where it is in focus, within its range. Differentiable in image and
-        region.
+        (B, C, H, W), within the range of ``image`` and equal to it to rounding where it is in focus. Differentiable in
+        image and region.
 
     Raises:
         TypeError, ValueError: if a tensor has another size, leaves its range, or the region is empty.
@@ -109,32 +109,32 @@ def fit_defocus(
 
 
 def focus_of(mask: Tensor) -> Tensor:
-    """How much of a pixel is in focus, from the mask (B, 1, H, W) of the subject."""
+    """Return the fraction of each pixel that is in focus, from the mask (B, 1, H, W) of the subject."""
     return ((mask - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
 
 
 def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture) -> Tensor:
-    """An image whose background is blurred, from pixels of the background alone, and mixed with itself by a soft mask.
+    """Blur the background by itself and blend it with the image by a soft mask.
 
     Args:
         image: (B, C, H, W).
-        focus: how much of a pixel is in focus, (B, 1, H, W).
-        radius: of the blur.
+        focus: fraction of each pixel that is in focus, (B, 1, H, W).
+        radius: radius of the blur.
         aperture: see :func:`defocus`.
     """
-    behind = (1 - focus).square() + LEAST  # the least matters only where there is nothing else
+    behind = (1 - focus).square() + LEAST  # LEAST matters only where there is no background nearby
     sums = _convolve(torch.cat([image * behind, behind], dim=1), _kernel(radius, aperture).to(image))
     blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
     return torch.where(focus == 1, image, blurred)
 
 
 def _kernel_radius(radius: float, aperture: Aperture) -> int:
-    """Pixels from the middle of the kernel to its border; of a Gaussian, three standard deviations."""
+    """Radius of the kernel in pixels; for a Gaussian, three standard deviations."""
     return math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)
 
 
 def _kernel(radius: float, aperture: Aperture) -> Tensor:
-    """A square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
+    """Compute a square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
     reach = _kernel_radius(radius, aperture)
     axis = torch.arange(-reach, reach + 1, dtype=torch.float64)
     squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
@@ -146,7 +146,7 @@ def _kernel(radius: float, aperture: Aperture) -> Tensor:
 
 
 def _convolve(planes: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve planes (B, C, H, W) with a symmetric kernel (k, k); nothing is outside the image."""
+    """Convolve planes (B, C, H, W) with a symmetric kernel (k, k), with zeros outside the image."""
     height, width = planes.shape[-2:]
     reach = kernel.shape[0] // 2
     size = (height + 2 * reach, width + 2 * reach)

@@ -1,4 +1,4 @@
-"""Less noise: by the trained network around the filter, or by sliders that every pixel sets from the noise level.
+"""Denoising by the trained network around the filter, or by sliders set per pixel from the noise level.
 
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
@@ -23,9 +23,9 @@ from nlfilter_torch.operator.build import nonlocal_operator
 
 Method = Literal["network", "rule"]
 
-GUIDE_BLUR = 0.7  # pixels; the guide's own noise would link pixels by it
+GUIDE_BLUR = 0.7  # pixels; without the blur, pixels would be similar by their noise
 ORDER = 2
-QUIET = 0.1 / 255  # a noise level below what eight bits resolve: nothing to do
+QUIET = 0.1 / 255  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
 @full_precision
@@ -41,27 +41,27 @@ def denoise(
     num_landmarks: int = DENOISE.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
-    """Remove noise of known or estimated strength.
+    """Remove noise of known or estimated level.
 
     The network is :meth:`NonlocalDenoiser.trained`. With ``method="rule"`` nothing is learned: the sliders of eq. (12)
-    are set for every pixel, and a detail layer is kept by the share of its energy that noise does not explain. That
-    energy is averaged by W, over similar patches wherever they are.
+    are set for each pixel, to the share of a detail layer's energy that is not due to noise. W averages this energy
+    over similar patches in the whole image.
 
     Args:
-        image: (B, C, H, W). Three channels are colours.
+        image: (B, C, H, W); with C = 3 it is RGB.
         noise_level: standard deviation of white noise, in units of the image, a number or a tensor of shape () or (B,);
-            for the network also a map (B, 1 or C, H, W). None estimates it, and whether it grows with the light.
-        strength: times the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
+            for the network also a map (B, 1 or C, H, W). None estimates it, and its growth with brightness.
+        strength: factor of the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
             smooths more.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
         photometric_bandwidth: h_y; None is the noise level.
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.
-        patch_size: of the patches that are compared.
-        num_landmarks: M; more keep more of what is rare.
-        **options: further ones of :func:`nonlocal_operator`.
+        patch_size: width of the compared patches.
+        num_landmarks: M; more keep more rare detail.
+        **options: further options of :func:`nonlocal_operator`.
 
     Returns:
-        (B, C, H, W); ``image`` itself where the noise level is less than a tenth of a grey level. Differentiable in
+        (B, C, H, W), equal to ``image`` where the noise level is less than a tenth of a grey level. Differentiable in
         image and noise level.
 
     Raises:
@@ -97,7 +97,7 @@ def fit_denoise(
     method: Method,
     **options: Any,
 ) -> Fitted:
-    """:func:`denoise` for any source; ``noise_level`` may be what :func:`noise_of` found."""
+    """:func:`denoise` for any source; ``noise_level`` may be the result of :func:`noise_of`."""
     DENOISE["strength"].check_argument(strength, source.batch)
     DENOISE["method"].check_argument(method)
     check_count(options["num_landmarks"], "num_landmarks")
@@ -123,13 +123,13 @@ def _read(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
 
 
 def _network(image: Tensor) -> NonlocalDenoiser:
-    """The trained network, read once for a device and dtype, with weights that stay as they are."""
-    read = _read.__wrapped__ if is_fake(image) else _read  # fake weights would be of no use later
+    """Return the trained network with frozen weights, read once per device and dtype."""
+    read = _read.__wrapped__ if is_fake(image) else _read  # fake weights must not be cached
     return read(image.device, image.dtype)
 
 
 def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
-    """Every tile is denoised where it stands; tiles of a picture worked on by rows stand at the same places."""
+    """Fit denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
     if isinstance(noise, Tensor) and noise.ndim == 4 and not source.whole:
         raise ValueError("noise_level must be a number for a picture in tiles, got a map; denoise it in memory")
 
@@ -152,7 +152,7 @@ def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Te
     }
     operator = source.operator(Guide(options, blur=GUIDE_BLUR))
     layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
-    energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of (B, ORDER, H, W)
+    energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of planes (B, ORDER, H, W)
     noise = assumed.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)
 
     def cleaned(pixels: Pixels) -> Tensor:
@@ -164,9 +164,9 @@ def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Te
 
 
 def _passed_noise(operator: Operator, pixels: int) -> Tensor:
-    """Variance (B, ORDER) that unit white noise has in each detail layer ``W^i (I - W)``, mean over pixels.
+    """Variance (B, ORDER) of unit white noise in each detail layer ``W^i (I - W)``, mean over pixels.
 
-    Off the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.
+    Outside the span of the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.
     """
 
     def gain(eigenvalues: Tensor, order: int) -> Tensor:

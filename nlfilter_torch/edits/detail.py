@@ -1,4 +1,4 @@
-"""Detail sliders for the whole image, or for all that looks like the regions painted on it. Paper: Figs. 12, 13."""
+"""Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 
-CALM = 2.0  # Gaussian window in pixels in which a picture is calm or not
+CALM = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
 TINY = 1e-12
 
 
@@ -47,33 +47,33 @@ def enhance(
     num_landmarks: int = DETAIL.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
-    """Move the detail sliders of a photograph, each region's own sliders for all that looks like it.
+    """Apply detail sliders to a photograph, or separate sliders to everything similar to each of several regions.
 
     Paper: eq. (12), (13). The filter compares luminance; the masks are those of :func:`region_mask`.
 
     Args:
         image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
-        alpha: sliders, fine to coarse: (k+1,) or (B, k+1) without regions, one row per region, (K, k+1), with them;
-            (k+1,) is for all regions.
-        regions: (B, K, H, W) in [0, 1], above 0 on some or all of each of K regions, as the scribbles of
+        alpha: sliders, fine to coarse: (k+1,) or (B, k+1) without regions; with regions one row for each, (K, k+1), or
+            (k+1,) for all of them.
+        regions: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions, like the scribbles of
             :func:`region_mask`; None edits the whole image.
-        negative: (B, 1 or K, H, W) in [0, 1], above 0 on some of what is in no region, or not in that one.
-        outside: sliders (k+1,) of what is in no region; None leaves it as it is.
-        residual: weight of what the eigenvectors do not explain, see :func:`polynomial_filter`.
+        negative: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions, or of each region.
+        outside: sliders (k+1,) outside all regions; None leaves these pixels unchanged.
+        residual: weight of the residual of the eigenvectors, see :func:`polynomial_filter`.
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
-        reach: of the masks, in [0, 1); larger takes in what is less alike.
+        reach: reach of the masks, in [0, 1); larger includes less similar pixels.
         mask_bandwidth: photometric bandwidth of the masks, in hundredths of Lab.
-        threshold: standard deviation of luminance around a pixel at which detail is strengthened half as much as the
-            sliders say, less where it is smaller; 0 strengthens all alike.
-        limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
+        threshold: standard deviation of luminance around a pixel at which detail is amplified half as much as the
+            sliders say, and less where it is smaller; 0 amplifies all detail alike.
+        limits: ``"soft"`` keeps detail in highlights and shadows, ``"none"`` adds the change as it is and lets them
             clip.
-        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
-            bandwidths are in pixels of that; 0 is the size of the image.
+        viewing_size: in megapixels; larger images are edited like their reduction to this size, with patches and
+            bandwidths in its pixels; 0 is the size of the image.
         photometric_bandwidth: h_y of the filter, or ``"auto"``.
-        spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares spots
-            however far apart they are, so that shading is detail, too.
-        num_landmarks: M of the filter, a spatial term needs more; the masks have as many, but not more than 100.
-        **options: further ones of :func:`nonlocal_operator`, for the filter; ``generator`` holds for the masks as well.
+        spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares pixels
+            regardless of their distance, so that shading counts as detail, too.
+        num_landmarks: M of the filter; a spatial term needs more. The masks use as many, but at most 100.
+        **options: further options of :func:`nonlocal_operator` for the filter; ``generator`` also applies to the masks.
 
     Returns:
         (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image, sliders and regions.
@@ -146,7 +146,7 @@ def fit_detail(
         raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
-    sliders = alpha - 1  # their change is 0 to the last bit where they are 1
+    sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit
 
     if regions is not None:
         check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
@@ -210,7 +210,7 @@ def fit_detail(
 
 
 def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
-    """Sliders less 1: those that strengthen detail, with 0 for the others, and the others."""
+    """Split sliders less 1 into those that amplify detail and the others, each with 0 in place of the rest."""
     dim = 1 if sliders.ndim == 4 else sliders.ndim - 1
     places = torch.arange(sliders.shape[dim], device=sliders.device)
     is_detail = (places < sliders.shape[dim] - 1).view(-1, *[1] * (sliders.ndim - dim - 1))
@@ -220,25 +220,25 @@ def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def change_of_mean(sliders: Tensor) -> Tensor | None:
-    """By what share sliders less 1, a row (K, k+1) for each part of a picture, change its mean.
+    """Relative change of the mean of a picture by sliders less 1, (K, k+1), one row for each part of the picture.
 
-    W keeps means, so that only the last slider counts. None if a part is to stay as it is, or the parts differ: the
-    mean is not corrected then.
+    W preserves means, so only the last slider counts. Returns None, for no correction of the mean, if a part stays
+    unchanged or the last sliders differ.
     """
     last = sliders[:, -1]
     return last[0] if bool((sliders != 0).any(1).all() & (last == last[0]).all()) else None
 
 
 def sum_of(changes: Tensor) -> Tensor:
-    """Added detail and the rest (B, 2 C, H, W) together."""
+    """Sum of added detail and the rest of the change, given as (B, 2 C, H, W)."""
     added, rest = changes.chunk(2, dim=1)
     return added + rest
 
 
 def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
-    """The change of an image (B, S, H, W) from those of K regions and that elsewhere, (B, (K + 1) S, H, W), by masks.
+    """Blend the changes of K regions and of the background, (B, (K + 1) S, H, W), by masks (B, K, H, W).
 
-    Where the masks (B, K, H, W) sum to more than 1, they are divided by their sum.
+    Where the masks sum to more than 1, they are divided by their sum.
     """
     shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
     rest = (1 - shares.sum(1, keepdim=True)).clamp(min=0.0)
@@ -247,9 +247,9 @@ def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
 
 
 def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
-    """The change (B, C, H, W) by added detail and the rest (B, 2 C, H, W), the former less where the image is calm.
+    """Sum added detail and the rest of the change, (B, 2 C, H, W), with less added detail where the image is flat.
 
-    The share of added detail is ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
+    Added detail is multiplied by ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
     """
     if not isinstance(threshold, Tensor) and threshold == 0:
         return sum_of(changes)
@@ -259,14 +259,14 @@ def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> T
 
 
 def activity(image: Tensor) -> Tensor:
-    """Variance (B, 1, H, W) of the luminance of an image around its pixels."""
+    """Local variance (B, 1, H, W) of the luminance of an image."""
     grey = reduce_channels(image, "luminance").mean(1, keepdim=True)
     mean, square = blur(torch.cat([grey, grey.square()], dim=1), CALM).chunk(2, dim=1)
     return (square - mean.square()).clamp(min=0)
 
 
 def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
-    """Options of :func:`nonlocal_operator` for the filter of a step on an image (H, W) of the viewing size."""
+    """Return the options of :func:`nonlocal_operator` for a step on an image of size (H, W), the viewing size."""
     found = {name: value for name, value in step.arguments(size).items() if name in FILTER}
     share = DETAIL["spatial_bandwidth"].share
     return found | {"spatial_bandwidth": nearby_or_far(found["spatial_bandwidth"], share, size)}

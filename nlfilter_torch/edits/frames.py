@@ -1,4 +1,4 @@
-"""One edit for all frames of a film, by a filter fitted to some of them."""
+"""Filtering of all frames of a film by one filter fitted to some of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -30,22 +30,22 @@ def filter_frames(
     viewing_size: float = DETAIL.defaults["viewing_size"],
     **options: Any,
 ) -> Iterator[Tensor]:
-    """Filter the frames of a film, or any set of like images, with one filter, so that the edit does not flicker.
+    """Filter the frames of a film, or any set of similar images, with one filter, so that the edit does not flicker.
 
     Args:
         frames: images (B, C, H, W) in [0, 1], read one at a time; with C = 3 they are RGB, and their colours are kept.
         alpha: sliders (k+1,) of :func:`polynomial_filter`.
-        references: one or a few frames (1, C, H, W) of one size that show what there is to see; the filter is fitted to
-            all of them. What looks like nothing in them stays as it is.
-        residual: of :func:`polynomial_filter`.
+        references: one or a few frames (1, C, H, W) of one size, representative of the film, which the filter is fitted
+            to. Pixels similar to nothing in them stay unchanged.
+        residual: that of :func:`polynomial_filter`.
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
-        threshold: of :func:`enhance`, and so are ``limits`` and ``viewing_size``.
-        limits: how far pixels may get brighter or darker.
-        viewing_size: in megapixels.
-        **options: of :func:`nonlocal_operator`, for the luminance of the references.
+        threshold: that of :func:`enhance`.
+        limits: that of :func:`enhance`.
+        viewing_size: that of :func:`enhance`, in megapixels.
+        **options: options of :func:`nonlocal_operator` for the luminance of the references.
 
     Returns:
-        The edited frames, in their order, each worked out when it is asked for; values may leave [0, 1].
+        An iterator over the edited frames, each computed on demand; values may leave [0, 1].
 
     Raises:
         TypeError, ValueError: if there is no reference, references differ in size, several of them come with a
@@ -78,7 +78,7 @@ def filter_frames(
     DETAIL["limits"].check_argument(limits)
     DETAIL["threshold"].check_argument(threshold)
     DETAIL["viewing_size"].check_argument(viewing_size)
-    # One above the other they are one image; the few patches across a seam are the price.
+    # References are stacked vertically to one image, at the cost of a few patches across the seams.
     viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
     reduced = [InMemory(frame.to(working_dtype(frame))).resized(viewed).image for frame in references]
     grey = reduce_channels(torch.cat(reduced, dim=2), "luminance")

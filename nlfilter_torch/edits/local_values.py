@@ -1,13 +1,13 @@
-"""Values that spread from scribbles to the neighbouring pixels, and stop where the luminance changes.
+"""Propagation of values from scribbles to neighbouring pixels, up to changes of luminance.
 
-They are the solution of a system over the eight neighbours of each pixel, as in Levin, Lischinski and Weiss,
-"Colorization using Optimization" (2004). Unlike theirs it is symmetric; the local variance of luminance that scales the
-differences has an upper limit, since it would be large at an edge; and the influence of scribbles falls to zero far
-from them and behind edges.
+The values solve a linear system over the eight neighbours of each pixel, as in Levin, Lischinski and Weiss,
+"Colorization using Optimization" (2004), with these differences: the system is symmetric; the local variance of
+luminance that scales the differences has an upper limit, since it is large at edges; and the influence of scribbles
+falls to zero far from them and behind edges.
 
-The system is solved on a picture that is reduced to about :data:`SOLVED` pixels, so that its cost does not grow with
-the size. Any pixel takes its values from the four nearest blocks, those of similar luminance first. So a pixel depends
-only on its own luminance and place, and tiles are exact.
+The system is solved on the picture reduced to about :data:`SOLVED` pixels, so that its cost does not grow with the
+size. The values of a pixel are then a mean over the four nearest blocks, weighted by similarity of luminance. They
+depend only on the pixel's own luminance and position, so that tiles are exact.
 """
 
 import math
@@ -21,22 +21,23 @@ from nlfilter_torch.filtering.neighbours import neighbour_weights, solve_neighbo
 from nlfilter_torch.operator.features import pad_border
 
 SOLVED = 1 << 14  # pixels
-# Limits of the variance that squared differences in luminance are compared with, and weight of the least alike.
+# Limits of the variance that squared differences of luminance are divided by, and least weight of a neighbour.
 LEAST_VARIANCE, MOST_VARIANCE, LEAST = 0.007**2, 0.042**2, 1e-5
-FIXED = 1e3  # anchor of a scribbled pixel
-REACH = 1.0  # distance at which the influence has fallen to 1/e in flat parts, relative to the root of the area
+FIXED = 1e3  # weight of the value of a scribbled pixel
+REACH = 1.0  # distance at which the influence falls to 1/e in flat areas, relative to the square root of the area
 TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-10}
 
 
 @dataclass(frozen=True, eq=False)
 class LocalValues:
-    """Values of any pixel, from those near it.
+    """Values of any pixel, by interpolation of a solution on blocks.
 
     Attributes:
-        values: solutions for the scribbles' values and for ones, (B, C+1, h, w). The latter is how far the scribbles
-            determine a block, in [0, 1], and the ratio of both is a weighted mean of the scribbles' values.
+        values: solutions for the scribbles' values and for ones, (B, C+1, h, w). The solution for ones, in [0, 1], is
+            the degree to which the scribbles determine a block; the ratio of both is a weighted mean of the scribbles'
+            values.
         guide: luminance of the blocks, (B, 1, h, w).
-        step: rows and columns of a block.
+        step: side of a block in pixels.
         width: W of the picture.
     """
 
@@ -47,33 +48,33 @@ class LocalValues:
 
     @staticmethod
     def of(guide: Tensor, step: int, width: int, places: Tensor, weights: Tensor, values: Tensor) -> "LocalValues":
-        """From values (B, C, n) and weights (B, 1, n) of scribbled pixels, and their numbers (n,) along the rows."""
+        """Solve for scribbled pixels with row-major indices (n,), weights (B, 1, n) and values (B, C, n)."""
         rows, columns = guide.shape[2:]
         blocks = places // width // step * columns + places % width // step
         weighted = torch.cat([values * weights, weights], dim=1)
         sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
         sums = sums.unflatten(2, (rows, columns)) * (FIXED / step**2)
-        # In flat parts the system is a u = 3 u'', as there are three neighbours in every direction.
+        # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
         anchor = sums[:, -1:] + 3 / (REACH**2 * rows * columns)
         links = neighbour_weights(guide, lambda squared: torch.exp(-squared) + LEAST, variance=local_variance(guide))
         solved = solve_neighbours(links, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
         return LocalValues(solved, guide, step, width)
 
     def __call__(self, own: Tensor, first: int) -> tuple[Tensor, Tensor]:
-        """Values times influence (B, C, h, w), and influence (B, 1, h, w) in [0, 1], of some pixels.
+        """Return values times influence (B, C, h, w), and influence (B, 1, h, w) in [0, 1], of a rectangle of pixels.
 
-        The influence is the square root of how far the scribbles determine a pixel.
+        The influence is the square root of the interpolated solution for ones.
 
         Args:
-            own: their luminance, (B, 1, h, w).
-            first: number of the first one.
+            own: luminance of the pixels, (B, 1, h, w).
+            first: row-major index of the first pixel.
         """
         found = self._at(own, *divmod(first, self.width))
         influence = found[:, -1:].clamp(min=1e-6).sqrt()
         return found[:, :-1] / influence, influence
 
     def _at(self, own: Tensor, top: int, left: int) -> Tensor:
-        """The solutions (B, C+1, h, w) at a rectangle."""
+        """Interpolate the solutions (B, C+1, h, w) in a rectangle."""
         height, width = own.shape[2:]
         if self.step == 1:
             return self.values[:, :, top : top + height, left : left + width]
@@ -89,7 +90,7 @@ class LocalValues:
         return total / weight
 
     def _between(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """The blocks before and after pixels along an axis, and their shares (count,) by distance."""
+        """Indices (count,) of the blocks before and after pixels along an axis, with linear weights (count,)."""
         position = (torch.arange(first, first + count, device=like.device) + 0.5) / self.step - 0.5
         before = position.floor()
         share = (position - before).to(like)
@@ -98,12 +99,12 @@ class LocalValues:
 
 
 def block_size(size: tuple[int, int]) -> int:
-    """Rows and columns of the blocks of a picture (H, W)."""
+    """Side in pixels of the blocks of a picture (H, W)."""
     return max(1, round(math.sqrt(size[0] * size[1] / SOLVED)))
 
 
 def local_variance(guide: Tensor) -> Tensor:
-    """Variance of 3x3 pixels around each, within limits, (B, 1, H, W)."""
+    """Variance over 3x3 pixels, clamped to the limits, (B, 1, H, W)."""
     moments = F.avg_pool2d(pad_border(torch.cat([guide, guide.square()], dim=1), 1), 3, stride=1)
     mean, square = moments.split(1, dim=1)
     return (square - mean.square()).clamp(LEAST_VARIANCE, MOST_VARIANCE)

@@ -1,4 +1,4 @@
-"""The noise of a photograph, from the windows of it in which there is little else."""
+"""Estimation of the noise of a photograph from its flattest windows."""
 
 from dataclasses import dataclass
 
@@ -10,25 +10,25 @@ from nlfilter_torch.core.checks import check_image
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.source import InMemory, Source
 
-WINDOW = 9  # pixels of a side
-WINDOWS = 6144  # that are looked at
-FLAT = 0.06  # share of them in which noise is measured: those of the least slopes
-SHADES = 6  # groups of them by their light, for noise that depends on it
-MEDIAN = 0.6745  # of the absolute value of a normal variable
-DOUBLE = 1.1  # times what is expected, from where on a group is thought to hold texture
-BETTER = 0.15  # squared relative errors that a dependence on light has to explain
-DARK = 0.02  # variance in the dark, as a share of that at white, that is always expected
+WINDOW = 9  # side of a window in pixels
+WINDOWS = 6144  # number of windows
+FLAT = 0.06  # share of the windows in which noise is measured: those with the smallest slopes
+SHADES = 6  # groups of windows by brightness, for noise that depends on it
+MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
+DOUBLE = 1.1  # ratio to the expected variance above which a group is assumed to contain texture
+BETTER = 0.15  # decrease of the squared relative errors that is required of a dependence on brightness
+DARK = 0.02  # least ratio of the variance in the dark to the growth of variance up to white
 SMALLEST = 1e-12  # variance
 
 
 @dataclass(frozen=True)
 class Noise:
-    """White noise whose variance grows with the light, as in cameras: ``floor + gain * light``.
+    """White noise whose variance grows with brightness, as in cameras: ``floor + gain * light``.
 
     Attributes:
         floor: variance (B,) in the dark.
-        gain: growth (B,) up to white.
-        light: mean (B,) of the photograph.
+        gain: growth (B,) of the variance up to white.
+        light: mean brightness (B,) of the photograph.
     """
 
     floor: Tensor
@@ -37,16 +37,16 @@ class Noise:
 
     @classmethod
     def even(cls, level: Tensor) -> "Noise":
-        """Noise of the same standard deviations (B,) everywhere."""
+        """Return noise with the same standard deviation (B,) everywhere."""
         return cls(level.square(), torch.zeros_like(level), torch.zeros_like(level))
 
     @property
     def level(self) -> Tensor:
-        """Standard deviation (B,) at the mean light."""
+        """Standard deviation (B,) at the mean brightness."""
         return (self.floor + self.gain * self.light).sqrt()
 
     def at(self, image: Tensor) -> Tensor:
-        """Standard deviation (B, C, H, W) at the pixels of an image, whose light is the mean of 5x5 pixels."""
+        """Standard deviation (B, C, H, W) at the pixels of an image, with brightness the mean of 5x5 pixels."""
         light = F.avg_pool2d(image.detach(), 5, 1, padding=2, count_include_pad=False).clamp(0, 1)
         floor, gain = (value.to(image).view(-1, 1, 1, 1) for value in (self.floor, self.gain))
         return (floor + gain * light).sqrt()
@@ -54,17 +54,18 @@ class Noise:
 
 @full_precision
 def estimate_noise(image: Tensor) -> Tensor:
-    """Standard deviation of white noise, at the mean light if it depends on light.
+    """Estimate the standard deviation of white noise, at the mean brightness if it depends on brightness.
 
-    Of many windows of 9x9 pixels, those with the least slopes of local means count, and of these the median response to
-    Immerkaer's mask ("Fast Noise Variance Estimation", 1996), which is blind to whatever is linear in rows or columns.
-    Neither slopes nor clipped pixels mislead it; texture that fills the whole picture does, by a level or two.
+    Of many windows of 9x9 pixels, those whose local means have the smallest slopes are used. The estimate is their
+    median response to Immerkaer's mask ("Fast Noise Variance Estimation", 1996), which is zero for anything linear in
+    rows or columns. It is robust to slopes and clipped pixels; texture that fills the whole picture biases it by one or
+    two grey levels.
 
     Args:
         image: (B, C, H, W), at least 3x3.
 
     Returns:
-        (B,), in units of the image; 0 for an image smaller than 3x3. Constant, as no gradient passes.
+        (B,), in units of the image; 0 for an image smaller than 3x3. No gradient is propagated.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point (B, C, H, W) tensor.
@@ -80,25 +81,25 @@ def estimate_noise(image: Tensor) -> Tensor:
 
 @torch.no_grad()
 def noise_of(source: Source) -> Noise:
-    """The noise of any source."""
+    """Estimate the noise of any source."""
     return Noise(*source.measured(_measured))
 
 
 def _measured(source: Source) -> Tensor:
-    """Floor, gain and light, (3, B)."""
+    """Estimate floor, gain and light, (3, B)."""
     if min(source.size) < 3:
         return torch.zeros(3, source.batch, dtype=source.dtype)
     windows = _windows(source)
     light = windows.mean((2, 3))
     response = _response(windows)
-    # Windows with clipped pixels come last: their noise is cut off.
+    # Windows with clipped pixels come last, as clipping truncates their noise.
     clipped = (windows == 0).logical_or(windows == 1).any(3).any(2)
     slopes = torch.where(clipped, torch.inf, _slopes(windows))
     level, _ = _level(response, slopes, light)
     shades, variances = [], []
     for group in light.argsort(1).tensor_split(SHADES, dim=1):
         if group.shape[1] == 0:
-            continue  # of fewer windows than groups
+            continue  # fewer windows than groups
         inside = group[..., None].expand(-1, -1, response.shape[2])
         found, shade = _level(response.gather(1, inside), slopes.gather(1, group), light.gather(1, group))
         shades.append(shade)
@@ -109,7 +110,7 @@ def _measured(source: Source) -> Tensor:
 
 
 def _windows(source: Source) -> Tensor:
-    """Windows (B, C * n, WINDOW, WINDOW) at random places, the same ones in memory and in tiles."""
+    """Return windows (B, C * n, WINDOW, WINDOW) at random positions, the same in memory and in tiles."""
     height, width = source.size
     rows, columns = max(1, height - WINDOW + 1), max(1, width - WINDOW + 1)
     generator = torch.Generator().manual_seed(0)
@@ -126,27 +127,27 @@ def _windows(source: Source) -> Tensor:
 
 
 def _mirrored(corners: Tensor, inside: Tensor, length: int) -> Tensor:
-    """Numbers of rows or columns (n, WINDOW); a picture smaller than a window goes on as in a mirror."""
+    """Indices of rows or columns (n, WINDOW), with reflection in pictures smaller than a window."""
     places = (corners[:, None] + inside) % max(1, 2 * length - 2)
     return torch.minimum(places, 2 * length - 2 - places)
 
 
 def _response(windows: Tensor) -> Tensor:
-    """Absolute response (B, n, 49) to Immerkaer's mask, which is of unit norm."""
+    """Absolute response (B, n, 49) to Immerkaer's mask, which has unit norm."""
     second = windows.new_tensor([1.0, -2.0, 1.0])
     mask = torch.outer(second, second)[None, None] / 6
     return F.conv2d(windows.flatten(0, 1).unsqueeze(1), mask).abs().flatten(1).unflatten(0, windows.shape[:2])
 
 
 def _slopes(windows: Tensor) -> Tensor:
-    """How much local means (B, n) rise or fall, which hardly depends on what the mask responds to."""
+    """Mean squared slopes (B, n) of local means, which hardly depend on what the mask responds to."""
     means = F.avg_pool2d(windows.flatten(0, 1).unsqueeze(1), 5, 1)
     down, across = means[..., 2:, 1:-1] - means[..., :-2, 1:-1], means[..., 1:-1, 2:] - means[..., 1:-1, :-2]
     return (down.square() + across.square()).mean((1, 2, 3)).unflatten(0, windows.shape[:2])
 
 
 def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations (B,) from responses (B, n, r) in the windows of the least slopes (B, n), and their light."""
+    """Noise level (B,) from responses (B, n, r) in windows with the smallest slopes (B, n), and their brightness."""
     count = max(1, min(slopes.shape[1], max(20, int(FLAT * slopes.shape[1]))))
     least = slopes.argsort(1)[:, :count]
     found = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
@@ -154,9 +155,10 @@ def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Ten
 
 
 def _line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Floor and gain (B,) of variances (B, K) at some light: none negative, no gain unless it explains much.
+    """Fit floor and gain (B,), not negative, to variances (B, K) over brightness (B, K).
 
-    Texture only adds variance, so what lies above the line counts for less.
+    The gain is 0 unless it reduces the error enough. Texture only adds variance, so points above the line have less
+    weight.
     """
     variance = variance.clamp(min=SMALLEST)
     weight = torch.ones_like(variance)

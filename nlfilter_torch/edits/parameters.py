@@ -1,6 +1,6 @@
-"""The edits and their parameters: everything that functions, commands, files, the editor and the documentation share.
+"""Declarations of all edits and their parameters, for functions, commands, files, the editor and the documentation.
 
-``docs/parameters.md`` is made from it (``python -m benchmarks.parameters docs/parameters.md``).
+``docs/parameters.md`` is generated from them (``python -m benchmarks.parameters docs/parameters.md``).
 """
 
 from dataclasses import replace
@@ -57,7 +57,7 @@ DETAIL = Edit(
             None,
             "The sliders inside what looks like the strokes; as many. Left out: 1 for each.",
             optional=True,
-            is_option=False,  # --region has them
+            is_option=False,  # given by --region
         ),
         gain(
             "residual",
@@ -362,7 +362,7 @@ ABSTRACT = Edit(
             2,
             "%",
             domain="positive",
-            least=0.3,  # thinner lines than a pixel can show
+            least=0.3,  # thinnest line that pixels can show
             former=(("width", 0.1),),
             slider=Slider("Width of lines", 0.05, 0.6, 0.01),
         ),
@@ -372,7 +372,7 @@ ABSTRACT = Edit(
             None,
             "Reduce brightness to so many tones. Left out: no such steps.",
             2,
-            1 << 16,  # as many as 16 bits have
+            1 << 16,  # levels of 16 bits
             domain="count",
             optional=True,
             idle=None,
@@ -384,7 +384,7 @@ ABSTRACT = Edit(
     hint="A painting of the photograph: flat areas with clear outlines.",
 )
 
-#: All edits, in the order in which the editor adds them to one another.
+#: All edits, in the order in which the editor applies them.
 EDITS: dict[str, Edit] = {
     edit.name: edit for edit in (DENOISE, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT, LOOK)
 }

@@ -1,4 +1,4 @@
-"""Some pixels of a picture, and what an edit makes of them."""
+"""A set of pixels of a picture, and an edit as a function of such a set."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Pixels(Protocol):
-    """Some pixels of a picture: all of them, some of its rows, or a rectangle."""
+    """A set of pixels of a picture: all of them, some rows, or a rectangle."""
 
     @property
     def image(self) -> Tensor:
@@ -16,7 +16,7 @@ class Pixels(Protocol):
 
     @property
     def first(self) -> int:
-        """Number of the first one, along the rows of the picture."""
+        """Row-major index of the first pixel in the picture."""
 
     @property
     def width(self) -> int:
@@ -24,23 +24,24 @@ class Pixels(Protocol):
 
 
 def corner(pixels: Pixels) -> tuple[int, int]:
-    """Row and column of the first one."""
+    """Return the row and column of the first pixel."""
     return divmod(pixels.first, pixels.width)
 
 
-Planes = Callable[[Any], Tensor]  # of some pixels, (B, C, h, W)
+Planes = Callable[[Any], Tensor]  # values (B, C, h, W) at given pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What an edit does to any pixels of a picture that it was fitted to.
+    """An edit fitted to a picture, which can be applied to any of its pixels.
 
     Attributes:
-        pixels: the edited pixels, or planes that ``finish`` makes these from.
-        finish: from the image and these planes to the edited image, where that takes the pixels around a pixel.
-        margin: how many.
-        step: what ``finish`` does depends on the number of a row modulo so many, counted from the first it is given;
-            tiles begin at multiples of it, and so does ``margin``. Likewise for columns.
+        pixels: function that returns the edited pixels, or planes that ``finish`` takes.
+        finish: function of the image and these planes that returns the edited image, for edits that depend on the
+            neighbourhood of a pixel.
+        margin: radius of this neighbourhood in pixels.
+        step: period, in rows and in columns, of what ``finish`` does, counted from the first row and column that it is
+            given; tiles begin at multiples of it, and ``margin`` is a multiple of it.
     """
 
     pixels: Planes

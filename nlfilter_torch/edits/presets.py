@@ -1,7 +1,7 @@
-"""Sliders and the filter they belong to, as a small JSON file: an edit that was found once, for any other photograph.
+"""Presets: sliders and the options of their filter, as a small JSON file that applies to any photograph.
 
-Names and units are those of the command line, so that the file can be read and changed by hand. :data:`PRESETS` are
-presets that have a name.
+Names and units are those of the command line, so that the file can be edited by hand. :data:`PRESETS` are the named
+presets.
 """
 
 from dataclasses import asdict, dataclass
@@ -23,14 +23,14 @@ class Preset:
 
     Attributes:
         alpha: sliders, fine to coarse, at least two. Paper: eq. (12).
-        bandwidth: photometric bandwidth in grey levels of 255, or ``"auto"``.
+        bandwidth: photometric bandwidth in grey levels from 0 to 255, or ``"auto"``.
         spatial_bandwidth: in pixels, ``"none"`` for none, or None for a twelfth of the short side.
         patch_size: odd.
-        landmarks: how many.
+        landmarks: number of landmarks.
         sampling: ``"kmeans"``, ``"uniform"`` or ``"random"``.
-        residual: gain of what no landmark explains, or None for that of the finest layer.
+        residual: gain of the residual of the landmarks, or None for that of the finest layer.
         channels: ``"luminance"`` or ``"all"``.
-        threshold: in grey levels, contrast of detail below which it is strengthened less.
+        threshold: in grey levels, contrast of detail below which it is amplified less.
         limits: ``"soft"`` or ``"none"``.
         viewing_size: in megapixels.
     """
@@ -76,7 +76,7 @@ class Preset:
         return Step("detail", **asdict(self))
 
     def to_json(self) -> str:
-        """The preset as text: a recipe of one step.
+        """Format the preset as JSON: a recipe of one step.
 
         >>> print(Preset((3.0, 1.0), 20.0).to_json())
         {
@@ -106,14 +106,14 @@ class Preset:
 
     @staticmethod
     def from_json(text: str, name: str) -> "Preset":
-        """Read what :meth:`to_json` wrote; entries that are left out have their defaults.
+        """Parse the output of :meth:`to_json`; omitted entries have their defaults.
 
         Args:
             text: the file's content.
-            name: what errors call it.
+            name: the file's name in errors.
 
         Raises:
-            ValueError: if ``text`` is no JSON object, or holds more than the sliders of a whole photograph.
+            ValueError: if ``text`` is no JSON object, or holds more than a single detail step without strokes.
         """
         return _preset(Recipe.from_json(text, name, REMEDY), name)
 
@@ -122,14 +122,14 @@ REMEDY = "make one with nlfilter-torch fit"
 
 
 def _preset(recipe: Recipe, name: str) -> Preset:
-    """What a recipe says about the details of a whole photograph."""
+    """Convert a recipe of a single detail step without strokes."""
     if [step.edit for step in recipe.steps] != ["detail"] or recipe.steps[0].strokes:
         raise ValueError(f"{name} is no preset: it holds other steps than detail, or strokes; use nlfilter-torch apply")
     return Preset(**{field: recipe.steps[0][field] for field in Preset.__dataclass_fields__})
 
 
-#: The presets that have a name. Chosen by eye on astronaut, chelsea and rocket of scikit-image and seven photographs of
-#: landscapes, buildings and plants. Those that take grain away do so better without a spatial term.
+#: The named presets. Chosen by eye on astronaut, chelsea and rocket of scikit-image and seven photographs of
+#: landscapes, buildings and plants. The presets that remove grain work better without a spatial term.
 PRESETS: dict[str, Preset] = {
     "crisp": Preset((2.2, 2.2, 2.2, 1.0)),
     "clear": Preset((1.5, 1.5, 1.5, 1.0)),
@@ -141,7 +141,7 @@ PRESETS: dict[str, Preset] = {
     "smooth": Preset((0.0, 0.0, 0.0, 1.0), 12.0, "none", landmarks=100),
 }
 
-#: What each of :data:`PRESETS` does, in a few words.
+#: Short description of each of :data:`PRESETS`.
 PURPOSES: dict[str, str] = {
     "crisp": "all details, large and small, strongly",
     "clear": "a little more of everything",
@@ -155,7 +155,7 @@ PURPOSES: dict[str, str] = {
 
 
 def find_preset(name: str) -> Preset:
-    """The preset of that name (``soft-skin`` is ``soft skin``), or the one in the file at that path.
+    """Return the preset of that name (``soft-skin`` is ``soft skin``), or read it from the file at that path.
 
     Raises:
         ValueError: if there is neither, or the file holds no preset.
@@ -168,10 +168,10 @@ def find_preset(name: str) -> Preset:
 
 
 def find_recipe(name: str) -> Recipe:
-    """The preset of that name (``soft-skin`` is ``soft skin``), or the edit in the file at that path.
+    """Return the preset of that name (``soft-skin`` is ``soft skin``), or read the recipe in the file at that path.
 
     Raises:
-        ValueError: if there is neither, or the file holds none.
+        ValueError: if there is neither, or the file holds no recipe.
     """
     spoken = name.lower().replace("-", " ").replace("_", " ")
     if spoken in PRESETS:

@@ -1,6 +1,6 @@
-"""A whole edit as a small JSON file: steps in their order, each with its parameters and strokes, for any photograph.
+"""Recipes: an ordered list of steps, each with its parameters and strokes, as a small JSON file for any photograph.
 
-What the editor saves and ``nlfilter-torch apply`` and ``batch`` take::
+The editor saves, and ``nlfilter-torch apply`` and ``batch`` read::
 
     {
       "version": 1,
@@ -10,8 +10,8 @@ What the editor saves and ``nlfilter-torch apply`` and ``batch`` take::
       ]
     }
 
-Entries that are left out have the defaults of the command of that name. Strokes lie where they lie in the picture, so
-that an edit that was made on a preview holds for the photograph. Imports no torch until it is applied.
+Omitted entries have the defaults of the command of that name. Coordinates of strokes are relative to the picture, so
+that an edit made on a preview applies to the photograph. Does not import torch until a recipe is applied.
 """
 
 from collections.abc import Iterable
@@ -26,37 +26,37 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 VERSION = 1
-ORDER = tuple(EDITS)  # in which the editor adds steps
-FORMER_ORDER = ("detail", "colorize", "recolor", "defocus", "abstract")  # of files without a list of steps
+ORDER = tuple(EDITS)  # order in which the editor adds steps
+FORMER_ORDER = ("detail", "colorize", "recolor", "defocus", "abstract")  # order in files without a list of steps
 REMEDY = "save one in the editor"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """An edit of a photograph, step by step; without steps it changes nothing.
+    """An edit of a photograph as a sequence of steps; without steps it changes nothing.
 
     Attributes:
-        steps: each edits what the one before made; of any kind, in any order, and any number of times.
+        steps: each applied to the result of the one before; of any kind, in any order, and any number of times.
     """
 
     steps: tuple[Step, ...] = ()
 
     @property
     def acting(self) -> tuple[Step, ...]:
-        """The steps that change anything."""
+        """The steps that have an effect."""
         return tuple(step for step in self.steps if step.changes())
 
     @property
     def drawn(self) -> "Recipe":
-        """The edit without steps that change nothing and hold no strokes."""
+        """The recipe without the steps that have neither an effect nor strokes."""
         return Recipe(tuple(step for step in self.steps if step.changes() or step.strokes))
 
     def last(self, edit: str) -> Step:
-        """The last step of an edit, or one that changes nothing if there is none."""
+        """Return the last step of an edit, or one that changes nothing if there is none."""
         return next((step for step in reversed(self.steps) if step.edit == edit), Step.idle(edit))
 
     def with_last(self, step: Step) -> "Recipe":
-        """The edit with another last step of its kind; the first of its kind is put where it usually comes."""
+        """Replace the last step of the same edit, or insert the step at its usual place if there is none."""
         places = [i for i, other in enumerate(self.steps) if other.edit == step.edit]
         if places:
             return Recipe((*self.steps[: places[-1]], step, *self.steps[places[-1] + 1 :]))
@@ -66,7 +66,7 @@ class Recipe:
 
     @property
     def bytes_per_pixel(self) -> int:
-        """Memory in bytes that the hungriest step needs for each pixel of an image."""
+        """Memory in bytes per pixel of the step that needs most."""
         return max((step.bytes_per_pixel() for step in self.acting), default=0)
 
     @property
@@ -81,11 +81,11 @@ class Recipe:
             image: (1, C, H, W) in [0, 1], C = 1 or 3.
 
         Returns:
-            (1, C, H, W), with C = 3 if it was coloured; the image itself if no step changes it. Values may leave
+            (1, C, H, W), with C = 3 if a step added colour; the image itself if no step has an effect. Values may leave
             [0, 1].
 
         Raises:
-            ValueError: if a step cannot do its work on such an image.
+            ValueError: if a step cannot be applied to such an image.
 
         Example:
             >>> import torch
@@ -102,7 +102,7 @@ class Recipe:
         return result
 
     def to_json(self, *, drawn: bool = False) -> str:
-        """The edit as text, without steps that change nothing; ``drawn`` adds those of them that hold strokes.
+        """Format the recipe as JSON, without steps that change nothing; ``drawn`` keeps those of them with strokes.
 
         >>> print(Recipe((Step("tone"), Step("detail", alpha=(2.0, 1.0)))).to_json())
         {
@@ -124,11 +124,11 @@ class Recipe:
 
     @staticmethod
     def from_json(text: str, name: str, remedy: str = REMEDY) -> "Recipe":
-        """Read what :meth:`to_json` wrote, or a file from before there was a list of steps.
+        """Parse the output of :meth:`to_json`, or a file in the former format without a list of steps.
 
         Raises:
-            ValueError: if ``text`` is no JSON object, or an entry is unknown or not of its kind. The message calls the
-                file ``name``, and ends in ``remedy`` where it holds something else.
+            ValueError: if ``text`` is no JSON object, or an entry is unknown or invalid. ``name`` is the file's name in
+                the message, which ends in ``remedy`` if the file is no recipe at all.
         """
         entries = parse_json(text, name, remedy)
         if isinstance(entries, dict) and "alpha" in entries:
@@ -144,14 +144,14 @@ class Recipe:
 
 
 def in_file(steps: Iterable[str]) -> str:
-    """The text of a file of steps that are text already."""
+    """Combine steps that are formatted already into the text of a file."""
     text = ",\n".join(steps)
     listed = f"[\n{text}\n  ]" if text else "[]"
     return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
 
 
 def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
-    """The steps of a file."""
+    """Parse the steps of a file."""
     unknown = entries.keys() - {"version", "steps"}
     if unknown:
         raise ValueError(f"{name} must hold no other entries than version, steps, got {min(unknown)}; remove it")

@@ -1,4 +1,4 @@
-"""Strokes of colour that reach everything of the same colour. Paper: Sec. V-A, Figs. 14, 15."""
+"""Recolouring of objects by strokes of colour. Paper: Sec. V-A, Figs. 14, 15."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,8 +16,8 @@ from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.source import Fitted, Source, edited
 
 TINY = 1e-12  # keeps the derivative of a root finite
-DOUBTFUL = 0.1  # masks nearer to 0 or 1 count as these: a faint tint far away is seen, an edge less soft is not
-SATURATION = 0.05  # chroma below this is grey: it has no texture of its own to keep
+DOUBTFUL = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
+SATURATION = 0.05  # chroma below this counts as grey, without variations to keep
 
 
 @full_precision
@@ -33,27 +33,27 @@ def recolor(
     patch_size: int = RECOLOR.defaults["patch_size"],
     **options: Any,
 ) -> Tensor:
-    """Give the colour of strokes to the thing that they are painted on, and to what looks like it around it.
+    """Recolour the objects that strokes are painted on, and similar pixels around them.
 
-    Paper: Sec. V-A, with :func:`region_mask` in place of k-means: any number of colours divide the image among them.
+    Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
-        strokes: (B, 3, H, W), RGB; their hue and saturation count, their lightness does not. Strokes of up to 16
-            colours are told apart and reach their own likes.
+        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used. Up to 16 colours are distinguished, each
+            with its own region.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
-        keep: (B, 1, H, W) in [0, 1], above 0 on spots whose likes are to stay as they are; None is none. Strokes paint
-            over it.
-        reach: in [0, 1), how likely a walk over similar pixels goes on after each step; larger takes in what is less
-            alike.
+        keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
+            ones. Strokes take precedence over it.
+        reach: in [0, 1), probability that a walk over similar pixels continues after each step; larger includes less
+            similar pixels.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 1.2 of the short side, ``math.inf`` no limit.
-        patch_size: of the patches that are compared.
-        **options: further ones of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
+        patch_size: width of the compared patches.
+        **options: further options of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
 
     Returns:
-        (B, 3, H, W), of the luminance of ``image``, and equal to it where a pixel resembles no stroke. Differentiable
-        in image, strokes, mask and parameters, with the grouping of colours held.
+        (B, 3, H, W), with the luminance of ``image``, and equal to it where a pixel is similar to no stroke.
+        Differentiable in image, strokes, mask and parameters, at a fixed grouping of the colours.
 
     Raises:
         TypeError, ValueError: if a tensor has another size, a mask leaves [0, 1], or nothing is painted.
@@ -119,7 +119,7 @@ def fit_recolor(
 
 
 def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
-    """The chroma (B, K, 3) of scribbles, their regions (B, K, n), and which of these an image has, (B, K)."""
+    """Return the chroma (B, K, 3) of scribbles, their regions (B, K, n), and which of them are valid, (B, K)."""
     assert scribbles.colours is not None  # for mypy
     chroma = split_luminance(scribbles.colours.unsqueeze(2))[1]
     regions, colours, counts = group_colours(chroma, scribbles.weights.unsqueeze(2))
@@ -128,15 +128,15 @@ def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Recoloring:
-    """What scribbles of K colours make of an image, given the masks of what they are to colour.
+    """Recolouring of an image by scribbles of K colours, given the masks of the regions.
 
-    A pixel on a soft border shows some of the thing and some of what is behind it. The part that is of the thing takes
-    the new colour, so that no rim of the old one is left.
+    A pixel on a soft border is a mixture of the object and its background. Only the object's part takes the new colour,
+    so that no rim of the old colour is left.
 
     Attributes:
         colours: chroma of the strokes, (B, K, 3).
-        old: mean chroma of what they are painted on, (B, K, 3).
-        counts: which of these an image has, (B, K).
+        old: mean chroma of the image under the strokes, (B, K, 3).
+        counts: which of the K colours each image has, (B, K).
     """
 
     colours: Tensor
@@ -144,23 +144,22 @@ class Recoloring:
     counts: Tensor
 
     def shares(self, masks: Tensor) -> Tensor:
-        """How much of a pixel takes each colour, (B, K, H, W), under masks likewise."""
+        """Return the fraction of each pixel that takes each colour, (B, K, H, W), from masks (B, K, H, W)."""
         certain = ((masks - DOUBTFUL) / (1 - 2 * DOUBTFUL)).clamp(0.0, 1.0)
         shares = certain * self.counts[..., None, None]
         return shares / shares.sum(1, keepdim=True).clamp(min=1.0)
 
     def __call__(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
-        """Pixels (B, 3, H, W) in their new colours, under masks (B, K, H, W), with the colours beside each of these."""
+        """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders."""
         shares = self.shares(masks)
         luminance, chroma = split_luminance(pixels)
         change, total = torch.zeros_like(chroma), torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
             sides = beside[k]
             share = sides.refine(chroma, shares[:, k : k + 1])
-            # Its part of a mixed pixel; all of one inside.
+            # Chroma of the object's part of a mixed pixel; inside the object, that of the pixel.
             thing = chroma + sides.known * (1 - share) * (sides.inside - sides.outside)
-            # A highlight on red enamel is white, and stays so on blue: the new colour takes the old one's relative
-            # saturation.
+            # The new colour takes the relative saturation of the old one, so that a white highlight stays white.
             usual = self.old[:, k].square().sum(1)[:, None, None, None]  # squared saturation
             product = (usual * thing.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
             relative = (product + SATURATION**2) / (usual + SATURATION**2)

@@ -1,4 +1,4 @@
-"""Pictures in another size, a few rows at a time."""
+"""Resizing of pictures, a few rows at a time."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-Read = Callable[[int, int], Tensor]  # the rows (B, C, n, W) of a picture from one number to another
-BLOCK = 64  # rows that are resized at once
+Read = Callable[[int, int], Tensor]  # returns the rows (B, C, n, W) of a picture from start to stop
+BLOCK = 64  # rows resized at once
 
 
 def resized(
@@ -19,14 +19,14 @@ def resized(
     rows: range | None = None,
     columns: range | None = None,
 ) -> Tensor:
-    """Some rows of a picture in another size, by bicubic interpolation with antialiasing.
+    """Resize a picture, or compute a part of the resized picture, by bicubic interpolation with antialiasing.
 
     Args:
-        read: its rows.
+        read: returns rows of the picture.
         size: (H, W) of the picture.
-        wanted: (H, W) it is to have.
-        rows: of the result, all by default.
-        columns: likewise.
+        wanted: (H, W) of the resized picture.
+        rows: rows of the result, all by default.
+        columns: columns of the result, all by default.
     """
     return torch.cat([part() for part in resized_parts(read, size, wanted, rows, columns)], dim=2)
 
@@ -38,7 +38,7 @@ def resized_parts(
     rows: range | None = None,
     columns: range | None = None,
 ) -> Iterator[Callable[[], Tensor]]:
-    """The rows of :func:`resized`, a few at a time: they are read here, and resized when the part is called."""
+    """Yield parts of :func:`resized`, a few rows each: rows are read here, and resized when the part is called."""
     rows = range(wanted[0]) if rows is None else rows
     across = None if columns is None else interpolation(columns, size[1], wanted[1])
     for start in range(rows.start, rows.stop, BLOCK):
@@ -47,7 +47,7 @@ def resized_parts(
 
 
 def _part(planes: Tensor, weights: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
-    """Some rows, from those of the picture that they depend on, and their weights."""
+    """Interpolate rows from the rows of the picture that they depend on, and weights."""
     if across is None:
         planes = F.interpolate(planes, (planes.shape[2], width), mode="bicubic", antialias=True)
     else:
@@ -57,15 +57,15 @@ def _part(planes: Tensor, weights: Tensor, across: tuple[slice, Tensor] | None, 
 
 @lru_cache(maxsize=8)  # strips of one picture have the same columns
 def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tensor]:
-    """The part of an axis that some places of its other size depend on, and their weights (places, part) in float64.
+    """Return the part of an axis that positions of the resized axis depend on, and weights (places, part) in float64.
 
     Args:
-        places: on the axis in its other size.
-        length: of the axis.
-        wanted: its other size.
+        places: positions on the resized axis.
+        length: length of the axis.
+        wanted: length of the resized axis.
     """
     scale = length / wanted
-    reach = 2 * max(scale, 1.0)  # of the kernel
+    reach = 2 * max(scale, 1.0)  # radius of the kernel
     first = max(0, math.floor((places.start + 0.5) * scale - reach))
     last = min(length, math.ceil((places.stop - 0.5) * scale + reach))
     centres = (torch.arange(places.start, places.stop, dtype=torch.float64) + 0.5) * scale - 0.5
@@ -74,25 +74,25 @@ def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tenso
 
 
 def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:
-    """Planes (B, C, H, W) in another size, see :func:`resized`."""
+    """Resize planes (B, C, H, W), see :func:`resized`."""
     return resized(lambda start, stop: planes[:, :, start:stop], (planes.shape[-2], planes.shape[-1]), size)
 
 
 def cubic(distance: Tensor) -> Tensor:
-    """Keys' interpolation kernel with a = -1/2."""
+    """Evaluate Keys' interpolation kernel with a = -1/2."""
     t = distance.abs()
     near, far = (1.5 * t - 2.5) * t * t + 1, ((-0.5 * t + 2.5) * t - 4) * t + 2
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
 
 
 def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """A part (B, C, h, w) of a picture from values (B, C, n, m) of its blocks, between whose middles they are linear.
+    """Interpolate a part (B, C, h, w) of a picture bilinearly between the centres of blocks (B, C, n, m).
 
     Args:
-        blocks: as of :func:`nlfilter_torch.edits.source.block_means`.
-        step: rows and columns of a block.
-        corner: row and column of its first pixel.
-        size: (h, w).
+        blocks: values of blocks as those of :func:`nlfilter_torch.edits.source.block_means`.
+        step: side of a block in pixels.
+        corner: row and column of the first pixel of the part.
+        size: (h, w) of the part.
     """
     if step != round(step):
         across = (_between(first, n, step, m) for first, n, m in zip(corner, size, blocks.shape[-2:], strict=True))
@@ -108,7 +108,7 @@ def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[i
 
 
 def _between(first: int, count: int, step: float, blocks: int) -> Tensor:
-    """Weights (count, blocks) of the blocks of an axis for pixels from a first one on."""
+    """Weights (count, blocks) of the blocks along an axis for ``count`` pixels from ``first`` on."""
     position = ((torch.arange(first, first + count, dtype=torch.float64) + 0.5) / step - 0.5).clamp(0, blocks - 1)
     distance = (position.unsqueeze(1) - torch.arange(blocks, dtype=torch.float64)).abs()
     return (1 - distance).clamp(min=0.0)

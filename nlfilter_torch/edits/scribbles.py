@@ -1,6 +1,6 @@
-"""Strokes of a brush as lines with a width, kept as shares of the picture, and the pixels that they cover.
+"""Brush strokes as lines with a width, and their rasterisation.
 
-A preview and the photograph it stands for are thus painted alike.
+Coordinates are relative to the picture, so that strokes cover the same part of a preview and of the photograph.
 """
 
 import re
@@ -16,7 +16,7 @@ from torch import Tensor
 from nlfilter_torch.edits.declaration import is_within, shown
 
 COLOUR = re.compile(r"#[0-9a-f]{6}")
-SMALLEST = 0.75  # pixels; the least radius, at which a dot still covers a pixel
+SMALLEST = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Stroke:
     """A line drawn with a round brush.
 
     Attributes:
-        points: (x, y) as shares of the picture's width and height, at least one.
-        radius: of the brush, as a share of the picture's short side.
-        paint: what the stroke says: a colour ``#rrggbb``, or a word of the edit that it belongs to.
+        points: at least one (x, y), as shares of the picture's width and height.
+        radius: radius of the brush, as a share of the picture's short side.
+        paint: meaning of the stroke: a colour ``#rrggbb``, or a word that the edit declares.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -34,15 +34,15 @@ class Stroke:
     paint: str
 
     def entries(self) -> dict[str, Any]:
-        """The stroke as JSON has it."""
+        """Return the stroke as a JSON object."""
         return {"paint": self.paint, "radius": self.radius, "points": [list(point) for point in self.points]}
 
     @staticmethod
     def from_entries(value: Any, words: tuple[str, ...], place: str) -> "Stroke":
-        """The stroke that a value of JSON is; the word ``colour`` allows any colour, others stand in place of one.
+        """Create a stroke from a JSON value; ``words`` are the allowed paints, of which ``colour`` allows any colour.
 
         Raises:
-            ValueError: if ``value`` is no stroke; the message says that it is in ``place``.
+            ValueError: if ``value`` is no stroke; ``place`` says in the message where it was found.
         """
         if not isinstance(value, dict) or set(value) != {"points", "radius", "paint"}:
             raise ValueError(f"{place} must hold strokes with points, radius and paint, got {shown(value)}; correct it")
@@ -67,7 +67,7 @@ def _is_point(value: Any) -> bool:
 
 
 def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
-    """The pixels that a stroke covers, (H, W) bool; or (h, W), those of some rows of a picture of that size.
+    """Rasterise a stroke: the pixels that it covers, (H, W) bool, or (h, W) for ``rows`` of a picture of that size.
 
     >>> cover(Stroke(((0.5, 0.5),), 0.1, "in"), (5, 5)).int()
     tensor([[0, 0, 0, 0, 0],
@@ -80,7 +80,7 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
     radius = max(stroke.radius * min(size), SMALLEST)
     first = 0 if rows is None else rows.start
     covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
-    # Coordinates in which the centre of the first pixel is 0.
+    # The origin is the centre of the first pixel.
     points = [(x * width - 0.5, y * height - 0.5) for x, y in stroke.points]
     for (x0, y0), (x1, y1) in pairwise(points if len(points) > 1 else points * 2):
         top, bottom = _span(y0, y1, radius, first, first + len(covered))
@@ -97,12 +97,12 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
 
 
 def _span(a: float, b: float, radius: float, first: int, last: int) -> tuple[int, int]:
-    """Where a line from a to b may cover pixels from ``first`` to before ``last``."""
+    """Range of the pixels in [first, last) that a line from a to b may cover."""
     return max(first, int(min(a, b) - radius)), min(last, int(max(a, b) + radius) + 2)
 
 
 def mask_of(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> Tensor:
-    """All pixels that strokes cover, (1, 1, H, W) float32 of zeros and ones; of ``rows`` as :func:`cover`."""
+    """Rasterise strokes to a mask (1, 1, H, W), float32, of zeros and ones; ``rows`` as in :func:`cover`."""
     covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
     for stroke in strokes:
         covered |= cover(stroke, size, rows)
@@ -110,7 +110,7 @@ def mask_of(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None
 
 
 def paint(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> tuple[Tensor, Tensor]:
-    """Colours (1, 3, H, W) and mask (1, 1, H, W) of strokes of colour; later ones cover earlier ones."""
+    """Rasterise strokes to colours (1, 3, H, W) and a mask (1, 1, H, W); later strokes cover earlier ones."""
     shape = _shape(size, rows)
     colours, painted = torch.zeros(3, *shape), torch.zeros(shape, dtype=torch.bool)
     for stroke in strokes:
@@ -125,7 +125,7 @@ def _shape(size: tuple[int, int], rows: slice | None) -> tuple[int, int]:
 
 
 def colour_of(paint: str) -> Tensor:
-    """RGB (3,) in [0, 1] of ``#rrggbb``.
+    """Parse ``#rrggbb`` to RGB (3,) in [0, 1].
 
     >>> colour_of("#ff0033")
     tensor([1.0000, 0.0000, 0.2000])
@@ -134,7 +134,7 @@ def colour_of(paint: str) -> Tensor:
 
 
 def thin(points: Iterable[tuple[float, float]], spacing: float) -> tuple[tuple[float, float], ...]:
-    """Points without those that lie closer than ``spacing`` to the one kept before; the last is always kept.
+    """Drop points that are closer than ``spacing`` to the previous point kept; the last is always kept.
 
     >>> thin([(0.0, 0.0), (0.01, 0.0), (0.1, 0.0), (0.11, 0.0)], 0.05)
     ((0.0, 0.0), (0.1, 0.0), (0.11, 0.0))

@@ -1,4 +1,4 @@
-"""Parameters that several edits share, and functions that declare parameters of a kind."""
+"""Parameters shared by several edits, and functions that declare common kinds of parameters."""
 
 from typing import Any
 
@@ -20,17 +20,17 @@ FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landm
 
 
 def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
-    """A factor."""
+    """Declare a factor."""
     return Parameter(name, "number", default, help, *GAINS, "gain", domain="finite", **more)
 
 
 def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
-    """A list of numbers."""
+    """Declare a list of numbers."""
     return Parameter(name, "sliders", default, help, *GAINS, unit, **more)
 
 
 def choice(name: str, choices: tuple[str, ...], help: str) -> Parameter:
-    """One of some words, the first by default."""
+    """Declare a choice among words, the first by default."""
     return Parameter(name, "choice", choices[0], help, domain="choice", choices=choices)
 
 
@@ -43,7 +43,7 @@ def filter_parameters(
     auto: bool = False,
     far: bool = False,
 ) -> tuple[Parameter, ...]:
-    """Parameters of the filter of an edit, with its defaults; ``far`` if distance may also not count at all."""
+    """Declare the filter parameters of an edit, with its defaults; ``far`` allows ``"none"`` as spatial bandwidth."""
     levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) touch fine texture only, large ones (40) treat "
     photometric = Parameter(
         "bandwidth",
@@ -102,15 +102,15 @@ def filter_parameters(
     )
 
 
-#: Of all edits of brightness that tell shading from detail.
+#: Filter parameters of the edits of brightness that separate shading from detail.
 WITHOUT_SHADING = filter_parameters(bandwidth=LEVELS, share=NEAR, landmarks=LANDMARKS, auto=True, far=True)
-#: Of all edits of brightness.
+#: For all edits of brightness.
 LIMITS = choice(
     "limits",
     ("soft", "none"),
     "How far pixels may get brighter or darker: `soft` keeps what highlights and shadows show, `none` lets them clip.",
 )
-#: Likewise.
+#: For all edits of brightness.
 VIEWING_SIZE = Parameter(
     "viewing_size",
     "number",
@@ -123,7 +123,7 @@ VIEWING_SIZE = Parameter(
     zero="0 is the size of the image",
     metavar="MEGAPIXELS",
 )
-#: Of all edits that find a thing.
+#: For all edits that select objects.
 TOLERANCE = Parameter(
     "tolerance",
     "number",
@@ -134,7 +134,7 @@ TOLERANCE = Parameter(
     "lab",
     argument="photometric_bandwidth",
 )
-#: Of all edits that find regions.
+#: For all edits that select regions.
 REACH = Parameter(
     "reach",
     "number",
@@ -149,5 +149,5 @@ REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 
 
 def reach_of_time(time: float) -> float:
-    """The reach of a region for the diffusion time that files had in its place: 0.6 for 1, the default of both."""
+    """Convert a diffusion time, as in files of former versions, to a reach; the defaults, 1 and 0.6, correspond."""
     return time / (time + 2 / 3) if time > 0 else time

@@ -1,4 +1,4 @@
-"""Sharper edges without more noise: the middle sliders of a filter that compares softened patches. Paper: Fig. 6."""
+"""Sharpening with little noise gain: the middle sliders of a filter with a blurred guide. Paper: Fig. 6."""
 
 from functools import partial
 from typing import Any
@@ -28,21 +28,22 @@ def sharpen(
 ) -> Tensor:
     """Sharpen a photograph, noisy or not.
 
-    The finest layer, which holds the noise, and the smooth one stay; the two between are raised. Noise in the guide
-    would link pixels by their noise, and what it links would be sharpened, so the guide is blurred first: at equal gain
-    on strong edges that halves the noise gain of unsharp masking (``python -m benchmarks.sharpening``).
+    The finest layer, which contains the noise, and the smooth one stay unchanged; the two between are amplified. With
+    noise in the guide, pixels would be similar by their noise, and the noise would be sharpened, so the guide is
+    blurred first: at equal gain on strong edges, the noise gain is half that of unsharp masking
+    (``python -m benchmarks.sharpening``).
 
     Args:
         image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
         amount: sliders alpha_2 and alpha_3, a number or a tensor of shape () or (B,); 1 changes nothing, 4 is visible,
             8 is strong.
         guide_blur: standard deviation in pixels of the blur of the guide, at most half the short side, 0 for none.
-        limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
+        limits: ``"soft"`` keeps detail in highlights and shadows, ``"none"`` adds the change as it is and lets them
             clip.
-        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
-            bandwidths are in pixels of that; 0 is the size of the image.
+        viewing_size: in megapixels; larger images are edited like their reduction to this size, with patches and
+            bandwidths in its pixels; 0 is the size of the image.
         photometric_bandwidth: h_y of the blurred guide.
-        **options: further ones of :func:`nonlocal_operator`.
+        **options: further options of :func:`nonlocal_operator`.
 
     Returns:
         (B, C, H, W); values may leave [0, 1]. Differentiable in image and amount.
@@ -83,10 +84,10 @@ def fit_sharpen(
     SHARPEN["guide_blur"].check_argument(guide_blur)
     SHARPEN["limits"].check_argument(limits)
     SHARPEN["viewing_size"].check_argument(viewing_size)
-    grey = partial(reduce_channels, guide_channels="luminance")  # one channel to blur in place of three
+    grey = partial(reduce_channels, guide_channels="luminance")  # blurs one channel instead of three
     middle = torch.as_tensor(amount, dtype=torch.float32).reshape(-1).expand(source.batch)
     still = torch.zeros_like(middle)
-    sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, which gives the change
+    sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, so that the filter gives the change
 
     def change(viewed: Source) -> Fitted:
         check_reach(guide_blur, "guide_blur", viewed.size)

@@ -1,8 +1,8 @@
-"""Where an edit finds the pixels of a picture, so that every edit is written once.
+"""Access of edits to the pixels of a picture, so that every edit is written once.
 
-An edit consists of what it learns from the whole picture, by sums over all pixels, and of what it does to some of the
-pixels once these sums are known. A :class:`Source` has the sums: here of an image in memory, with gradients and for a
-batch; in :mod:`nlfilter_torch.tiled.source` of a picture that is read a few rows at a time.
+An edit has two parts: statistics of the whole picture (sums over all pixels), and a function of some of the pixels
+given these statistics. A :class:`Source` computes the sums: here for an image or a batch in memory, with gradients; in
+:mod:`nlfilter_torch.tiled.source` for a picture that is read a few rows at a time.
 """
 
 import math
@@ -30,25 +30,25 @@ from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum, compute_grams
 
-SAMPLE = 1 << 15  # pixels whose sums stand for those of all, where an edit allows it
+SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, where an edit allows it
 
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
 
 @dataclass(frozen=True)
 class Guide:
-    """What the filter of an edit compares.
+    """The guide image of an edit's filter, and the options of the filter.
 
     Attributes:
         options: of :func:`nonlocal_operator`.
-        look: makes the guide from an image (B, C, H, W); None takes the image.
-        reach: how many pixels around a pixel ``look`` depends on.
-        planes: channels of the guide; None is as many as the image has.
-        blur: standard deviation in pixels of a Gaussian that the guide is blurred by.
-        spectral: whether the edit takes sums along eigenvectors.
-        sampled: whether a sample of the pixels may stand for all in these sums, as far as memory does not allow all.
-        exact: whether it takes what eigenvectors capture of single pixels, which depends on rare pixels that a sample
-            lacks.
+        look: function that computes the guide from an image (B, C, H, W); None uses the image itself.
+        reach: radius in pixels of the neighbourhood that ``look`` depends on.
+        planes: number of channels of the guide; None is that of the image.
+        blur: standard deviation in pixels of the Gaussian blur of the guide.
+        spectral: whether the edit uses the spectrum.
+        sampled: whether the spectrum may be estimated from a sample of the pixels.
+        exact: whether the edit needs what the eigenvectors capture at single pixels, which depends on rare pixels that
+            a sample lacks.
     """
 
     options: Mapping[str, Any]
@@ -62,16 +62,16 @@ class Guide:
 
     @property
     def margin(self) -> int:
-        """How many pixels around a pixel its value depends on."""
+        """Radius in pixels of the neighbourhood that the guide at a pixel depends on."""
         return self.reach + self.blur_margin
 
     @property
     def blur_margin(self) -> int:
-        """The same for the blur alone."""
+        """Margin needed by the blur alone, in pixels."""
         return blur_margin(self.blur)
 
     def __call__(self, image: Tensor) -> Tensor:
-        """The guide of an image (B, C, H, W) of any size."""
+        """Compute the guide of an image (B, C, H, W) of any size."""
         guide = image if self.look is None else self.look(image)
         if self.blur_margin == 0:
             return guide
@@ -83,22 +83,22 @@ class Operator(Protocol):
 
     @property
     def pairs(self) -> RitzPairs:
-        """Its spectrum, without pixels."""
+        """Spectrum of W, without the values of the eigenvectors at pixels."""
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
-        """The planes that a function (B, C, n) of columns gives."""
+        """Apply a function, which returns (B, C, n), to the columns of the pixels."""
 
     def layers(self, planes: Planes, order: int) -> Planes:
-        """Detail layers (B, k+1, C, h, W) of some planes of the picture."""
+        """Detail layers (B, k+1, C, h, W) of planes of the picture."""
 
     def coefficients(self, planes: Planes) -> Tensor:
-        """``F y``, (B, C, M), of some planes y of the picture."""
+        """``F y``, (B, C, M), for planes y of the picture."""
 
     def mean(self, planes: Planes) -> Tensor:
-        """Means (B, C) over the picture."""
+        """Means (B, C) of planes over the picture."""
 
     def at(self, places: Tensor) -> Blocks:
-        """The columns of single pixels, numbered along the rows in ascending order."""
+        """Columns of the factor at single pixels, given by ascending row-major indices."""
 
 
 class Source(Protocol):
@@ -110,85 +110,85 @@ class Source(Protocol):
 
     @property
     def batch(self) -> int:
-        """Images at once."""
+        """Number of images."""
 
     @property
     def channels(self) -> int:
-        """Of the picture."""
+        """Number of channels of the picture."""
 
     @property
     def dtype(self) -> torch.dtype:
-        """In which it is computed, float32 or float64."""
+        """Precision of the computation, float32 or float64."""
 
     @property
     def whole(self) -> bool:
-        """Whether all pixels are at hand at once."""
+        """Whether all pixels are in memory."""
 
     @property
     def stride(self) -> float:
-        """Every how many pixels of a photograph, each way, it has one; 1 but for previews."""
+        """Sampling step relative to the photograph, in pixels along each axis; 1 except for previews."""
 
     def operator(self, guide: Guide) -> Operator:
-        """The filter of the picture."""
+        """Build the filter of the picture."""
 
     def scribbles(self, mask: Any, colours: Any, name: str, *, needed: bool = True) -> Scribbles:
-        """Scribbles, in whatever form the source has these; ``name`` is that of the mask in errors.
+        """Read scribbles in the form that this source takes; ``name`` is the name of the mask in errors.
 
         Raises:
             ValueError: if they do not fit the picture, or are ``needed`` and cover no pixel.
         """
 
     def resized(self, size: tuple[int, int]) -> "Source":
-        """The picture in a smaller size (H, W)."""
+        """Reduce the picture to a smaller size (H, W)."""
 
     def resized_weights(self, weights: Any, size: tuple[int, int], name: str) -> Any:
-        """Weights (B, K, H, W) of its pixels, in whatever form the source has these, in a smaller size (H, W).
+        """Reduce weights (B, K, H, W) of the pixels, in the form that this source takes, to a smaller size (H, W).
 
         Raises:
-            ValueError: if they do not fit the picture; ``name`` is theirs in errors.
+            ValueError: if they do not fit the picture; ``name`` is their name in the message.
         """
 
     def all(self, fitted: "Fitted") -> Tensor:
-        """The planes (B, C, H, W) that an edit makes of all pixels, for pictures that are small enough."""
+        """Result (B, C, H, W) of an edit at all pixels, for pictures that are small enough."""
 
     def held(self, fitted: "Fitted") -> "Fitted":
-        """An edit with the planes that it makes worked out, if there is room for them."""
+        """Compute the result of an edit and keep it in memory, if there is room for it."""
 
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means (B, S, 1, 1) of the planes (B, S, h, W) that a function makes of pixels and of what an edit makes."""
+        """Means (B, S, 1, 1) of a function of the image and of an edit's result; the function returns (B, S, h, W)."""
 
     def regions(self, masks: Any, name: str) -> list[Scribbles]:
-        """Scribbles of several regions, one after the other, each as :meth:`scribbles` has them."""
+        """Read the scribbles of several regions, see :meth:`scribbles`."""
 
     def colours(self, places: Tensor) -> Tensor:
-        """The colours (B, C, n) of single pixels, numbered along the rows in ascending order."""
+        """Colours (B, C, n) of single pixels, given by ascending row-major indices."""
 
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
     def reduced(self, planes: Planes, step: int) -> Tensor:
-        """Means (B, C, H / step, W / step), rounded up, over blocks of ``step`` pixels in both directions."""
+        """Means (B, C, H / step, W / step), sizes rounded up, over blocks of ``step`` x ``step`` pixels."""
 
     def blocks(self, step: float, floats: int) -> "InMemory":
-        """The picture reduced by means over blocks of ``step`` pixels in both directions, in memory.
+        """Reduce the picture, in memory, to means over blocks of ``step`` x ``step`` pixels.
 
-        The step is an integer, but for previews.
+        The step is an integer except for previews.
 
         Raises:
-            MemoryError: if there is no room for so many ``floats`` for each of its pixels.
+            MemoryError: if there is no room for ``floats`` numbers per pixel of the reduced picture.
         """
 
     def measured(self, function: Callable[["Source"], Tensor]) -> Tensor:
-        """What a function finds in the picture; of a frame, the mean of what it finds in the frames that count."""
+        """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""
 
 
 class InMemory:
-    """An image as a source, and all of its pixels.
+    """An image in memory, both as a source and as the set of all its pixels.
 
     Args:
         image: (B, C, H, W), float32 or float64.
-        kept: its operators by their options, if they are to be kept.
-        stride: every how many pixels of a photograph, each way, it has one.
+        kept: cache of its operators, by their options; None caches nothing.
+        stride: sampling step of the image relative to the photograph, in pixels along each axis.
     """
 
     first = 0
@@ -200,7 +200,7 @@ class InMemory:
         self.size, self.width = (size[0], size[1]), size[1]
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
-        """:func:`nonlocal_operator` of the guide."""
+        """Build, or take from the cache, :func:`nonlocal_operator` of the guide."""
         key = (
             guide.look,
             guide.blur,
@@ -214,7 +214,7 @@ class InMemory:
         return operator
 
     def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
-        """From tensors (B, 1, H, W) and (B, 3, H, W)."""
+        """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
         named = [(mask, name, 1), *([] if colours is None else [(colours, "strokes", 3)])]
         for tensor, called, channels in named:
             check_image(tensor, called, channels=channels, batch=self.batch)
@@ -235,45 +235,45 @@ class InMemory:
         return Scribbles(places, weights[:, :, places], image, shown)
 
     def resized(self, size: tuple[int, int]) -> "InMemory":
-        """The image in another size."""
+        """Resize the image."""
         if size == self.size:
             return self
         return InMemory(resize(self.image, size))
 
     def blocks(self, step: float, floats: int) -> "InMemory":
-        """The image reduced by :func:`block_means`."""
+        """Reduce the image by :func:`block_means`."""
         if step == 1:
             return self
         kept = None if self.kept is None else self.kept.setdefault(("blocks", step), {})
         return InMemory(block_means(self.image, step), kept)
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
-        """Weights in another size."""
+        """Resize weights."""
         check_same_size(weights, self.size, name, "image")
         weights = weights.to(self.image)
-        ends = weights.detach().aminmax()  # interpolation may go beyond them, but hides no weight that is invalid
+        ends = weights.detach().aminmax()  # undoes the overshoot of interpolation but leaves invalid weights invalid
         return resize(weights, size).clamp(ends.min, ends.max)
 
     def all(self, fitted: "Fitted") -> Tensor:
-        """All pixels under an edit."""
+        """Apply an edit to all pixels."""
         planes = fitted.pixels(self)
         return planes if fitted.finish is None else fitted.finish(self.image, planes)
 
     def held(self, fitted: "Fitted") -> "Fitted":
-        """With the planes of all pixels."""
+        """Compute the result of an edit and keep it in memory."""
         planes = self.all(fitted)
         return Fitted(lambda _: planes)
 
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means over all pixels."""
+        """Means of a function of the image and of the result of an edit."""
         return function(self.image, self.all(fitted)).mean((2, 3), keepdim=True)
 
     def colours(self, places: Tensor) -> Tensor:
-        """Some pixels."""
+        """Colours of single pixels."""
         return self.image.flatten(2)[:, :, places]
 
     def regions(self, masks: Tensor, name: str) -> list[Scribbles]:
-        """From a tensor (B, K, H, W)."""
+        """Read the scribbles of K regions from a tensor (B, K, H, W)."""
         check_image(masks, name, batch=self.batch)
         return [self.scribbles(mask, None, name) for mask in masks.split(1, dim=1)]
 
@@ -282,22 +282,22 @@ class InMemory:
         return planes(self).mean((2, 3), keepdim=True)
 
     def reduced(self, planes: Planes, step: int) -> Tensor:
-        """Means over blocks of all pixels."""
+        """Means over blocks of pixels."""
         return block_means(planes(self), step)
 
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
-        """What a function finds."""
+        """Apply a measurement to the image."""
         return function(self)
 
 
 @dataclass(frozen=True, eq=False)
 class InMemoryOperator:
-    """The operator of an image in memory; planes are of all its pixels and worked out at once.
+    """The operator of an image in memory; planes are computed at once, for all pixels.
 
     Attributes:
         operator: W.
         source: the image.
-        sampled: whether the spectrum may be that of a sample of the pixels.
+        sampled: whether the spectrum may be estimated from a sample of the pixels.
     """
 
     operator: NonlocalOperator
@@ -306,7 +306,7 @@ class InMemoryOperator:
 
     @cached_property
     def pairs(self) -> RitzPairs:
-        """The spectrum, without pixels if it is that of a sample."""
+        """The spectrum; estimated from a sample, it has no values at pixels."""
         count = self.operator.factor.shape[2]
         if not self.sampled or count <= SAMPLE:
             return self.operator.spectrum()
@@ -316,18 +316,18 @@ class InMemoryOperator:
         return sampled_pairs([columns], count, of.factor.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
-        """All planes."""
+        """Apply a function to the columns of all pixels."""
         found = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
         planes = found.unflatten(2, self.source.size)
         return lambda _: planes
 
     def layers(self, planes: Planes, order: int) -> Planes:
-        """:func:`detail_layers`."""
+        """Compute :func:`detail_layers`."""
         layers = detail_layers(self.operator, planes(self.source), order=order)
         return lambda _: layers
 
     def coefficients(self, planes: Planes) -> Tensor:
-        """:meth:`Spectrum.coefficients`."""
+        """Compute :meth:`Spectrum.coefficients`."""
         return cast(Spectrum, self.pairs).coefficients(planes(self.source))
 
     def mean(self, planes: Planes) -> Tensor:
@@ -335,18 +335,18 @@ class InMemoryOperator:
         return planes(self.source).mean((2, 3))
 
     def at(self, places: Tensor) -> Blocks:
-        """Some columns of the factor."""
+        """Columns of the factor at single pixels."""
         columns = self.operator.factor[:, :, places]
         return lambda: [columns]
 
 
 def sampled_places(count: int) -> Tensor:
-    """Numbers of :data:`SAMPLE` of so many pixels, ascending; the same ones in memory and in tiles."""
+    """Indices, ascending, of :data:`SAMPLE` of ``count`` pixels; the same sample in memory and in tiles."""
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
 
 
 def sampled_pairs(blocks: Iterable[Columns], count: int, dtype: torch.dtype) -> RitzPairs:
-    """The spectrum of an operator of ``count`` pixels from the columns at :func:`sampled_places`, block by block."""
+    """Estimate the spectrum of an operator of ``count`` pixels from blocks of the columns at :func:`sampled_places`."""
     grams: Tensor | float = 0.0
     for block in blocks:
         factor, scaling, remainder = (part.double() for part in (block.factor, block.scaling, block.remainder))
@@ -355,15 +355,15 @@ def sampled_pairs(blocks: Iterable[Columns], count: int, dtype: torch.dtype) -> 
 
 
 def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:
-    """``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
+    """Compute ``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
     total = coefficients @ operator.pairs.gain(response).mT
     return operator.each(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
 
 
 def block_means(planes: Tensor, step: float) -> Tensor:
-    """Means over blocks of ``step`` pixels in both directions, those at the lower and right borders smaller.
+    """Means over blocks of ``step`` x ``step`` pixels; blocks at the lower and right borders may be smaller.
 
-    Of a fractional step, pixels count by the share of them that is in the block.
+    With a fractional step, a pixel on the border of two blocks counts in both, weighted by the part in each.
     """
     if step == round(step):
         step = round(step)
@@ -373,8 +373,8 @@ def block_means(planes: Tensor, step: float) -> Tensor:
 
 
 def _shares(length: int, step: float) -> Tensor:
-    """Weights (n, length) of the pixels of an axis in blocks of a fractional step."""
-    count = math.ceil(length / step - 0.01)  # no sliver at the end
+    """Weights (n, length) of the pixels along an axis in n blocks of a fractional step."""
+    count = math.ceil(length / step - 0.01)  # avoids a very thin last block
     ends = torch.arange(count + 1, dtype=torch.float64) * step
     ends[-1] = length
     first = torch.arange(length, dtype=torch.float64)
@@ -384,16 +384,17 @@ def _shares(length: int, step: float) -> Tensor:
 
 
 def luminance(pixels: Pixels) -> Tensor:
-    """The luminance of pixels in colour; pixels of another number of channels as they are."""
+    """Luminance of RGB pixels; pixels with another number of channels are returned unchanged."""
     return reduce_channels(pixels.image, "luminance")
 
 
 def polynomial(
     operator: Operator, planes: Planes, order: int, residual: float | Tensor | None
 ) -> Callable[..., Tensor]:
-    """:func:`polynomial_filter` of some planes of a picture, of any of its pixels and for any sliders.
+    """Prepare :func:`polynomial_filter` of planes of a picture.
 
-    The weight of the residual may follow these, in place of the filter's.
+    Returns:
+        A function of pixels, sliders and, optionally, a weight of the residual that replaces ``residual``.
     """
     layers = operator.layers(planes, order)
     if residual is None:
@@ -410,6 +411,6 @@ def polynomial(
 
 
 def edited(image: Tensor, fit: Callable[..., Fitted], *arguments: Any, **options: Any) -> Tensor:
-    """An image in memory under an edit, in its own dtype."""
+    """Fit an edit to an image in memory and apply it; the result has the image's dtype."""
     source = InMemory(image.to(working_dtype(image)))
     return source.all(fit(source, *arguments, **options)).to(image.dtype)

@@ -1,7 +1,7 @@
-"""A step of a whole edit: the name of an edit, its parameters and strokes, all of them relative to the picture.
+"""A step of a recipe: the name of an edit, its parameters and strokes, all of them relative to the picture.
 
-It is a value: nothing in it depends on the photograph, so that one that was made on a preview holds for the original.
-Imports no torch.
+A step is an immutable value that does not depend on the photograph, so that one made on a preview also applies to the
+original. Does not import torch.
 """
 
 import json
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.edits.scribbles import Stroke
 
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
-# Files written before there was a list of steps left out what changes nothing.
+# Defaults in files of the format without a list of steps, which left out values that change nothing.
 BEFORE: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
 
 
@@ -26,9 +26,9 @@ class Step:
     """One step of an edit.
 
     Attributes:
-        edit: its name, one of :data:`~nlfilter_torch.edits.parameters.EDITS`.
-        strokes: what is painted for it.
-        values: of the parameters that differ from their defaults, in the order of their declaration.
+        edit: name of the edit, one of :data:`~nlfilter_torch.edits.parameters.EDITS`.
+        strokes: strokes painted for it.
+        values: names and values of the parameters that differ from their defaults, in the order of declaration.
 
     Example:
         >>> Step("abstract", edges=1.0)["power"], Step("abstract", power=0.1).values
@@ -40,7 +40,7 @@ class Step:
     values: tuple[tuple[str, Any], ...]
 
     def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Any) -> None:
-        """Parameters that are left out have their defaults."""
+        """Create a step; omitted parameters have their defaults."""
         declared = EDITS[edit]
         unknown = values.keys() - {parameter.name for parameter in declared}
         if unknown:
@@ -51,41 +51,41 @@ class Step:
 
     @staticmethod
     def idle(edit: str) -> "Step":
-        """The step that changes nothing, from which the editor starts."""
+        """Return the step that changes nothing, from which the editor starts."""
         values: dict[str, Any] = {
             p.name: NONE if p.kind == "sliders" and p.idle == 1 else p.idle for p in EDITS[edit] if p.idle is not ...
         }
         return Step(edit, **values)
 
     def __getitem__(self, name: str) -> Any:
-        """The value of a parameter."""
+        """Return the value of a parameter."""
         return dict(self.values).get(name, EDITS[self.edit][name].default)
 
     def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Any) -> "Step":
-        """The step with other strokes or parameters."""
+        """Return a copy with other strokes or parameters."""
         return Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
 
     @property
     def declared(self) -> Edit:
-        """What the edit is."""
+        """Declaration of the edit."""
         return EDITS[self.edit]
 
     def painted(self, word: str) -> tuple["Stroke", ...]:
-        """Its strokes that say a word; for ``colour``, those that are a colour."""
+        """Return the strokes whose paint is the given word; for ``colour``, those with any colour."""
         return tuple(s for s in self.strokes if s.paint == word or (word == "colour" and s.paint.startswith("#")))
 
     @property
     def sliders_inside(self) -> tuple[float, ...]:
-        """Sliders inside the region, as many as outside."""
+        """Sliders inside the region; by default 1 for each layer."""
         inside: tuple[float, ...] | None = self["inside"]
         return inside or (1.0,) * len(self["alpha"])
 
     def has_region(self) -> bool:
-        """Whether detail has sliders of their own somewhere."""
+        """Whether this is a detail step with a region that has sliders of its own."""
         return self.edit == "detail" and bool(self.painted("in"))
 
     def changes(self) -> bool:
-        """Whether it does anything."""
+        """Whether the step has any effect."""
         if self.declared.needs:
             return bool(self.painted(self.declared.words[0]))
         acting = [p for p in self.declared if p.idle is not ...]
@@ -94,7 +94,7 @@ class Step:
         )
 
     def bytes_per_pixel(self, *, masked: bool = False) -> int:
-        """Memory in bytes that it needs for each pixel of an image; ``masked`` if it has a region without strokes."""
+        """Memory in bytes needed per pixel of an image; ``masked`` if a region is given by other means than strokes."""
         names = {parameter.name for parameter in self.declared}
         if "method" in names and self["method"] == "network":
             return working_bytes(0, 0)  # its tiles are small
@@ -105,15 +105,15 @@ class Step:
         return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
 
     def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
-        """Arguments of the edit's function for an image of a size, see :meth:`Parameter.argument_of`."""
+        """Return the arguments of the edit's function for an image of that size; see :meth:`Parameter.argument_of`."""
         return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_option}
 
     def to_json(self, indent: str = "", *, complete: bool = False) -> str:
-        """The step as a JSON object, a line for each entry, and a line for each stroke.
+        """Format the step as a JSON object, with one line for each entry and each stroke.
 
         Args:
-            indent: of all lines.
-            complete: whether defaults are written, too, so that they can be changed by hand.
+            indent: indentation of all lines.
+            complete: whether to write defaults, too, so that they can be edited by hand.
         """
         entries = [("edit", json.dumps(self.edit))]
         for parameter in self.declared:
@@ -129,17 +129,17 @@ class Step:
 
     @staticmethod
     def from_entries(edit: str, entries: Any, place: str, *, bare: bool = False, before: bool = False) -> "Step":
-        """Check what JSON holds.
+        """Create a step from parsed JSON.
 
         Args:
-            edit: name of an edit.
-            entries: of the step.
-            place: what errors call it.
-            bare: whether the file holds nothing else; errors then name it only.
-            before: whether the file was written before there was a list of steps.
+            edit: name of the edit.
+            entries: JSON object of the step.
+            place: description of where it was found, for errors.
+            bare: whether the file holds nothing else, so that ``place`` is the file.
+            before: whether the file has the former format, without a list of steps.
 
         Raises:
-            ValueError: if an entry is unknown or not of its kind.
+            ValueError: if an entry is unknown or invalid.
         """
         if not isinstance(entries, dict):
             raise ValueError(f"{place} must hold entries in braces, got {shown(entries)}; correct it")
@@ -168,7 +168,7 @@ class Step:
 
 
 def _find(declared: Edit, entry: str) -> tuple[Parameter, float | Callable[[float], float]] | None:
-    """The parameter that an entry is, and what its value is multiplied or converted by."""
+    """Find the parameter with the name of an entry, and the factor or function that converts its value."""
     for parameter in declared:
         factors: dict[str, float | Callable[[float], float]] = {parameter.name: 1.0, **dict(parameter.former)}
         if entry in factors:

@@ -1,4 +1,4 @@
-"""Contrast and local contrast by the last two sliders, around the mean. Paper: Figs. 6(a), 7(b) to 10(b)."""
+"""Contrast and local contrast around the mean by the last two sliders. Paper: Figs. 6(a), 7(b) to 10(b)."""
 
 from typing import Any
 
@@ -27,29 +27,29 @@ def adjust_tone(
     num_landmarks: int = TONE.defaults["num_landmarks"],
     **options: Any,
 ) -> Tensor:
-    """Raise or lower the contrast of large shapes, and of the coarsest detail on them, with the mean held.
+    """Change the contrast of large shapes, and of the coarsest detail on them, without changing the mean.
 
-    Paper: eq. (12) with alpha_{k+1} = contrast and alpha_k = clarity. Since W keeps constants, the mean takes no part:
-    the paper's own form would brighten the image by alpha_{k+1}.
+    Paper: eq. (12) with alpha_{k+1} = contrast and alpha_k = clarity, applied to the image less its mean: since W
+    preserves constants, the paper's own form would multiply the mean by alpha_{k+1}.
 
     Args:
         image: (B, C, H, W); with C = 3 it is RGB, and its colours are kept.
         contrast: alpha_{k+1}, a number or a tensor of shape () or (B,); 1 changes nothing, 1.4 is strong.
-        clarity: alpha_k, likewise; bears larger values.
+        clarity: alpha_k, a number or a tensor of shape () or (B,); larger values than for ``contrast`` are usable.
         order: k, at least 1.
-        limits: ``"soft"`` keeps what highlights and shadows show, ``"none"`` adds the change as it is and lets them
-            clip, and holds the mean exactly.
-        viewing_size: in megapixels; a larger image is edited as its reduction to this size would be, and patches and
-            bandwidths are in pixels of that; 0 is the size of the image.
+        limits: ``"soft"`` keeps detail in highlights and shadows, ``"none"`` adds the change as it is, lets them clip,
+            and preserves the mean exactly.
+        viewing_size: in megapixels; larger images are edited like their reduction to this size, with patches and
+            bandwidths in its pixels; 0 is the size of the image.
         photometric_bandwidth: h_y, or ``"auto"``.
-        spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
-            apart they are.
+        spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares pixels regardless of
+            their distance.
         num_landmarks: M.
-        **options: further ones of :func:`nonlocal_operator`.
+        **options: further options of :func:`nonlocal_operator`.
 
     Returns:
-        (B, C, H, W) of the same mean in every channel; values may leave [0, 1]. Differentiable in image, contrast and
-        clarity.
+        (B, C, H, W) with unchanged mean in every channel; values may leave [0, 1]. Differentiable in image, contrast
+        and clarity.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or an option leaves its range.
@@ -100,7 +100,8 @@ def fit_tone(
         return torch.as_tensor(value).to(source.dtype).reshape(-1).expand(source.batch)
 
     fine = [torch.zeros_like(slider(1.0))] * (order - 1)
-    sliders = torch.stack([*fine, slider(clarity) - 1, slider(contrast) - 1], dim=1)  # less 1, which gives the change
+    # Less 1, so that the filter gives the change.
+    sliders = torch.stack([*fine, slider(clarity) - 1, slider(contrast) - 1], dim=1)
 
     def change(viewed: Source) -> Fitted:
         filter_options = options | {

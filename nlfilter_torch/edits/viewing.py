@@ -1,15 +1,15 @@
-"""Edits of brightness at the size at which a picture is looked at, so that sliders mean the same at any resolution.
+"""Edits of brightness at the viewing size, so that sliders have the same effect at any resolution.
 
-Patches are counted in pixels: in a photograph of 24 megapixels, one of 5x5 holds a sixteenth of what it holds in the
-same photograph at 1.5, and the sliders would move only grain that nobody sees when the whole picture is on a screen. A
-larger picture is therefore reduced to the viewing size, its change of brightness is worked out there, and enlarged. Of
-the ways to make sliders independent of resolution this one costs least: patches and factor are those of the small
-picture, whatever the size of the photograph.
+Patches have a fixed size in pixels: in a photograph of 24 megapixels, a patch of 5x5 covers a sixteenth of what it
+covers in the same photograph at 1.5 megapixels, and sliders would change only grain that is invisible when the whole
+picture fits on a screen. A larger picture is therefore reduced to the viewing size; its change of brightness is
+computed there and enlarged. Of the ways to make sliders independent of resolution this is the cheapest: patches and
+factor are those of the small picture, whatever the size of the photograph.
 
-Detail that is too fine for the viewing size is changed as the coarser detail around it: the slope of the change over
-the brightness, by regression over 5x5 pixels of the small picture, times what the small picture lacks. Texture gets as
-much stronger (or smoother) in its finest parts as in the others, and an edge, which is no detail, remains as sharp as
-it is. The average of the result over a pixel of the small picture is the small result.
+Detail too fine for the viewing size is changed like the coarser detail around it: what the small picture lacks is
+multiplied by the slope of the change over the brightness, from a regression over 5x5 pixels of the small picture. The
+finest parts of a texture are amplified (or smoothed) as much as the others; an edge, which is not detail, stays as
+sharp as it is. The average of the result over a pixel of the small picture is the small result.
 """
 
 import math
@@ -28,12 +28,12 @@ from nlfilter_torch.edits.resizing import interpolation, resized
 from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
-PASSED = 4  # pixels around one that its enlargement depends on once it is reduced again
-FAINT = (2 / 255) ** 2  # variance below which a slope over brightness is taken for 0
+PASSED = 4  # radius in pixels of the kernel that enlarging and reducing again amounts to
+FAINT = (2 / 255) ** 2  # variance of brightness below which its slope is attenuated towards 0
 
 
 def viewed_size(size: tuple[int, int], megapixels: float) -> tuple[int, int]:
-    """(H, W) of a picture reduced to so many megapixels; its own where it has no more, or for 0.
+    """Return (H, W) of a picture reduced to a number of megapixels; unchanged if it has no more, or for 0.
 
     >>> viewed_size((4000, 6000), 1.5), viewed_size((600, 800), 1.5)
     ((1000, 1500), (600, 800))
@@ -45,7 +45,7 @@ def viewed_size(size: tuple[int, int], megapixels: float) -> tuple[int, int]:
 
 
 class Reducible(Protocol):
-    """What is asked of a :class:`~nlfilter_torch.edits.source.Source`."""
+    """The part of :class:`~nlfilter_torch.edits.source.Source` that is used here."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -53,16 +53,16 @@ class Reducible(Protocol):
 
     @property
     def stride(self) -> float:
-        """Every how many pixels of a photograph, each way, it has one."""
+        """Sampling step relative to the photograph, in pixels along each axis."""
 
     def resized(self, size: tuple[int, int]) -> Any:
-        """The picture in a smaller size."""
+        """Reduce the picture to a smaller size."""
 
     def held(self, fitted: Fitted) -> Fitted:
-        """An edit with the planes that it makes worked out, if there is room for them."""
+        """Compute the result of an edit and keep it in memory, if there is room for it."""
 
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means (B, S, 1, 1) of what a function makes of the picture and of the planes of an edit."""
+        """Means (B, S, 1, 1) of a function of the image and of the result of an edit."""
 
 
 def fit_change(
@@ -74,16 +74,16 @@ def fit_change(
     *,
     brighter: float | Tensor | None = 0.0,
 ) -> Fitted:
-    """An edit of a picture from a change of its brightness at the viewing size.
+    """Fit an edit of a picture that is given by a change of its brightness at the viewing size.
 
     Args:
         source: the picture.
-        change: fitted to a source, a change (B, 1 or C, h, w) of its planes.
+        change: function that fits the change (B, 1 or C, h, w) to a source.
         planes: what is changed, luminance or all channels.
-        size: the viewing size in megapixels; 0 is that of the picture.
-        limits: of :func:`change_luminance`.
-        brighter: by what share the change is meant to raise the mean brightness, which is otherwise kept; None leaves
-            it, and chroma, to the limits.
+        size: the viewing size in megapixels; 0 is the size of the picture.
+        limits: those of :func:`change_luminance`.
+        brighter: intended relative increase of the mean brightness, by default 0; None corrects neither mean brightness
+            nor chroma.
     """
 
     def balanced(of: Any, fitted: Fitted) -> tuple[Fitted, Balance | None]:
@@ -130,10 +130,10 @@ class Coarse:
     """A change of brightness at the viewing size.
 
     Attributes:
-        planes: what is changed, its change, the slope of the change over it, and for ``soft`` limits of luminance the
-            change of saturation, (B, S, h, w).
-        count: channels of each of the first three.
-        limits: of :func:`change_luminance`.
+        planes: (B, S, h, w): the planes before the change, the change, its slope over these planes and, for ``soft``
+            limits of luminance, the change of saturation.
+        count: number of channels of each of the first three.
+        limits: those of :func:`change_luminance`.
     """
 
     planes: Tensor
@@ -142,7 +142,7 @@ class Coarse:
 
     @staticmethod
     def of(image: Tensor, before: Tensor, change: Tensor, limits: Limits, balance: Balance | None) -> "Coarse":
-        """The change of some planes of an image, as far as the limits allow it."""
+        """Limit the change of planes of an image."""
         saturation = None
         if limits == "soft":
             change, saturation = limited_change(image, change, balance)
@@ -150,7 +150,13 @@ class Coarse:
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
     def change(self, image: Tensor, planes: Tensor, found: Tensor) -> Tensor:
-        """Pixels of the picture, of which ``planes`` are changed, under the part of :attr:`planes` that they see."""
+        """Apply the change to pixels of the full-size picture.
+
+        Args:
+            image: the pixels.
+            planes: their values to change, luminance or all channels.
+            found: :attr:`planes`, interpolated at these pixels.
+        """
         blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
         moved = changed + steepness * (planes - blurred)
         if self.limits == "none":
@@ -159,14 +165,14 @@ class Coarse:
         return move_luminance(image, moved, saturation if saturation.shape[1] else None)
 
     def seen(self, image: Tensor, planes: Tensor, stride: float) -> Tensor:
-        """The picture of the viewing size under what is left of the change where it was enlarged and is reduced."""
+        """Apply the change to a preview at the viewing size as if it had been enlarged, applied and reduced again."""
         return self.change(image, planes, enlarged_and_reduced(self.planes, stride))
 
 
 def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:
-    """Planes (B, C, H, W) as they are once they were made ``stride`` times as large, and resized back.
+    """Enlarge planes (B, C, H, W) by a factor of ``stride`` and reduce them again, as one convolution.
 
-    At borders, and for a stride that is no integer, to an approximation.
+    Approximate at borders, and for a fractional stride.
     """
     kernel = _passed(stride).to(planes)
     reach = len(kernel) // 2
@@ -177,7 +183,7 @@ def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _passed(stride: float) -> Tensor:
-    """The weights (2 PASSED + 1,) of the pixels around one, along an axis, mean over the places in between."""
+    """Kernel (2 PASSED + 1,) of :func:`enlarged_and_reduced` along an axis, averaged over the phases."""
     length, places = 64, range(28, 36)
     large = round(length * stride)
     used, down = interpolation(places, large, length)
@@ -188,13 +194,13 @@ def _passed(stride: float) -> Tensor:
 
 
 def _up(used: slice, length: int, large: int) -> Tensor:
-    """Weights (n, length) of the pixels of an axis for some places of its enlargement."""
+    """Interpolation weights (n, length) of the pixels of an axis for a slice of its enlargement."""
     part, weights = interpolation(range(used.start, used.stop), length, large)
     return F.pad(weights, (part.start, length - part.stop))
 
 
 def slope(before: Tensor, change: Tensor) -> Tensor:
-    """Of a change over the planes (B, C, H, W) before it, by regression over 5x5 pixels; 0 where they are flat."""
+    """Slope of a change over the planes (B, C, H, W) before it, by regression over 5x5 pixels; 0 in flat areas."""
 
     def mean(planes: Tensor) -> Tensor:
         return F.avg_pool2d(pad_border(planes, 2), 5, 1)

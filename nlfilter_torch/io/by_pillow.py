@@ -1,4 +1,4 @@
-"""PNG, JPEG, WebP and AVIF files to channels, by Pillow, or by imagecodecs where they have more than 8 bits."""
+"""Decoding of PNG, JPEG, WebP and AVIF files by Pillow, or by imagecodecs if they have more than 8 bits."""
 
 import warnings
 from collections.abc import Callable
@@ -18,13 +18,13 @@ Pixels = NDArray[np.generic]
 def read_by_pillow(
     path: Path, deep_png: bool, check_size: Callable[[tuple[int, int]], None]
 ) -> tuple[Pixels, int, bytes | None, bytes | None]:
-    """(H, W, S) channels, orientation, profile and EXIF of a PNG, JPEG, WebP or AVIF file."""
+    """Read channels (H, W, S), orientation, profile and EXIF of a PNG, JPEG, WebP or AVIF file."""
     with tiff.decoding(path):
         try:
             with warnings.catch_warnings():
                 # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                warnings.simplefilter("ignore", UserWarning)  # about EXIF, see exif.split
+                warnings.simplefilter("ignore", UserWarning)  # warnings about EXIF, see exif.split
                 image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
         except Image.DecompressionBombError as error:
             raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
@@ -37,7 +37,7 @@ def read_by_pillow(
                 raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
             check_size(image.size)
             orientation, exif = exif_tags.split(image.getexif)
-            # Pillow would reduce 16 bits to 8, and 10 or 12.
+            # Pillow would reduce 10, 12 or 16 bits to 8.
             if deep_png:
                 channels = imagecodecs.png_decode(path.read_bytes())
             elif image.format == "AVIF" and (bits := _bits_of_avif(path)) > 8:
@@ -49,7 +49,7 @@ def read_by_pillow(
 
 
 def _bits_of_avif(path: Path) -> int:
-    """Bits of a channel, from the configuration of the codec, which is among the first boxes."""
+    """Read the bits per channel from the codec configuration, which is among the first boxes."""
     with path.open("rb") as stream:
         head = stream.read(1 << 16)
     place = head.find(b"av1C") + 6  # after the version, the profile and the level
@@ -58,7 +58,7 @@ def _bits_of_avif(path: Path) -> int:
 
 
 def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
-    """The image in one of the modes L, LA, RGB, RGBA."""
+    """Convert an image to one of the modes L, LA, RGB, RGBA."""
     transparent = "transparency" in image.info
     modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
     modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")

@@ -1,4 +1,4 @@
-"""Files of cameras and phones, which are read but not written: RAW by rawpy, HEIC by pillow-heif.
+"""Reading of camera and phone files: RAW by rawpy, HEIC by pillow-heif. They are not written.
 
 Needs the ``cli`` extra, and the extras ``raw`` and ``heic``.
 """
@@ -19,7 +19,7 @@ from nlfilter_torch.io import tiff
 Found = tuple[NDArray[np.generic], int, bytes | None, bytes | None]  # channels, orientation, profile and EXIF
 CheckSize = Callable[[tuple[int, int]], None]  # of (width, height)
 
-#: Suffixes of RAW files, most of which begin as TIFF files do.
+#: Suffixes of RAW files, most of which begin like TIFF files.
 RAWS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
@@ -38,7 +38,7 @@ def is_heic(head: bytes) -> bool:
 
 
 def read_raw(path: Path, check_size: CheckSize) -> Found:
-    """Channels of 16 bits in sRGB, upright, with the white balance of the camera and no brightening."""
+    """Read upright 16-bit channels in sRGB, with the camera's white balance and no brightening."""
     try:
         import rawpy
     except ImportError as error:
@@ -50,7 +50,7 @@ def read_raw(path: Path, check_size: CheckSize) -> Found:
             check_size((raw.sizes.iwidth, raw.sizes.iheight))
             channels = raw.postprocess(output_bps=16, use_camera_wb=True, no_auto_bright=True)
             exif = None
-            with suppress(rawpy.LibRawError):  # without a preview, or one that can be read
+            with suppress(rawpy.LibRawError):  # no preview, or an unreadable one
                 preview = raw.extract_thumb()
                 if preview.format == rawpy.ThumbFormat.JPEG:
                     exif = _exif_of(bytes(preview.data))
@@ -62,12 +62,12 @@ def read_raw(path: Path, check_size: CheckSize) -> Found:
 
 
 def _exif_of(preview: bytes) -> bytes | None:
-    """EXIF of a JPEG that is turned as the camera was; its pixels are not taken."""
+    """Read the EXIF block of a JPEG preview, and reset its orientation, as the RAW pixels are upright."""
     return exif_tags.split(lambda: Image.open(io.BytesIO(preview)).getexif())[1]
 
 
 def read_heic(path: Path, check_size: CheckSize) -> Found:
-    """Upright channels of 8 bits, or of 16 where the file has more."""
+    """Read upright channels of 8 bits, or of 16 if the file has more."""
     try:
         import pillow_heif
     except ImportError as error:
@@ -79,7 +79,7 @@ def read_heic(path: Path, check_size: CheckSize) -> Found:
         check_size(picture.size)
         info: dict[str, Any] = picture.info
         channels = np.asarray(picture)
-        if channels.dtype == np.uint16:  # whose lower bits are empty
+        if channels.dtype == np.uint16:  # the lower bits are empty
             channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)
 
         def stored() -> Image.Exif:

@@ -1,4 +1,4 @@
-"""EXIF blocks: the orientation of a picture, and turning it upright."""
+"""EXIF blocks, and rotation of pictures by their EXIF orientation."""
 
 import warnings
 from collections.abc import Callable
@@ -12,7 +12,7 @@ FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields t
 
 
 def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Turn an array (H, W, S) stored with an EXIF orientation upright.
+    """Rotate or flip an array (H, W, S) stored with an EXIF orientation to the upright position.
 
     >>> import numpy as np
     >>> upright(np.array([[[1], [2]]]), 6)[..., 0].tolist()
@@ -24,13 +24,13 @@ def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
-    """The orientation, and the other fields as an EXIF block with orientation 1, or None if there are none.
+    """Return the orientation, and the other fields as an EXIF block with orientation 1, or None if there are none.
 
     ``read`` returns the block. Width and height fields are swapped if the orientation swaps them. Invalid fields are
     dropped, since they do not affect the pixels.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, about damaged blocks
+        warnings.simplefilter("ignore")  # Pillow warns about damaged blocks
         try:
             exif = read()
             fields = dict(exif)
@@ -54,7 +54,7 @@ def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
 
 
 def orientation_of(value: Any) -> int:
-    """The EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
+    """Return the EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
 
     >>> orientation_of(6), orientation_of("upside down")
     (6, 1)
@@ -70,7 +70,7 @@ def _folder(exif: Image.Exif, code: int) -> dict[int, Any]:
 
 
 def _sound(fields: dict[int, Any], folders: dict[int, dict[int, Any]]) -> Image.Exif:
-    """An EXIF block of the fields that can be written."""
+    """Build an EXIF block from the fields that can be written."""
     block = Image.Exif()
     for code, value in fields.items():
         if code not in FOLDERS and is_writable(code, value):

@@ -1,4 +1,4 @@
-"""What an image file carries beside pixels, profile and EXIF: XMP and the resolution in print."""
+"""Metadata of image files besides profile and EXIF: XMP and print resolution."""
 
 import io
 import math
@@ -20,26 +20,26 @@ from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
 
 PNG_KEY = "XML:com.adobe.xmp"
-JPEG_LIMIT = 65_000  # bytes of XMP in a segment of a JPEG file; longer ones are left out there
-INCH, CENTIMETRE = 2, 3  # units of TIFF
-# Pixels are turned upright when they are read, and XMP may repeat the orientation that they had.
+JPEG_LIMIT = 65_000  # bytes of XMP that fit in a JPEG segment; longer packets are not written
+INCH, CENTIMETRE = 2, 3  # values of the TIFF tag ResolutionUnit
+# Pixels are turned upright when read, but XMP may repeat the original orientation.
 ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[1-8]")
 
 
 @dataclass(frozen=True)
 class Extras:
-    """Data of a file to write back.
+    """Metadata of a file to write back.
 
     Attributes:
         xmp: an XMP packet, or None.
-        dpi: pixels to the inch, horizontally and vertically, or None.
+        dpi: pixels per inch, horizontal and vertical, or None.
     """
 
     xmp: bytes | None = None
     dpi: tuple[float, float] | None = None
 
     def options(self, kind: str) -> dict[str, Any]:
-        """Options of Pillow to write them to a JPEG, WebP, AVIF or PNG file."""
+        """Options for Pillow to write the metadata to a JPEG, WebP, AVIF or PNG file."""
         options: dict[str, Any] = {}
         if self.dpi is not None and kind not in ("WebP", "AVIF"):
             options["dpi"] = self.dpi
@@ -52,7 +52,7 @@ class Extras:
         return options | {"pnginfo": info}
 
     def chunks(self) -> list[tuple[bytes, bytes]]:
-        """Chunks of a PNG file."""
+        """The metadata as chunks of a PNG file."""
         found = []
         if self.dpi is not None:
             found.append((b"pHYs", struct.pack(">IIB", *(round(value / 0.0254) for value in self.dpi), 1)))
@@ -61,7 +61,7 @@ class Extras:
         return found
 
     def tags(self) -> dict[str, Any]:
-        """Options of tifffile, without those tags that are given beside others."""
+        """Options for tifffile to write the resolution; XMP is written with the extra tags."""
         return {} if self.dpi is None else {"resolution": self.dpi, "resolutionunit": INCH}
 
 
@@ -69,7 +69,7 @@ NO_EXTRAS = Extras()
 
 
 def read_extras(path: Path) -> Extras:
-    """Those of an image file whose pixels can be read; fields without sense are dropped, as pixels do not need them."""
+    """Read the extras of an image file whose pixels can be read; invalid fields are dropped."""
     try:
         return _read(path)
     except Exception:  # decoders have no common base class for errors
@@ -87,35 +87,35 @@ def _read(path: Path) -> Extras:
         pair = None if scale is None else tuple(_ratio(values.get(code)) * scale for code in (282, 283))
         return Extras(_upright(values.get(tiff.XMP)), _sound(pair))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's, about sizes and damaged EXIF
+        warnings.simplefilter("ignore")  # Pillow warns about sizes and damaged EXIF
         with Image.open(path) as image:
             xmp = image.info.get("xmp", image.info.get(PNG_KEY))
             return Extras(_upright(xmp.encode() if isinstance(xmp, str) else xmp), _sound(image.info.get("dpi")))
 
 
 def _ratio(value: Any) -> float:
-    """A fraction of TIFF, or NaN."""
+    """Convert a TIFF fraction to a float; NaN if it is invalid."""
     if isinstance(value, tuple) and len(value) == 2 and value[1]:
         return float(value[0]) / float(value[1])
     return math.nan
 
 
 def _sound(pair: Any) -> tuple[float, float] | None:
-    """Two positive numbers that files can hold, or None."""
+    """Return the resolution if it is two valid numbers, else None."""
     try:
         x, y = (float(value) for value in pair)
     except (TypeError, ValueError):
         return None
-    return (x, y) if all(1 <= value <= 60_000 for value in (x, y)) else None  # 1 without a unit is no resolution
+    return (x, y) if all(1 <= value <= 60_000 for value in (x, y)) else None  # 1 without a unit is not a resolution
 
 
 def _upright(xmp: Any) -> bytes | None:
-    """An XMP packet that says that the picture is upright."""
+    """Set the orientation in an XMP packet to upright."""
     return ORIENTATION.sub(rb"\g<1>1", xmp) if isinstance(xmp, bytes) and xmp.strip() else None
 
 
 def encode_deep_png(channels: NDArray[np.generic], icc: bytes | None, exif: bytes | None, extras: Extras) -> bytes:
-    """A 16-bit PNG file, with profile, EXIF and the rest between header and pixels as the format requires."""
+    """Encode a 16-bit PNG file, with profile, EXIF and extras between header and pixels as the format requires."""
     encoded = imagecodecs.png_encode(channels)
     start = 8 + 25  # signature and header chunk, of fixed length
     chunks = io.BytesIO()

@@ -1,7 +1,7 @@
-"""Films in and out, frame by frame: mp4 and mov files, with their sound, time stamps, rotation and colour properties.
+"""Films read and written frame by frame: mp4 and mov, with sound, time stamps, rotation and colour properties.
 
-Needs the ``cli`` and the ``films`` extra (PyAV). Frames are decoded to red, green and blue in floats, and encoded with
-the codec, the chroma subsampling and the bits of the film; sound and subtitles are copied as they are.
+Needs the ``cli`` and the ``films`` extra (PyAV). Frames are decoded to RGB floats, and encoded with the codec, chroma
+subsampling and bit depth of the film; sound and subtitles are copied as they are.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 FILMS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov"}  # muxer of each suffix
-#: Encoder of each codec, and its options for a quality at which the loss is hard to see; others become H.264.
+#: Encoder of each codec, with options for a quality at which the loss is barely visible; other codecs become H.264.
 ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     "h264": ("libx264", {"crf": "16", "preset": "medium"}),
     "hevc": ("libx265", {"crf": "18", "preset": "medium", "x265-params": "log-level=error"}),
     "prores": ("prores_ks", {}),
 }
-BT601, BT709 = 5, 1  # matrices, as swscale numbers them
-MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}  # from the numbers of H.273
-LIMITED, FULL = 1, 2  # ranges of brightness
-HD = 720  # rows from which players take films without a tag for BT.709
-OF_THE_FILE = ("major_brand", "minor_version", "compatible_brands", "encoder")  # entries that describe the file itself
+BT601, BT709 = 5, 1  # colour matrices, numbered as in swscale
+MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}  # from numbers of H.273 to those of swscale
+LIMITED, FULL = 1, 2  # colour ranges
+HD = 720  # rows from which on players assume BT.709 for untagged films
+OF_THE_FILE = ("major_brand", "minor_version", "compatible_brands", "encoder")  # metadata of the file itself
 COPIED = ("audio", "subtitle")
-PLANES = [2, 0, 1]  # red, green and blue among the planes green, blue and red
+PLANES = [2, 0, 1]  # order of red, green and blue in the planes green, blue, red
 
 
 def is_film(path: Path) -> bool:
@@ -45,7 +45,7 @@ def is_film(path: Path) -> bool:
 
 
 def check_film_output(path: Path) -> str:
-    """The muxer for a path; raises ValueError if no film can be written there."""
+    """Return the muxer for a path; raises ValueError if no film can be written there."""
     check_file(path)
     kind = FILMS.get(path.suffix.lower())
     if kind is None:
@@ -63,12 +63,12 @@ def _av() -> Any:
 
 @dataclass(eq=False)
 class Film:
-    """A film that is open.
+    """An open film.
 
     Attributes:
         path: its file.
-        container: of PyAV.
-        stream: of the pictures.
+        container: the container of PyAV.
+        stream: the video stream.
     """
 
     path: Path
@@ -77,23 +77,23 @@ class Film:
 
     @property
     def count(self) -> int:
-        """Number of frames, nearly: some of them may be hidden."""
+        """Approximate number of frames: some of them may be hidden."""
         return self.stream.frames or len(self.stream.index_entries)
 
     @property
     def matrix(self) -> int:
-        """The matrix between red, green, blue and what is stored, as swscale numbers it."""
+        """The colour matrix between RGB and the stored planes, numbered as in swscale."""
         untagged = BT709 if self.stream.codec_context.height >= HD else BT601
         return MATRICES.get(self.stream.codec_context.colorspace, untagged)
 
     @property
     def range(self) -> int:
-        """The range of brightness."""
+        """The colour range."""
         pix_fmt = self.stream.codec_context.pix_fmt or ""
         return FULL if self.stream.codec_context.color_range == FULL or pix_fmt.startswith("yuvj") else LIMITED
 
     def frames(self, packets: Iterator[Any] | None = None) -> Iterator["VideoFrame"]:
-        """All frames from here on; raises ValueError where they cannot be decoded."""
+        """Decode all frames from the current position on; raises ValueError if a frame cannot be decoded."""
         number = 0
         for packet in self.container.demux(self.stream) if packets is None else packets:
             for frame in self.decoded(packet, number):
@@ -101,7 +101,7 @@ class Film:
                 yield frame
 
     def decoded(self, packet: Any, number: int) -> list["VideoFrame"]:
-        """The frames that a packet completes, after so many others."""
+        """Decode the frames that a packet completes; ``number`` frames came before, for errors."""
         av = _av()
         try:
             frames: list[VideoFrame] = packet.decode()
@@ -117,7 +117,7 @@ class Film:
         return frames
 
     def pixels(self, frame: "VideoFrame") -> Floats:
-        """A frame as red, green and blue (H, W, 3) in [0, 1]."""
+        """Convert a frame to RGB (H, W, 3) in [0, 1]."""
         from av.video.reformatter import Interpolation
 
         planes = frame.reformat(
@@ -132,7 +132,7 @@ class Film:
         return found
 
     def sample(self, count: int) -> list[Floats]:
-        """Frames from the middles of so many equal parts of the film, or all frames of a shorter one."""
+        """Decode the middle frames of ``count`` equal parts of the film, or all frames of a shorter film."""
         start, length = self.span()
         found: list[Floats] = []
         last: int | None = None
@@ -151,7 +151,7 @@ class Film:
         return found
 
     def span(self) -> tuple[int, int]:
-        """The first time stamp, and the length in its units."""
+        """Return the first time stamp, and the duration in the same units."""
         entries = self.stream.index_entries
         start = self.stream.start_time or 0
         return start, self.stream.duration or (entries[-1].timestamp - start + 1 if len(entries) else 1)
@@ -163,7 +163,7 @@ def open_film(path: Path) -> Iterator[Film]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no film, has no pictures that move, is cut short, or has transparency.
+        ValueError: if it is no film, has no video stream, is truncated, or has transparency or a palette.
     """
     first_bytes(path)
     av = _av()
@@ -200,10 +200,10 @@ def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: 
     """Write a film with every frame edited; the file appears complete or not at all.
 
     Args:
-        film: to be read from its start.
-        path: of an mp4 or mov file.
-        edit: from a frame (H, W, 3) in [0, 1] to another of its size; values may leave [0, 1].
-        begin: told of the number of every frame before it is edited.
+        film: the film, read from its start.
+        path: path of an mp4 or mov file.
+        edit: function from a frame (H, W, 3) in [0, 1] to one of the same size; values may leave [0, 1].
+        begin: called with the number of each frame before it is edited.
 
     Returns:
         The number of frames.
@@ -235,7 +235,7 @@ def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: 
 def _transcode(
     film: Film, output: "OutputContainer", edit: Callable[[Floats], Floats], begin: Callable[[int], None], path: Path
 ) -> int:
-    """Write the edited frames and the rest of a film to an open container; their number."""
+    """Write the edited frames and the other streams of a film to an open container; return the number of frames."""
     target = _encoder(film, output)
     copied: dict[int, Any] = {}
     for stream in film.container.streams:
@@ -250,11 +250,11 @@ def _transcode(
             ) from error
         copied[stream.index].metadata.update(stream.metadata)
     output.metadata.update({key: text for key, text in film.container.metadata.items() if key not in OF_THE_FILE})
-    film.container.seek(0)  # the header is written with the first packet, which may be one of sound
+    film.container.seek(0)  # the header is written with the first packet, which may be a sound packet
     target.set_display_matrix(next(map(display_matrix, film.frames()), None))
     film.container.seek(0)
     count = 0
-    durations: dict[int | None, int] = {}  # of frames in the encoder, which may forget them
+    durations: dict[int | None, int] = {}  # durations of the frames in the encoder, which may lose them
 
     def put(packets: Iterable[Any]) -> None:
         for packet in packets:
@@ -279,7 +279,7 @@ def _transcode(
 
 
 def _encoder(film: Film, output: "OutputContainer") -> "VideoStream":
-    """A stream for edited frames, with the properties of the film."""
+    """Add a stream for the edited frames, with the properties of the film."""
     av = _av()
     source = film.stream.codec_context
     name, options = ENCODERS.get(source.codec.canonical_name, ENCODERS["h264"])
@@ -303,13 +303,13 @@ def _encoder(film: Film, output: "OutputContainer") -> "VideoStream":
     if source.sample_aspect_ratio:
         context.sample_aspect_ratio = source.sample_aspect_ratio
     if name == "libx265":
-        context.codec_tag = "hvc1"  # without which some players show nothing
+        context.codec_tag = "hvc1"  # required by some players
     target.metadata.update(film.stream.metadata)
     return target
 
 
 def subsampling(pix_fmt: str) -> tuple[int, int]:
-    """Width and height in pixels that share a chroma sample.
+    """Return the width and height in pixels of the block that shares a chroma sample.
 
     >>> subsampling("yuv420p10le"), subsampling("yuv422p"), subsampling("gbrp")
     ((2, 2), (2, 1), (1, 1))
@@ -320,14 +320,14 @@ def subsampling(pix_fmt: str) -> tuple[int, int]:
 
 
 def display_matrix(frame: "VideoFrame") -> list[int] | None:
-    """How a frame is to be turned, as nine integers; None if it is upright."""
-    kept: Any = frame.side_data  # of which the stubs know only one kind
+    """Return the display matrix (rotation) of a frame as nine integers; None if it is upright."""
+    kept: Any = frame.side_data  # the type stubs declare only one kind
     data = next((part for part in kept if part.type.name == "DISPLAYMATRIX"), None)
     return None if data is None else [int(number) for number in np.frombuffer(bytes(data), np.int32)]
 
 
 def _stored(film: Film, frame: "VideoFrame", pixels: Floats, target: "VideoStream") -> "VideoFrame":
-    """Edited pixels as a frame to encode, with the time of the one that they come from."""
+    """Convert edited pixels to a frame to encode, with the time stamps of the original frame."""
     from av.video.frame import VideoFrame
     from av.video.reformatter import Interpolation
 

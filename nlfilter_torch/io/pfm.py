@@ -1,4 +1,4 @@
-"""Masks as PFM files: floats of one channel, which darktable and ART read as raster masks."""
+"""Writing of masks as PFM files, with one channel of floats, which darktable and ART read as raster masks."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ PFM = ".pfm"
 
 
 def write_pfm(path: Path, plane: NDArray[np.float32]) -> None:
-    """Write a plane (H, W), rows from the bottom up as the format has them; the file appears complete or not at all."""
+    """Write a plane (H, W), bottom row first as the format requires; the file appears complete or not at all."""
     height, width = plane.shape
     with open_beside(path) as stream:
         stream.write(f"Pf\n{width} {height}\n-1.0\n".encode())  # negative: little-endian

@@ -1,6 +1,6 @@
-"""Image files in and out: PNG, JPEG, TIFF, WebP and AVIF at their own depth, with alpha, EXIF and colour profile.
+"""Image files in memory: PNG, JPEG, TIFF, WebP and AVIF at their own depth, with alpha, EXIF and colour profile.
 
-Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil); nothing else in the package imports this module.
+Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
 import os
@@ -35,7 +35,7 @@ Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
 
 BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
-# Depths that each file type supports: those that Pillow writes. JPEG has no alpha, PNG no floats.
+# Depths supported by each file type. JPEG has no alpha, PNG no floats.
 DEPTHS: dict[str, tuple[str, ...]] = {
     "PNG": ("uint8", "uint16"),
     "JPEG": ("uint8",),
@@ -49,7 +49,7 @@ ENCODING: dict[str, dict[str, object]] = {
     "AVIF": {"quality": 90, "subsampling": "4:4:4"},
 }
 PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
-unfinished: set[Path] = set()  # files being written; command lines read this when interrupted
+unfinished: set[Path] = set()  # files being written; read by the command line when interrupted
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 
@@ -62,10 +62,10 @@ class Photograph:
         pixels: (1, C, H, W), C = 1 or 3, upright. Integer files are scaled to [0, 1]; float files keep their own
             values. float32, or float64 for a file of 64-bit floats.
         depth: How a channel is stored in the file, as the name of a numpy dtype.
-        alpha: (1, 1, H, W) likewise, or None. Kept as it is.
+        alpha: (1, 1, H, W), scaled like the pixels, or None. It is not edited.
         icc: The colour profile, or None. Pixels are not converted.
-        exif: The EXIF block, whose orientation is 1 since the pixels are upright, or None.
-        extras: XMP, and the resolution in print.
+        exif: The EXIF block, with orientation 1 since the pixels are upright, or None.
+        extras: XMP and print resolution.
     """
 
     pixels: Tensor
@@ -81,7 +81,7 @@ class Photograph:
         return self.pixels.shape[-2], self.pixels.shape[-1]
 
     def with_pixels(self, pixels: Tensor) -> "Photograph":
-        """The same photograph with other pixels (1, C, H, W) on any device; a new number C drops the profile."""
+        """Return a copy with other pixels (1, C, H, W), from any device; a different C drops the profile."""
         icc = self.icc if pixels.shape[1] == self.pixels.shape[1] else None
         return replace(self, pixels=pixels.detach().to(self.pixels), icc=icc)
 
@@ -95,10 +95,11 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
 
     Args:
         path: A PNG, JPEG, TIFF, WebP or AVIF file, recognised by its content: grey or RGB, with or without alpha, 8 or
-            16 bits, 10 or 12 (AVIF, read as 16) or floats (TIFF). The first page of a TIFF or picture of a JPEG is
-            read. RAW and HEIC files as well, with the extras ``raw`` and ``heic``; RAW, by its suffix, as 16 bits.
-        bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for a
-            file of 64-bit floats.
+            16 bits, 10 or 12 (AVIF, read as 16) or floats (TIFF). Of several pages or pictures in a TIFF or JPEG file,
+            the first is read. With the extras ``raw`` and ``heic`` also HEIC files, and RAW files, which are recognised
+            by their suffix and read as 16 bits.
+        bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for files
+            of 64-bit floats.
         memory: Bytes that may be used; None is the free memory.
 
     Returns:
@@ -120,7 +121,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
 
 
 def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
-    """The depth of a file whose channels have that dtype; raises ValueError if it is not handled."""
+    """Return the depth of a file whose channels have that dtype; raises ValueError if it is not supported."""
     if dtype.name not in BITS:
         raise ValueError(
             f"{path} stores its channels as {dtype.name}, which is not handled; convert it to 8 or 16 bits or floats"
@@ -129,7 +130,7 @@ def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
 
 
 def first_bytes(path: Path) -> bytes:
-    """The first bytes of a file, which identify its type.
+    """Read the first bytes of a file, which identify its type.
 
     Raises:
         FileNotFoundError, ValueError: see :func:`read_photograph`.
@@ -151,7 +152,7 @@ def first_bytes(path: Path) -> bytes:
 
 
 def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tuple[Pixels, bytes | None, bytes | None]:
-    """Upright channels (H, W, S) as they are stored, profile and EXIF; see :func:`read_photograph`."""
+    """Read upright channels (H, W, S) in the stored dtype, profile and EXIF; see :func:`read_photograph`."""
     head = first_bytes(path)
     if cameras.is_raw(path) or cameras.is_heic(head):
         read = cameras.read_raw if cameras.is_raw(path) else cameras.read_heic
@@ -171,8 +172,8 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tu
 def write_photograph(photograph: Photograph, path: str | Path) -> None:
     """Write an image file at the photograph's depth; the extension of the name selects the type.
 
-    Integer channels are clipped to what the file can hold and rounded. JPEG is written at quality 95 without colour
-    subsampling, AVIF at 90, WebP and TIFF without loss. The file appears complete or not at all.
+    Integer channels are clipped to their range and rounded. JPEG is written at quality 95 without chroma subsampling,
+    AVIF at 90, WebP and TIFF without loss. The file appears complete or not at all.
 
     Raises:
         ValueError: See :func:`check_output`.
@@ -195,7 +196,7 @@ def encode(
     exif: bytes | None,
     extras: Extras,
 ) -> None:
-    """Write channels (H, W, S) of the stored dtype as an image file of a type in :data:`DEPTHS`."""
+    """Write channels (H, W, S) in their dtype as an image file of a type in :data:`DEPTHS`."""
     channels = channels[..., 0] if channels.shape[2] == 1 else channels
     if kind == "TIFF":
         tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, extras.xmp, **extras.tags())
@@ -216,7 +217,7 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
 
 
 def check_type(path: str | Path, depth: str, alpha: bool) -> str:
-    """:func:`check_output` for a picture of that depth, with or without alpha."""
+    """Do the check of :func:`check_output` for a picture of that depth, with or without alpha."""
     path = Path(path)
     check_file(path)
     kind = SUFFIXES.get(path.suffix.lower())
@@ -266,7 +267,7 @@ def _check_parent(path: Path) -> None:
 
 @contextmanager
 def open_beside(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file that is renamed to ``path`` when the block succeeds, and removed when it fails.
+    """Open a binary file that is renamed to ``path`` when the block succeeds, and removed when it fails.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -286,7 +287,7 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def part_beside(path: Path) -> Iterator[Path]:
-    """A unique hidden name beside ``path`` for a file or folder that is being written, removed when the block ends."""
+    """Reserve a unique hidden name beside ``path`` for a file or folder, which is removed when the block ends."""
     # Not tempfile: the file needs the usual permissions and must be on the same file system.
     beside = name_beside(path)
     unfinished.add(beside)
@@ -304,19 +305,19 @@ def part_beside(path: Path) -> Iterator[Path]:
 
 
 def link_target(path: str | Path) -> Path:
-    """``path``, or the target of the symbolic link there."""
+    """Return ``path``, or its target if it is a symbolic link."""
     path = Path(path)
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def name_beside(path: Path) -> Path:
-    """A unique hidden name in the same folder for a file that is being written."""
+    """Return a unique hidden name in the same folder for a file that is being written."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
 @contextmanager
 def claimed(part: Path) -> Iterator[None]:
-    """Lock a file or folder, so that :func:`remove_stale` in other processes leaves it alone."""
+    """Lock a file or folder, so that :func:`remove_stale` in other processes does not remove it."""
     with ExitStack() as stack:
         if sys.platform != "win32":  # open files cannot be removed there
             stack.callback(os.close, handle := os.open(part, os.O_RDONLY))
@@ -336,7 +337,7 @@ def _is_claimed(part: Path) -> bool:
 
 
 def remove_stale(folder: Path, names: Container[str]) -> None:
-    """Remove the unfinished files of killed processes for some names in a folder."""
+    """Remove unfinished files of killed processes in a folder; ``names`` are the names of the finished files."""
     for part in folder.glob(".*.part"):
         if PART.fullmatch(part.name) and part.name[1:].rsplit(".", 2)[0] in names and not _is_claimed(part):
             _remove(part)
@@ -345,7 +346,7 @@ def remove_stale(folder: Path, names: Container[str]) -> None:
 def _remove(part: Path) -> None:
     with suppress(OSError):  # no such file, or the name is too long
         if part.is_dir():
-            for pause in (0.0, 0.1, 0.4):  # after an interrupt a thread of zarr may still be writing its last chunk
+            for pause in (0.0, 0.1, 0.4):  # after an interrupt, a zarr thread may still be writing its last chunk
                 time.sleep(pause)
                 shutil.rmtree(part, ignore_errors=True)
         else:
@@ -365,5 +366,5 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
 
 
 def _size(count: int) -> str:
-    """A number of bytes with its unit."""
+    """Format a number of bytes."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

@@ -36,8 +36,8 @@ from nlfilter_torch.tiled.sources import Rows, RowSource
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
-FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is done in tiles
-CODED = 8  # memory to decode or encode other formats, as a multiple of the picture's bytes
+FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is tiled
+CODED = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class StoredPicture:
     """A picture in a file, read on demand.
 
     Attributes:
-        rows: upright, (H, W, S) or (H, W).
+        rows: upright rows, (H, W, S) or (H, W).
         alpha: whether the last channel is transparency.
-        cached: bytes that stay in memory while it is read.
+        cached: bytes kept in memory while the picture is read.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
-        attributes: of a zarr array.
-        extras: XMP, and the resolution in print.
+        attributes: attributes of a zarr array.
+        extras: XMP and print resolution.
     """
 
     rows: RowSource
@@ -69,7 +69,7 @@ class StoredPicture:
         return height, width, samples[0] if samples else 1
 
     def in_colour(self) -> "StoredPicture":
-        """Shape and metadata of its coloured version, without pixels; the profile of a grey picture is dropped."""
+        """Return shape and metadata of the colour version, without pixels; the profile of a grey picture is dropped."""
         height, width, samples = self.shape
         if samples > 2:
             return self
@@ -78,7 +78,7 @@ class StoredPicture:
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether ``path`` is the folder of a zarr array or has the name of one."""
+    """Whether ``path`` is the folder of a zarr array or ends in ``.zarr``."""
     return path.suffix.lower() == ZARR or _holds_zarr(path)
 
 
@@ -88,11 +88,11 @@ def _holds_zarr(path: Path) -> bool:
 
 @contextmanager
 def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
-    """Open a picture to read its rows within the block.
+    """Open a picture, whose rows can be read within the block.
 
     Raises:
         FileNotFoundError, ValueError: if the file does not exist or cannot be read.
-        MemoryError: if reading it takes more than ``memory`` bytes.
+        MemoryError: if reading it needs more than ``memory`` bytes.
     """
     with ExitStack() as stack:
         if is_zarr(path):
@@ -158,7 +158,7 @@ def free_memory() -> int:
 
 
 def modest_memory() -> int:
-    """What an edit takes without being asked: a fifth of the machine's memory, and no more than is free."""
+    """Memory budget in bytes of an edit if none is given: a fifth of the machine's memory, at most what is free."""
     return min(FIFTH, free_memory())
 
 
@@ -170,7 +170,7 @@ def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
 
 
 def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
-    """The rows of a picture stored on its side, upright, in a temporary file."""
+    """Rotate a picture that is stored sideways, in a temporary file."""
     height, width, samples = rows.shape
     copy = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
     upright = np.memmap(copy, dtype=rows.dtype, mode="w+", shape=(width, height, samples))
@@ -232,7 +232,7 @@ def _open_zarr(path: Path) -> StoredPicture:
 
 
 def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:
-    """Write an array that is renamed when it is complete, and only then replaces an earlier one of that name."""
+    """Write an array under another name, which replaces an existing array only when it is complete."""
     shape = tuple(like.rows.shape)
     path = link_target(path)
     former = name_beside(path)

@@ -1,4 +1,4 @@
-"""TIFF files of any depth, with profile and EXIF, by tifffile; whole, or a few rows at a time."""
+"""Reading and writing of TIFF files with profile and EXIF, by tifffile; whole, or a few rows at a time."""
 
 import logging
 import os
@@ -33,7 +33,7 @@ class UnhandledImage(ValueError):
 
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
-    """Report errors in the block as those of a damaged file; decoders have no common base class for errors."""
+    """Report any error in the block as a damaged file, since decoders have no common base class for errors."""
     try:
         yield
     except (MemoryError, UnhandledImage):
@@ -51,7 +51,7 @@ def is_tiff(head: bytes) -> bool:
 def read(
     path: Path, check_size: Callable[[tuple[int, int], bool], None]
 ) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
-    """(H, W, S) channels as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
+    """Read channels (H, W, S) as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
 
     ``check_size((width, height), double)`` is called before the pixels are decoded; ``double`` means 64-bit pixels.
     """
@@ -85,7 +85,7 @@ def check_page(path: Path, page: Any) -> None:
 
 
 def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
-    """Channels (H, W, S) of a page or some of its rows, with black as 0 and colours not premultiplied by alpha."""
+    """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
     channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
         channels[..., :1] = np.iinfo(channels.dtype).max - channels[..., :1]
@@ -93,7 +93,7 @@ def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
 
 
 def metadata(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes | None]:
-    """Orientation, profile and EXIF (not from a BigTIFF) of the first page of a file."""
+    """Read orientation, profile and EXIF (not from a BigTIFF) of the first page of a file."""
     tags = file.pages.first.tags
     orientation, profile = tags.get(_ORIENTATION), tags.get(34675)
     return (
@@ -174,20 +174,20 @@ def write(
 ) -> None:
     """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
 
-    ``alpha``: whether the last channel is transparency; ``options``: of :func:`tifffile.imwrite`.
+    ``alpha`` says whether the last channel is transparency; ``options`` are those of :func:`tifffile.imwrite`.
     """
     tags = Image.Exif()
     if exif is not None:
         tags.load(exif)
     text: list[tuple[int, str, int, bytes, bool]] = [
-        (code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True)  # as Pillow has decoded it
+        (code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True)  # latin-1, as decoded by Pillow
         for code in _DESCRIPTIVE
         if code in tags and code not in exif_tags.FOLDERS
     ]
     if xmp is not None:
         text.append((XMP, "B", len(xmp), xmp, True))
     folders = {code: folder for code in exif_tags.FOLDERS if (folder := tags.get_ifd(code))}
-    # tifffile does not write nested tables, so a placeholder tag of the next lower number keeps each one's place.
+    # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, "I", 1, 0, True) for code in folders]
     start = stream.tell()
     tifffile.imwrite(
@@ -225,7 +225,7 @@ def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder
     offset = end + end % 2
     stream.write(table.tobytes(offset))
     stream.seek(position)
-    stream.write(struct.pack(f"{order}HHLL", code, 4, 1, offset))  # 4: a 32-bit integer, 1: one of them
+    stream.write(struct.pack(f"{order}HHLL", code, 4, 1, offset))  # type 4: 32-bit integer; count 1
 
 
 def _read_exif(path: Path) -> bytes | None:
@@ -257,14 +257,14 @@ class TiffRows:
 
     Attributes:
         shape: (H, W, S).
-        dtype: in native byte order.
+        dtype: dtype in native byte order.
         icc: the colour profile, or None.
         exif: the EXIF block, or None.
         alpha: whether the last channel is transparency.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the header; raises UnhandledImage if the picture is of an unsupported kind."""
+        """Open the file and read the header; raises UnhandledImage if the picture is of an unsupported kind."""
         self.path = path
         self.stream: BinaryIO = path.open("rb")
         try:
@@ -302,7 +302,7 @@ class TiffRows:
         return 0 if self._raw else (KEPT + 1) * self.segment[0] * self.shape[1] * self.shape[2] * self.dtype.itemsize
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """The rows from ``rows.start`` to ``rows.stop``.
+        """Read the rows from ``rows.start`` to ``rows.stop``.
 
         Raises:
             ValueError: if the file has changed since it was opened, or is damaged.
@@ -319,7 +319,7 @@ class TiffRows:
 
     @property
     def _raw(self) -> bool:
-        """Whether the file stores the rows uncompressed, one after the other."""
+        """Whether the file stores the rows uncompressed and contiguous."""
         contiguous: bool = self.page.is_contiguous and self.page.planarconfig == tifffile.PLANARCONFIG.CONTIG
         return contiguous and self.page.compression == tifffile.COMPRESSION.NONE and not self.page.is_tiled
 
@@ -342,7 +342,7 @@ class TiffRows:
         return whole[first - wanted.start * height : last - wanted.start * height]
 
     def _band(self, band: int) -> NDArray[Any]:
-        """One row of tiles, or one strip, (h, W, S)."""
+        """Decode one row of tiles, or one strip, (h, W, S)."""
         height, width, samples = self.shape
         top = band * self.segment[0]
         result = np.full((min(self.segment[0], height - top), width, samples), self.page.nodata, self.page.dtype)
