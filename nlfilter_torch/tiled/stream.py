@@ -126,7 +126,7 @@ def stream_recolor(
         keep: rows like those of ``stroke_mask``, above 0 on background scribbles; pixels similar to these keep their
             colours. None is no scribbles.
         reach: as in :func:`~nlfilter_torch.recolor`, like ``photometric_bandwidth`` and ``patch_size``.
-        photometric_bandwidth: in hundredths of Lab units.
+        photometric_bandwidth: in Lab units divided by 100.
         patch_size: of the patches that are compared.
         statistics: as in :func:`stream_detail`, like ``sample``, ``tile_rows``, ``memory`` and ``report``.
         sample: number of pixels.
