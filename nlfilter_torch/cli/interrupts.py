@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-INTERRUPTED = 128 + signal.SIGINT  # exit status of shells after Ctrl-C
+INTERRUPTED = 128 + signal.SIGINT  # exit status that shells use for Ctrl-C
 PAUSE = 0.05  # seconds after which an interrupt is sent again, if it could not be raised where it arrived
 SHOW_CURSOR = "\x1b[?25h"
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))

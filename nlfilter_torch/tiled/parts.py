@@ -144,7 +144,7 @@ class Stage:
 
     Args:
         picture: rows.
-        stack: context of its temporary file.
+        stack: closes its temporary file.
     """
 
     def __init__(self, picture: Picture, stack: ExitStack) -> None:

@@ -1,6 +1,6 @@
 """Sampling a picture that is read by rows.
 
-The pilot reads the picture once, and has the kernel of its filter and an even sample of its pixels. A second sample,
+One pass over the picture yields the pilot: the kernel of its filter and an even sample of its pixels. A second sample,
 for the sums that define the filter, favours rare pixels and has no gaps.
 """
 

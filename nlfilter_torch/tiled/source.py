@@ -186,7 +186,7 @@ class Tiled:
         return found.clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
 
     def _resized(self, read: Read, size: tuple[int, int]) -> Tensor:
-        """Resize the rows of the picture."""
+        """Resize rows, which ``read`` returns in the size of the picture."""
         parts = resized_parts(read, self.size, size)
         return torch.cat(list(in_order(lambda part: part(), parts, self.passes.workers(1))), dim=2)
 
@@ -284,7 +284,8 @@ class Tiled:
     def parts_of(self, tile: Tile) -> Iterator[TilePixels]:
         """Split a tile into groups of a few rows, which are the same for tiles of any height.
 
-        This is because the rounding of a matrix product depends on its shape.
+        The height of tiles therefore does not affect results, although the rounding of a matrix product depends on its
+        shape.
         """
         width, step = self.size[1], self.passes.rows_together(self.size[1])
         features: dict[int, tuple[Tensor, ...]] = {}

@@ -30,7 +30,7 @@ from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
 CONVERGED = {
     torch.float32: 1e-5,
     torch.float64: 1e-7,
-}  # of a Newton step, relative to t; the error after it is its square
+}  # relative Newton step; the error after it is its square
 MAX_PASSES = 12
 ALARM = 1e-3
 
@@ -61,8 +61,8 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
     """Solve for the moment t (1, M, 1) of the pixels in ``blocks``, from an initial guess ``total``.
 
     ``correction`` is added to the sum over the blocks. ``completed`` means that the kernel has a unit diagonal and no
-    negative entry, so that no scaling can be large; scalings are then clamped. Otherwise pixels that the guess does not
-    represent could start with a large scaling, which Newton's method would only halve in every pass.
+    negative entry, so that no scaling can be large. Scalings are then clamped, since they would start large for pixels
+    that the guess does not represent, and Newton's method would only halve them in every pass.
     """
     largest = LARGEST if completed else float("inf")
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)

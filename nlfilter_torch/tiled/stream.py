@@ -57,8 +57,8 @@ def stream_detail(
             favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
             or four passes that each cost more than the output.
         sample: approximate number of pixels of that sample; with as many as the picture has, statistics are full.
-        tile_rows: rows of a tile; None is as many as fit in ``memory``. With 256 MB or more, a tile has at least the
-            rows that make 16,384 pixels, or a multiple of them.
+        tile_rows: rows of a tile; None is as many as fit in ``memory``. With 256 MB or more, it is rounded to a
+            multiple of the rows that make 16,384 pixels.
         memory: bytes that may be used, besides those of source and target.
         report: called with the name of a stage, the part done and the total.
         **options: ``threshold``, ``limits``, ``viewing_size`` and bandwidths of :func:`~nlfilter_torch.enhance`, and
@@ -123,8 +123,8 @@ def stream_recolor(
             the mask. Integers are scaled to [0, 1].
         stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
             channels.
-        keep: rows like those of ``stroke_mask``, above 0 on background scribbles; pixels similar to these keep their
-            colours. None is no scribbles.
+        keep: rows like those of ``stroke_mask``, or None, above 0 on background scribbles; pixels similar to these
+            keep their colours.
         reach: as in :func:`~nlfilter_torch.recolor`, like ``photometric_bandwidth`` and ``patch_size``.
         photometric_bandwidth: in Lab units divided by 100.
         patch_size: of the patches that are compared.

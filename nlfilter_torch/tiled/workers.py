@@ -1,7 +1,7 @@
 """Several tiles at once, each in its own thread: the short operations on a tile are not worth dividing among threads.
 
-OpenMP divides every operation among threads that wait for each other at full speed, so that beside another busy program
-most of the time goes into waiting. Tiled edits therefore divide the picture among threads, not single operations.
+OpenMP divides every operation among threads that busy-wait for each other, so that most of the time is spent waiting if
+another program is busy. Tiled edits therefore divide the picture among threads, not single operations.
 """
 
 from collections import deque
@@ -53,7 +53,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
 
 @contextmanager
 def undivided(workers: int) -> Iterator[None]:
-    """Run each operation of the calling thread on a single core, if there are several workers.
+    """Keep the calling thread from dividing operations among threads, if there are several workers.
 
     Other threads still divide their operations.
     """
