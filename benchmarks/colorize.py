@@ -1,10 +1,10 @@
 """Colourisation against optimisation: ``python -m benchmarks.colorize [--pictures FOLDER] [--set choosing]``.
 
 Grey versions of photographs are colourised from 6, 20 and 60 random 5x5 strokes of their true chroma, with three seeds
-each. Measured are the PSNR of the RGB result against the photograph, and CPU time, of the regression mixed with values
-of neighbours (the default), the paper's k-means method, and Levin's optimisation (:mod:`benchmarks.levin`). All keep
-the luminance and use the same gamut mapping. Parameters were chosen on :data:`CHOOSING` and on other photographs;
-results are reported on :data:`REPORTING`, or on every photograph of a folder, with strokes of other seeds.
+each. Prints the PSNR of the RGB result against the photograph, and CPU time, for the regression mixed with values of
+neighbours (the default), the paper's k-means method, and Levin's optimisation (:mod:`benchmarks.levin`). All keep the
+luminance and use the same gamut mapping. Parameters were chosen on :data:`CHOOSING` and on other photographs; results
+are reported on :data:`REPORTING`, or on every photograph of a folder, with strokes of other seeds.
 """
 
 import argparse

@@ -137,7 +137,7 @@ def crop(image: Tensor, share: tuple[float, float], random: np.random.Generator,
 
 
 def composites(count: int, first_seed: int, images: dict[str, Tensor], size: tuple[int, int]) -> Iterator[Composite]:
-    """Yield ``count`` composites; each depends only on its seed and the photographs."""
+    """Yield ``count`` composites, each reproducible from its seed."""
     names = sorted(images)
     for seed in range(first_seed, first_seed + count):
         random = np.random.default_rng(seed)

@@ -123,7 +123,7 @@ class Crops:
         return torch.lerp(colours[0], colours[1], share)
 
     def _smooth(self, planes: int, count: int) -> Tensor:
-        """Smooth random planes (planes, side, side), interpolated from ``count`` x ``count`` unit normal values."""
+        """Smooth random planes (planes, side, side), interpolated from ``count`` x ``count`` standard normal values."""
         values = torch.randn(1, planes, count, count, generator=self.generator)
         return F.interpolate(values, (self.side, self.side), mode="bicubic")[0]
 

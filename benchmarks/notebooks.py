@@ -1,7 +1,7 @@
 """Runs the notebooks, and shrinks their outputs for the repository: ``python -m benchmarks.notebooks notebooks``.
 
-Each ``.py`` in the folder is run in its own kernel and written as ``.ipynb`` beside it, with pictures as JPEG. Printed
-are CPU seconds over all cores, elapsed seconds, and the size of the file.
+Each ``.py`` in the folder is run in its own kernel and written as ``.ipynb`` beside it, with pictures as JPEG. Prints
+CPU seconds over all cores, elapsed seconds, and the size of the file.
 """
 
 import argparse

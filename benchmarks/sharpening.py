@@ -2,7 +2,7 @@
 
 Four photographs in grey at 256x256, without noise and with white noise of 10 and 20 grey levels. The strength of every
 method is set so that the gradient on strong edges (the steepest 4 % of pixels, measured along the clean photograph's
-gradient) becomes 1.5 times as large. Measured are
+gradient) becomes 1.5 times as large. The measurements are
 
 halo    mean overshoot near these edges: how far the result leaves the range of the clean photograph within 5 pixels,
         in grey levels;

@@ -1,7 +1,7 @@
 """CPU time of edits in tiles compared with edits in memory: ``python -m benchmarks.streaming_cpu``.
 
 The mosaic of ``benchmarks.streaming`` is edited alternately in memory and in tiles, from 8 bits to 8 bits, in one
-process. Reported are medians of CPU time per megapixel, summed over all threads. ``--quick`` runs it on a fraction of a
+process. Prints medians of CPU time per megapixel, summed over all threads. ``--quick`` runs it on a fraction of a
 megapixel.
 """
 
