@@ -1,1 +1,1 @@
-"""Executable claims: each module prints what it measures, ``python -m benchmarks.<name>`` from the root."""
+"""Benchmarks that check claims: ``python -m benchmarks.<name>``, run from the root, prints what a module measures."""

@@ -1,8 +1,8 @@
-"""Error of the approximated filter against the dense one: ``python -m benchmarks.accuracy``.
+"""Error of the approximate filter relative to the dense one: ``python -m benchmarks.accuracy``.
 
 RMS difference of W y in grey levels between the library in float64 and :mod:`tests.reference`, on photographs reduced
-to 72x72, 5x5 patches, m = 100. The paper's own method stands twice: as the reference transcribes it, and the library
-with uniform samples and no completion.
+to 72x72, 5x5 patches, m = 100. The paper's own method appears twice: as implemented in the reference, and as the
+library with uniform samples and no completion.
 """
 
 import warnings
@@ -34,7 +34,7 @@ class Errors:
 
     @property
     def holds(self) -> bool:
-        """Is the default within its limit, and at most half of the paper's own method?"""
+        """Whether the default's error is within its limit and at most half of that of the paper's own method."""
         return self.default <= LIMITS[self.bandwidth] and self.default <= min(self.paper, self.plain) / 2
 
 
@@ -50,7 +50,7 @@ def measure(picture: str, bandwidth: int) -> Errors:
     def library(**options: str) -> np.ndarray:
         y = torch.from_numpy(image.copy())[None, None]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the plain method warns of its own row sums
+            warnings.simplefilter("ignore")  # without completion the library warns about row sums
             operator = nonlocal_operator(y, photometric_bandwidth=h_y, num_landmarks=LANDMARKS, **options)
         return (operator @ y).numpy()
 

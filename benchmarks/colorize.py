@@ -1,10 +1,10 @@
-"""Colours from strokes, against optimisation: ``python -m benchmarks.colorize [--pictures FOLDER] [--set choosing]``.
+"""Colourisation against optimisation: ``python -m benchmarks.colorize [--pictures FOLDER] [--set choosing]``.
 
-Photographs in grey, with 6, 20 and 60 random 5x5 strokes of their true chroma, three seeds each. PSNR of the RGB result
-against the photograph, and CPU time, for the regression mixed with values of neighbours (the default), the paper's
-k-means way, and Levin's optimisation (:mod:`benchmarks.levin`). All keep the luminance and share one step into the RGB
-gamut. Parameters were chosen on :data:`CHOOSING` and on other photographs; the result is reported on :data:`REPORTING`,
-or on every photograph of a folder, with strokes of other seeds.
+Grey versions of photographs are colourised from 6, 20 and 60 random 5x5 strokes of their true chroma, with three seeds
+each. Prints the PSNR of the RGB result against the photograph, and CPU time, for the regression mixed with values of
+neighbours (the default), the paper's k-means method, and Levin's optimisation (:mod:`benchmarks.levin`). All keep the
+luminance and use the same gamut mapping. Parameters were chosen on :data:`CHOOSING` and on other photographs; results
+are reported on :data:`REPORTING`, or on every photograph of a folder, with strokes of other seeds.
 """
 
 import argparse
@@ -29,9 +29,9 @@ SIDE, SHAPE = 160, (160, 240)  # pixels of the short side, and of crops
 COUNTS = (6, 20, 60)
 SEEDS = 3
 BRUSH = 5
-WON, AHEAD, WORST, TIME = 0.85, 0.8, -0.4, 1.5  # wins against Levin, median and worst lead in dB, time relative to his
+WON, AHEAD, WORST, TIME = 0.85, 0.8, -0.4, 1.5  # share won, median and worst lead in dB, relative time
 
-GREY = 45  # dB between a photograph and its luminance, above which it has no colours to find
+GREY = 45  # dB; a photograph whose luminance has a higher PSNR counts as grey
 
 Method = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -46,7 +46,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Case:
-    """One photograph with one set of strokes, under every method."""
+    """Results of all methods for one photograph with one set of strokes."""
 
     name: str
     count: int
@@ -55,7 +55,7 @@ class Case:
 
     @property
     def lead(self) -> float:
-        """Of the default over Levin, in dB."""
+        """PSNR of the default minus that of Levin, in dB."""
         return self.results["default"].psnr - self.results["Levin"].psnr
 
 
@@ -71,7 +71,7 @@ def random_strokes(count: int, seed: int, size: tuple[int, int]) -> Tensor:
 
 
 def levin(grey: Tensor, strokes: Tensor, mask: Tensor) -> Tensor:
-    """Levin's optimisation with the library's way into the gamut."""
+    """Levin's optimisation with the library's gamut mapping."""
     chroma = split_luminance(strokes)[1][0].double()
     found = propagate(grey[0, 0].double().numpy(), chroma[[0, 2]].numpy(), mask[0, 0].numpy() > 0)
     return merge_luminance(grey, with_green(torch.from_numpy(found).float()[None]))
@@ -85,12 +85,12 @@ METHODS: dict[str, Method] = {
 
 
 def psnr(found: Tensor, wanted: Tensor) -> float:
-    """In dB, for images in [0, 1]."""
+    """PSNR in dB, for images in [0, 1]."""
     return float(-10 * (found - wanted).square().mean().log10())
 
 
 def crops(names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Tensor]:
-    """The upper left, the middle and the lower right of photographs, each of half their height and width."""
+    """Upper left, middle and lower right crops of photographs, each of half their height and width."""
     found = {}
     for name in names:
         picture = photograph(name)
@@ -106,7 +106,7 @@ def crops(names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Tensor]:
 
 
 def measure(name: str, image: Tensor, count: int, seed: int, save: Path | None) -> Case:
-    """Every method on one photograph with one set of strokes; what they make is saved side by side."""
+    """Run every method on one photograph with one set of strokes; save the results side by side."""
     grey, mask = split_luminance(image)[0], random_strokes(count, seed, (image.shape[2], image.shape[3]))
     results, shown = {}, [torch.where(mask > 0, image, grey)]
     for method, function in METHODS.items():
@@ -123,7 +123,7 @@ def measure(name: str, image: Tensor, count: int, seed: int, save: Path | None) 
 
 
 def report(cases: list[Case]) -> bool:
-    """Print wins, leads, times and lost comparisons; whether what is promised holds."""
+    """Print wins, leads, times and lost comparisons; return whether the claim holds."""
     leads = [case.lead for case in cases]
     seconds = {method: statistics.median(case.results[method].seconds for case in cases) for method in METHODS}
     over_pieces = [case.results["default"].psnr - case.results["k-means"].psnr for case in cases]
@@ -144,7 +144,7 @@ def report(cases: list[Case]) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print the tables and what is claimed."""
+    """Print the tables and the claim."""
     parser = argparse.ArgumentParser(description="Colours from strokes, against Levin's optimisation.")
     parser.add_argument("--quick", action="store_true", help="one seed at 40x60, to see that it runs")
     parser.add_argument("--pictures", type=Path, help="folder of photographs in place of scikit-image's")

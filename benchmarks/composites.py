@@ -1,8 +1,7 @@
-"""Composites with known transparency: a textured object from one photograph over another, and scribbles on both.
+"""Composites with known opacity: a textured object from one photograph over another, and scribbles on both.
 
-The shapes are drawn at random: blobs, blobs with hairs, with holes, in motion, and out of focus. The photographs whose
-names are in ``CHOOSING`` were used to choose the defaults of masks, recolouring and defocus; those in ``REPORTING``
-were not.
+The shapes are random: blobs, blobs with hairs, with holes, with motion blur, and out of focus. The photographs in
+``CHOOSING`` were used to choose the defaults of masks, recolouring and defocus; those in ``REPORTING`` were not.
 """
 
 import argparse
@@ -48,7 +47,7 @@ class Composite:
     background: Tensor
 
     def scribbles(self, count: int, seed: int) -> tuple[Tensor, Tensor]:
-        """Masks (1, 1, H, W) of as many short strokes on the object and on the background, within each of them."""
+        """Masks (1, 1, H, W) of ``count`` short strokes inside the object, and as many inside the background."""
         random = np.random.default_rng(seed)
         alpha = self.alpha[0, 0].numpy()
         inside, outside = (draw_strokes(place, count, random) for place in (alpha > 0.98, alpha < 0.02))
@@ -56,7 +55,7 @@ class Composite:
 
 
 def draw_strokes(allowed: NDArray[np.bool_], count: int, random: np.random.Generator) -> Tensor:
-    """A mask (1, 1, H, W) of short strokes, spread over an area and away from its border where there is room."""
+    """A mask (1, 1, H, W) of short strokes, spread over an area and away from its border where possible."""
     short = min(allowed.shape)
     depth = cv2.distanceTransform(np.pad(allowed, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     places = np.argwhere(depth >= min(depth.max(), 2 * RADIUS * short))
@@ -79,7 +78,7 @@ def draw_strokes(allowed: NDArray[np.bool_], count: int, random: np.random.Gener
 
 
 def blob(random: np.random.Generator, size: tuple[int, int], radius: float, middle: tuple[float, float]) -> Plane:
-    """A star-shaped area with a wavy border, (H, W), smooth by a pixel."""
+    """An antialiased star-shaped area with a wavy border, (H, W)."""
     scale = 4
     angles = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     reach = np.ones_like(angles)
@@ -94,7 +93,7 @@ def blob(random: np.random.Generator, size: tuple[int, int], radius: float, midd
 
 
 def draw_shape(shape: str, random: np.random.Generator, size: tuple[int, int]) -> Plane:
-    """The opacity (H, W) of an object."""
+    """Draw the opacity (H, W) of an object."""
     height, width = size
     middle = (height * random.uniform(0.42, 0.58), width * random.uniform(0.38, 0.62))
     radius = height * random.uniform(0.24, 0.34)
@@ -127,7 +126,7 @@ def draw_shape(shape: str, random: np.random.Generator, size: tuple[int, int]) -
 
 
 def crop(image: Tensor, share: tuple[float, float], random: np.random.Generator, size: tuple[int, int]) -> Tensor:
-    """A part of a photograph (1, 3, H, W), with a random share of its sides, at another size."""
+    """Cut a part of random size and position from a photograph (1, 3, H, W), and resize it to ``size``."""
     height, width = image.shape[-2:]
     scale = random.uniform(*share) * min(height / size[0], width / size[1])
     rows, columns = int(size[0] * scale), int(size[1] * scale)
@@ -138,7 +137,7 @@ def crop(image: Tensor, share: tuple[float, float], random: np.random.Generator,
 
 
 def composites(count: int, first_seed: int, images: dict[str, Tensor], size: tuple[int, int]) -> Iterator[Composite]:
-    """As many composites; equal seeds give equal ones."""
+    """Yield ``count`` composites, each reproducible from its seed."""
     names = sorted(images)
     for seed in range(first_seed, first_seed + count):
         random = np.random.default_rng(seed)
@@ -152,7 +151,7 @@ def composites(count: int, first_seed: int, images: dict[str, Tensor], size: tup
 
 
 def sources(folder: Path | None, kind: str) -> dict[str, Tensor]:
-    """The photographs that composites are made of: those in a folder, or scikit-image's of a set."""
+    """The photographs for composites: those in a folder, or those of scikit-image in a set."""
     if folder is not None:
         return pictures(folder, 426, ())
     names = CHOOSING if kind == "choosing" else REPORTING
@@ -161,15 +160,15 @@ def sources(folder: Path | None, kind: str) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class Setup:
-    """What a benchmark of composites measures.
+    """Options of a benchmark on composites.
 
     Attributes:
-        count: of composites.
-        size: of each, (H, W).
-        images: that they are made of.
-        first: seed of the first one.
-        kind: which set of photographs and seeds.
-        quick: whether only to see that it runs.
+        count: number of composites.
+        size: (H, W) of each.
+        images: photographs that they are made of.
+        first: seed of the first composite.
+        kind: set of photographs and seeds.
+        quick: whether this is only a check that the benchmark runs.
     """
 
     count: int
@@ -181,7 +180,7 @@ class Setup:
 
 
 def setup(description: str, arguments: list[str] | None) -> Setup:
-    """From the options of the command line."""
+    """Read the options of the command line."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
     parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")

@@ -1,7 +1,7 @@
-"""What the denoiser trains on: crops of scikit-image's pictures, changed at random, patterns, and noise.
+"""Training data of the denoiser: randomly augmented crops of scikit-image's pictures, synthetic patterns, and noise.
 
-The pictures to judge on (:mod:`benchmarks.denoising`) are not among them; of ``retina`` and ``page`` these are the left
-halves, and the right halves are here.
+The test pictures of :mod:`benchmarks.denoising` are not among them; of ``retina`` and ``page`` the left halves are for
+testing, and the right halves for training.
 """
 
 import math
@@ -33,15 +33,15 @@ PICTURES = {
 RIGHT_HALVES = ("retina", "page")
 SCALES = (1.0, 0.8, 0.6, 0.4, 0.28)
 LARGEST = 60 / 255  # standard deviation of noise
-MISSTATED = 0.75, 1.35  # noise as told over the noise that is there, in half of the crops
+MISSTATED = 0.75, 1.35  # range of given over actual noise level, in half of the crops
 
 
 class Crops:
-    """Random crops with noise, the same ones for equal seeds.
+    """Random crops with noise, reproducible from a seed.
 
     Args:
         side: of the crops, in pixels.
-        seed: of all that is random.
+        seed: of all random numbers.
     """
 
     def __init__(self, side: int, seed: int) -> None:
@@ -61,7 +61,7 @@ class Crops:
         self.weights = torch.tensor(weights)
 
     def batch(self, count: int, *, grey: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Clean and noisy crops (B, 1 or 3, side, side), and the noise that the denoiser is told."""
+        """Clean and noisy crops (B, 1 or 3, side, side), and the noise level that the denoiser is given."""
         clean = torch.stack([self._clean(grey) for _ in range(count)])
         return (clean, *self._noise(clean))
 
@@ -90,21 +90,21 @@ class Crops:
         return 1 - crop if self._chance(0.1) else crop
 
     def _cut(self) -> Tensor:
-        """A crop (C, side, side), turned and mirrored."""
+        """A crop (C, side, side), rotated and mirrored at random."""
         picture = self.pictures[int(torch.multinomial(self.weights, 1, generator=self.generator))]
         row, column = (self._below(length - self.side + 1) for length in picture.shape[-2:])
         crop = torch.rot90(picture[:, row : row + self.side, column : column + self.side], self._below(4), (1, 2))
         return crop.flip(2) if self._chance(0.5) else crop
 
     def _blend(self, first: Tensor, second: Tensor) -> Tensor:
-        """Two crops on top of each other, or beside each other with a soft or sharp border."""
+        """Blend two crops, or put them side by side with a soft or sharp border."""
         if self._chance(0.5):
             return torch.lerp(*torch.broadcast_tensors(first, second), self._number())
         share = (self._smooth(1, 2 + self._below(5)) * self._number(5, 45) + 0.5).clamp(0, 1)
         return share * first + (1 - share) * second
 
     def _pattern(self) -> Tensor:
-        """Regions, stripes, lines or shades (3, side, side)."""
+        """A random pattern (3, side, side) of regions, stripes, lines or shades."""
         smooth = self._smooth(3, 2 + self._below(14))
         colours = self._random(3, 3, 1, 1)
         kind = self._below(4)
@@ -123,17 +123,17 @@ class Crops:
         return torch.lerp(colours[0], colours[1], share)
 
     def _smooth(self, planes: int, count: int) -> Tensor:
-        """Smooth random planes (planes, side, side) of unit variance at ``count`` points."""
+        """Smooth random planes (planes, side, side), interpolated from ``count`` x ``count`` standard normal values."""
         values = torch.randn(1, planes, count, count, generator=self.generator)
         return F.interpolate(values, (self.side, self.side), mode="bicubic")[0]
 
     def _as_grey(self, crop: Tensor) -> Tensor:
-        """One channel, the channels mixed at random."""
+        """A random mixture of the channels, as one channel."""
         mixture = self._random(len(crop), 1, 1) + 0.1
         return (crop * (mixture / mixture.sum())).sum(0, keepdim=True)
 
     def _as_colour(self, crop: Tensor) -> Tensor:
-        """Three channels: grey ones between two colours, or others in another order and of another saturation."""
+        """Three channels: tint a grey crop between two colours, or change order, saturation and light of colours."""
         if len(crop) == 1:
             if self._chance(0.5):
                 return crop.expand(3, -1, -1)
@@ -143,12 +143,12 @@ class Crops:
         if self._chance(0.6):
             mean = crop.mean(0, keepdim=True)
             crop = torch.lerp(mean.expand_as(crop), crop, self._number(0, 1.5)).clamp(0, 1)
-        if self._chance(0.35):  # light of another colour
+        if self._chance(0.35):  # coloured light
             crop = crop.clamp(0, 1) ** (0.7 + 0.8 * self._random(3, 1, 1)) * (0.15 + 0.85 * self._random(3, 1, 1))
         return crop
 
     def _noise(self, clean: Tensor) -> tuple[Tensor, Tensor]:
-        """Noisy crops and what is told of the noise: even, changing from place to place, or with the light."""
+        """Noisy crops and the given noise level: uniform, varying over the crop, or dependent on brightness."""
         each = (len(clean), 1, 1, 1)
         level = LARGEST * self._random(*each) ** 1.4
         shades = F.interpolate(self._random(len(clean), 1, 3, 3), clean.shape[-2:], mode="bilinear", align_corners=True)
@@ -159,7 +159,9 @@ class Crops:
         uneven = torch.where(kind < 0.7, even, level * (0.3 + 1.4 * shades))
         deviation = torch.where(kind < 0.82, uneven, (gain * clean.clamp(min=0) + dark).sqrt())
         noisy = clean + deviation * torch.randn(clean.shape, generator=self.generator)
-        seen = F.avg_pool2d(F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1)  # the light as it can be known
+        seen = F.avg_pool2d(
+            F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1
+        )  # brightness, as far as it can be estimated
         told = torch.where(kind < 0.82, uneven, (gain * seen.clamp(min=0) + dark).sqrt())
         low, high = (math.log(factor) for factor in MISSTATED)
         factor = (low + (high - low) * self._random(*each)).exp()

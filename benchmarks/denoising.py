@@ -1,21 +1,21 @@
-"""Denoisers beside each other: ``python -m benchmarks.denoising [--pictures FOLDER] [--methods NAMES] [--out FILE]``.
+"""Comparison of denoisers: ``python -m benchmarks.denoising [--pictures FOLDER] [--methods NAMES] [--out FILE]``.
 
-Photographs that nothing was trained on, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour: PSNR,
-SSIM and CPU seconds of
+On photographs that were not used in training, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour:
+PSNR, SSIM and CPU seconds of
 
-ours             ``nlfilter_torch.denoise``, told the noise; the mean of four turned images; with the noise measured;
+ours             ``nlfilter_torch.denoise``, given the noise level; the mean over four rotations; with estimated noise;
 rule             ``denoise(method="rule")``: sliders by rule, nothing learned;
 BM3D, CBM3D      package ``bm3d``;
-scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` of the best of five weights for
-                 each photograph;
+scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` with the best of five weights
+                 for each photograph;
 OpenCV           ``fastNlMeansDenoising`` on 8 bits, with the best of four strengths for each photograph;
 plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.train_denoiser --plain``.
 
-``--methods``, ``--noise`` and ``--kinds`` choose a part of it; what is measured is added to the file ``--out``, from
-which ``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` judges other weights than those of the
+``--methods``, ``--noise`` and ``--kinds`` select a part of it; results are added to the file ``--out``, from which
+``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` evaluates other weights than those of the
 package, and may be given several times. Without ``--pictures``, the photographs are camera, coffee, chelsea and the
-left halves of retina and page. ``--wrong`` adds: noise misstated by a fifth, noise that depends on the light, and clean
-photographs.
+left halves of retina and page. ``--wrong`` adds noise levels misstated by a fifth, noise that depends on brightness,
+and clean photographs.
 """
 
 import argparse
@@ -43,13 +43,13 @@ LEFT_HALVES = ("retina", "page")
 NOISE = (5, 15, 25, 50)  # grey levels
 OPENCV_STRENGTHS = (0.6, 0.8, 1.0, 1.2)  # times the noise level
 TV_WEIGHTS = (0.5, 0.7, 0.9, 1.1, 1.4)  # times the noise level
-GAINS, FLOOR = (0.002, 0.01), 2 / 255  # of noise that grows with the light, as in cameras
+GAINS, FLOOR = (0.002, 0.01), 2 / 255  # of noise whose variance grows with brightness, as in cameras
 LONGEST = 512  # pixels of the longer side; larger photographs are reduced
 
 
 @dataclass(frozen=True)
 class Case:
-    """A photograph (1, 1 or 3, H, W) in [0, 1], the same with noise, which may leave that range, and the noise."""
+    """A photograph (1, 1 or 3, H, W) in [0, 1], its noisy version, not clipped, and the noise level."""
 
     name: str
     clean: Tensor
@@ -63,7 +63,7 @@ class Case:
 
     @property
     def axis(self) -> int | None:
-        """The axis of colours."""
+        """The axis of colours in :attr:`array`, if any."""
         return None if self.noisy.shape[1] == 1 else -1
 
 
@@ -72,7 +72,7 @@ Method = Callable[[Case], Tensor]
 
 @dataclass(frozen=True)
 class Figures:
-    """What a method makes of a photograph."""
+    """Measurements of a method on one photograph."""
 
     psnr: float
     ssim: float
@@ -80,7 +80,7 @@ class Figures:
 
 
 def scenes(folder: Path | None, kind: str, *, quick: bool) -> dict[str, Tensor]:
-    """Photographs (1, 1 or 3, H, W) by name, in ``"grey"`` or ``"colour"``; grey ones are none in colour."""
+    """Photographs (1, 1 or 3, H, W) by name, in ``"grey"`` or ``"colour"``; grey ones are left out of the latter."""
     if folder is not None:
         found = pictures(folder, 320, ())
     else:
@@ -100,23 +100,23 @@ def scenes(folder: Path | None, kind: str, *, quick: bool) -> dict[str, Tensor]:
 
 
 def with_noise(clean: Tensor, noise: float | Tensor, number: int) -> Tensor:
-    """A photograph with noise of its own number, not clipped."""
+    """Add noise of seed ``number`` to a photograph, without clipping."""
     generator = torch.Generator().manual_seed(1000 + number)
     return clean + noise * torch.randn(clean.shape, generator=generator)
 
 
 def decibels(squared_error: float) -> float:
-    """A mean squared error of images in [0, 1] as a PSNR."""
+    """Convert a mean squared error of images in [0, 1] to a PSNR."""
     return -10 * math.log10(max(squared_error, 1e-12))
 
 
 def psnr(image: Tensor, clean: Tensor) -> float:
-    """Peak signal to noise ratio in decibels."""
+    """Peak signal-to-noise ratio in decibels."""
     return decibels(float((image - clean).double().square().mean()))
 
 
 def ssim(image: Tensor, clean: Tensor) -> float:
-    """Structural similarity, with the Gaussian window of the paper that defined it."""
+    """Structural similarity, with the Gaussian window of its original paper."""
     from skimage.metrics import structural_similarity
 
     arrays = [picture[0].permute(1, 2, 0).double().numpy() for picture in (image, clean)]
@@ -127,12 +127,12 @@ def ssim(image: Tensor, clean: Tensor) -> float:
 
 
 def as_array(image: Tensor) -> np.ndarray:
-    """(1, C, H, W) as (H, W) or (H, W, 3)."""
+    """Convert (1, C, H, W) to (H, W) or (H, W, 3)."""
     return image[0].permute(1, 2, 0).squeeze(2).double().numpy()
 
 
 def as_image(array: np.ndarray) -> Tensor:
-    """The inverse of :func:`as_array`."""
+    """Invert :func:`as_array`."""
     tensor = torch.from_numpy(np.ascontiguousarray(array)).float()
     return (tensor[..., None] if tensor.ndim == 2 else tensor).permute(2, 0, 1)[None]
 
@@ -162,7 +162,7 @@ def wavelets(case: Case) -> Tensor:
 
 
 def total_variation(case: Case) -> Tensor:
-    """Total variation of scikit-image, of the weight that is best on this very photograph."""
+    """Total variation of scikit-image, with the weight that is best for this photograph."""
     from skimage.restoration import denoise_tv_chambolle
 
     return best(
@@ -172,7 +172,7 @@ def total_variation(case: Case) -> Tensor:
 
 
 def opencv(case: Case) -> Tensor:
-    """Non-local means of OpenCV, which takes 8 bits, of the strength that is best on this very photograph."""
+    """Non-local means of OpenCV, which needs 8 bits, with the strength that is best for this photograph."""
     import cv2
 
     pixels = (case.array.clip(0, 1) * 255).round().astype(np.uint8)
@@ -185,13 +185,13 @@ def opencv(case: Case) -> Tensor:
 
 
 def best(case: Case, results: Iterable[Tensor]) -> Tensor:
-    """The result of the highest PSNR."""
+    """Select the result of the highest PSNR."""
     return max(results, key=lambda found: psnr(found, case.clean))
 
 
 @cache
 def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method:
-    """The trained network of a file, or of the package, told the noise."""
+    """The trained network from a file or from the package, given the noise level."""
     from benchmarks.train_denoiser import PlainDenoiser
 
     kind = PlainDenoiser if plain else NonlocalDenoiser
@@ -205,7 +205,7 @@ def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method
     return run
 
 
-#: What ``--methods`` takes.
+#: Choices of ``--methods``.
 METHODS: dict[str, Method] = {
     "noisy": lambda case: case.noisy,
     "ours": lambda case: network(None)(case),
@@ -221,7 +221,7 @@ METHODS: dict[str, Method] = {
 
 
 def judge(method: Method, case: Case) -> Figures:
-    """What a method makes of a photograph."""
+    """Run a method on a photograph and measure the result."""
     start = time.process_time()
     found = method(case)
     seconds = time.process_time() - start
@@ -229,7 +229,7 @@ def judge(method: Method, case: Case) -> Figures:
 
 
 def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dict[str, Figures]]:
-    """Print the PSNR of each photograph, and the means of all figures, row by row as they come."""
+    """Print the PSNR of each photograph and the means of all measurements, one row per method."""
     print(f"{'':22}" + "".join(f"{case.name[:9]:>10}" for case in cases) + f"{'mean':>10}{'SSIM':>8}{'CPU s':>8}")
     rows: dict[str, dict[str, Figures]] = {}
     for name, method in methods.items():
@@ -242,7 +242,7 @@ def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dic
 
 
 def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
-    """Print what is lost where the noise is told wrong, depends on the light, or is not there."""
+    """Print results for misstated noise levels, for noise that depends on brightness, and for clean photographs."""
     print("\nmean loss in dB with the noise told 0.8 and 1.2 times as strong")
     for level in NOISE:
         losses = {}

@@ -1,8 +1,8 @@
 """Tables of denoisers: ``python -m benchmarks.denoising_tables FILE [--docs FILE] [--readme FILE]``.
 
 FILE is the JSON of ``python -m benchmarks.denoising --out FILE``. Prints means over photographs of PSNR in dB, SSIM and
-CPU seconds, and puts them between the markers of the named files: those of all methods into ``--docs``, those of a few
-into ``--readme``.
+CPU seconds, and writes them between markers: the table of all methods into ``--docs``, that of a few methods into
+``--readme``.
 """
 
 import argparse
@@ -21,13 +21,13 @@ Results = dict[str, dict[str, Any]]
 
 
 def mean(results: Results, kind: str, level: str, method: str, figure: str) -> float | None:
-    """The mean of a figure over the photographs, None if it was not measured."""
+    """The mean of a measurement over the photographs, or None if there is none."""
     found = results.get(f"{kind}, {level}", {}).get(method)
     return None if found is None else statistics.mean(each[figure] for each in found.values())
 
 
 def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tuple[str, str, str]]) -> str:
-    """A table for each kind of photograph: a method a row, a noise level a column."""
+    """A table for each kind of photograph, with one row per method and one column per noise level."""
     parts = []
     for kind in dict.fromkeys(key.split(", ")[0] for key in results):
         levels = [key.split(", ")[1] for key in results if key.startswith(f"{kind}, ")]
@@ -40,7 +40,7 @@ def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tu
             row = ["CBM3D" if (kind, name) == ("colour", "BM3D") else name]
             for _, figure, form in figures:
                 found = [mean(results, kind, level, name, figure) for level in levels]
-                if figure == "seconds":  # much the same at all levels
+                if figure == "seconds":  # nearly the same at all noise levels
                     known = [value for value in found if value is not None]
                     found = [statistics.mean(known)] if known else [None]
                 row += ["" if value is None else format(value, form) for value in found]
@@ -53,7 +53,7 @@ def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tu
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the tables, and write them."""
+    """Print the tables, and write them to files."""
     parser = argparse.ArgumentParser(description="Tables of denoisers.")
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.denoising")
     parser.add_argument("--docs", type=Path, help="file for the table of all methods")

@@ -1,19 +1,19 @@
 """Detail against other methods at equal gain: ``python -m benchmarks.detail [--pictures FOLDER] [--quick] [--scales]``.
 
-The detail preset (sliders g, g, g, 1 and the defaults of ``enhance``) and other methods strengthen the luminance of
-the same photographs. Their strength is set by bisection so that the fine part, what a Gaussian of 2 pixels takes away,
-is 1.5 and 2 times as strong (RMS) on mid-strength texture: pixels whose surroundings have between 50 and 85 % of the
-picture's activity. Everything is measured on what a file of 8 bits would hold:
+The detail preset (sliders g, g, g, 1 and the defaults of ``enhance``) and other methods boost the detail of the
+luminance of the same photographs. Their strength is set by bisection so that the fine part, which a Gaussian of 2
+pixels removes, is 1.5 and 2 times as strong (RMS) on mid-strength texture: pixels whose local activity is between the
+50 and 85 % quantiles of the picture. Everything is measured after rounding to 8 bits:
 
-halo      99th percentile of what lies beyond the local range of 11x11 pixels, in grey levels;
-noise     noise of 5 grey levels after the edit, over before, where the picture is flat (its calmer half), of two
-          realisations of noise;
-clipped   pixels of which a channel becomes 0 or 255 that was not, in percent;
+halo      99th percentile of the excess over the local range of 11x11 pixels, in grey levels;
+noise     ratio, after to before the edit, of noise of 5 grey levels in flat areas (the half of the picture with less
+          activity), from two realisations of noise;
+clipped   pixels with a channel that becomes 0 or 255 but was not before, in percent;
 chroma    change of the mean chroma (YCbCr), in percent;
 mean      change of the mean brightness, in grey levels.
 
 With ``--scales``, one large photograph at 1.5, 6 and 24 megapixels under the same sliders: detail gain of each result
-reduced to 1.5 megapixels, and how far these are apart.
+reduced to 1.5 megapixels, and the differences between these results.
 """
 
 import argparse
@@ -46,12 +46,12 @@ LARGE = "retina"
 FACTORS = (1, 2, 4)  # of the sides
 OURS = "nlfilter-torch"
 
-Strength = Callable[[float], Tensor]  # the photograph under a strength, 0 for none
+Strength = Callable[[float], Tensor]  # strength to the edited photograph; 0 leaves it unchanged
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What is measured of one result."""
+    """Measurements of one result."""
 
     halo: float
     noise: float
@@ -61,32 +61,32 @@ class Figures:
 
     @property
     def costs(self) -> tuple[float, float, float]:
-        """Those that are to be small."""
+        """The measurements that should be small."""
         return (self.halo, self.noise, self.clipped)
 
     def beats(self, other: "Figures") -> bool:
-        """Whether it is nowhere worse and somewhere better."""
+        """Whether this result dominates another: no measurement is worse, and at least one is better."""
         pairs = list(zip(self.costs, other.costs, strict=True))
         return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
 
 
 def luminance(image: Tensor) -> Tensor:
-    """(B, 1, H, W)."""
+    """The luminance (B, 1, H, W) of an image."""
     return reduce_channels(image, "luminance")
 
 
 def shown(image: Tensor) -> Tensor:
-    """As a file of 8 bits holds it."""
+    """Round an image to 8 bits."""
     return (image.clamp(0, 1) * 255).round() / 255
 
 
 def fine(y: Tensor) -> Tensor:
-    """What a Gaussian of 2 pixels takes away."""
+    """The part that a Gaussian of 2 pixels removes."""
     return y - gaussian(y, RADIUS)
 
 
 class Scene:
-    """A photograph, the same with noise, and where to look."""
+    """A photograph, noisy versions of it, and the areas to measure in."""
 
     def __init__(self, image: Tensor) -> None:
         self.image = shown(image)
@@ -99,12 +99,12 @@ class Scene:
         self.flat = activity < low
 
     def gain(self, result: Tensor) -> float:
-        """Of detail, on mid-strength texture."""
+        """Detail gain on mid-strength texture."""
         after = fine(luminance(shown(result)))[self.texture]
         return float((after.square().mean() / self.fine[self.texture].square().mean()).sqrt())
 
     def figures(self, result: Tensor, noisy: list[Tensor]) -> Figures:
-        """Of a result, and of those of the noisy copies."""
+        """Measurements of a result, given the results for the noisy versions."""
         before, after = self.image, shown(result)
         y, z = luminance(before), luminance(after)
         highest, lowest = F.max_pool2d(y, 11, 1, 5), -F.max_pool2d(-y, 11, 1, 5)
@@ -122,7 +122,7 @@ class Scene:
 
 
 def ours(image: Tensor) -> Strength:
-    """The detail edit for any strength from one filter: before the limits it is linear in the sliders."""
+    """The detail edit for any strength from a single filter run: it is linear in the sliders before the limits."""
     change = luminance(enhance(image, torch.tensor([2.0, 2.0, 2.0, 1.0]), limits="none")) - luminance(image)
 
     def edit(strength: float) -> Tensor:
@@ -133,7 +133,7 @@ def ours(image: Tensor) -> Strength:
 
 
 def boosted(smooth: Callable[..., object]) -> Callable[[Tensor], Strength]:
-    """A method that adds a multiple of what a smoothing filter takes away."""
+    """A method that adds a multiple of the detail removed by a smoothing filter."""
 
     def of(image: Tensor) -> Strength:
         y = luminance(image)
@@ -161,7 +161,7 @@ METHODS: dict[str, Callable[[Tensor], Strength]] = {
 
 
 def reach(scene: Scene, strength: Strength, gain: float) -> float | None:
-    """The strength that has the gain, or None where none has."""
+    """Find the strength with the given gain, or None if there is none."""
     low, high = 0.0, 1.0
     while scene.gain(strength(high)) < gain:
         low, high = high, 2 * high
@@ -174,7 +174,7 @@ def reach(scene: Scene, strength: Strength, gain: float) -> float | None:
 
 
 def measure(scene: Scene) -> dict[float, dict[str, Figures | None]]:
-    """Figures of every method for every gain; None where it does not reach it."""
+    """Measure every method for every gain; None if a method does not reach the gain."""
     found: dict[float, dict[str, Figures | None]] = {gain: {} for gain in GAINS}
     for name, method in METHODS.items():
         clean, *noisy = (method(image) for image in (scene.image, *scene.noisy))
@@ -188,12 +188,12 @@ def measure(scene: Scene) -> dict[float, dict[str, Figures | None]]:
 
 
 def row(cells: list[str]) -> str:
-    """Of a table."""
+    """Format a row of a table."""
     return f"{cells[0]:18}" + "".join(f"{cell:>9}" for cell in cells[1:])
 
 
 def compare(images: dict[str, Tensor]) -> None:
-    """Print a table for each picture and gain, and what it says."""
+    """Print a table for each picture and gain, and a summary."""
     lost: list[str] = []
     fronts = least = cases = 0
     worst = [0.0, 0.0]

@@ -1,7 +1,7 @@
-"""Other ways to strengthen the details of a photograph: what a smoothing filter takes away, times a gain.
+"""Other methods to boost the details of a photograph: the part that a smoothing filter removes, times a gain.
 
-The local Laplacian filter after Aubry, Paris, Hasinoff, Kautz and Durand, "Fast Local Laplacian Filters", ACM
-Transactions on Graphics 33(5), 2014, is a reference of our own; all others are OpenCV's.
+The local Laplacian filter, after Aubry, Paris, Hasinoff, Kautz and Durand, "Fast Local Laplacian Filters", ACM
+Transactions on Graphics 33(5), 2014, is implemented here; all others are OpenCV's.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Plane = NDArray[np.float32]
-SAMPLES = 16  # brightnesses that the local Laplacian filter is worked out at
-CONTRAST = 0.15  # up to which differences count as detail there
+SAMPLES = 16  # brightness levels at which the local Laplacian filter is computed
+CONTRAST = 0.15  # largest difference that counts as detail in the local Laplacian filter
 
 
 def smoothers() -> dict[str, Callable[[Plane], Plane]]:
-    """Edge-preserving filters of luminance (H, W) in [0, 1], at settings that are usual for detail."""
+    """Edge-preserving filters of luminance (H, W) in [0, 1], with settings that are usual for detail."""
     ximgproc = cv2.ximgproc
 
     def bytes_of(y: Plane) -> NDArray[np.uint8]:
@@ -37,7 +37,7 @@ def smoothers() -> dict[str, Callable[[Plane], Plane]]:
 
 
 def local_laplacian_detail(y: Tensor, sigma: float = CONTRAST) -> Tensor:
-    """What a local Laplacian filter adds to luminance (1, 1, H, W) for a strength of 1; it is linear in the strength.
+    """Detail that a local Laplacian filter of strength 1 adds to luminance (1, 1, H, W); it is linear in the strength.
 
     The picture is remapped around every sample g of brightness to ``(y - g) exp(-(y - g)^2 / 2 sigma^2)``; the level
     of the result's Laplacian pyramid is interpolated at the brightness of the picture's Gaussian pyramid.
@@ -68,7 +68,7 @@ def _halve(plane: Tensor) -> Tensor:
 
 
 def _double(plane: Tensor, like: Tensor) -> Tensor:
-    """A level enlarged to the one below it."""
+    """Enlarge a level to the size of the next finer one."""
     spread = torch.zeros_like(like)
     spread[..., ::2, ::2] = plane
     weights = torch.zeros_like(like)
@@ -83,14 +83,14 @@ def _blur(plane: Tensor) -> Tensor:
 
 
 def detail_enhance(image: Tensor, strength: float) -> Tensor:
-    """OpenCV's detailEnhance of an RGB image (1, 3, H, W); its range grows with the strength."""
+    """OpenCV's detailEnhance of an RGB image (1, 3, H, W); ``sigma_r`` grows with the strength."""
     rows = np.ascontiguousarray((image[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
     found = cv2.detailEnhance(rows, sigma_s=10, sigma_r=min(0.02 * strength, 1.0))
     return torch.from_numpy(found).permute(2, 0, 1)[None].float() / 255
 
 
 def clahe(y: Plane, strength: float) -> Plane:
-    """Contrast-limited adaptive histogram equalization of luminance; its limit grows with the strength."""
+    """Contrast-limited adaptive histogram equalisation of luminance; the clip limit grows with the strength."""
     equalizer = cv2.createCLAHE(clipLimit=0.2 + strength, tileGridSize=(8, 8))
     found: Plane = equalizer.apply(np.rint(y * 65535).astype(np.uint16)).astype(np.float32) / 65535
     return found

@@ -1,13 +1,13 @@
 """The README's pictures, sharpening against an unsharp mask: ``python -m benchmarks.detail_pictures [FOLDER]``.
 
-Both edit the luminance of the same photograph and leave its colour. The unsharp mask is scikit-image's, of radius 2,
+Both edit the luminance of the same photograph and keep its colour. The unsharp mask is scikit-image's, of radius 2,
 with the amount that gives the same detail gain: the ratio, after to before, of the RMS difference between luminance and
-its own Gaussian blur of 2 pixels. Three figures of each are printed, the lost comparisons too:
+its Gaussian blur of 2 pixels. Three measurements of each are printed, including lost comparisons:
 
-* noise gain: the same ratio over the tenth of 8x8 blocks that has the least of it before;
-* halo: how far, on average over the steepest twentieth of pixels, the result leaves the range that the photograph
-  itself has within 4 pixels, in grey levels;
-* clipped: pixels that are pushed out of [0, 255] by more than a level, in percent.
+* noise gain: the same ratio over the tenth of 8x8 blocks where that difference is smallest before;
+* halo: mean distance, over the steepest twentieth of pixels, by which the result leaves the range of the photograph
+  within 4 pixels, in grey levels;
+* clipped: pixels that leave [0, 255] by more than a level, in percent.
 """
 
 import argparse
@@ -31,30 +31,30 @@ from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.plotting import save_figure, show_images
 
 RADIUS = 2.0
-# The part of each photograph that is shown, at its own scale, by its upper left corner; the figures are of the whole.
+# Upper left corner of the part of each photograph that is shown at full size; measurements are of the whole.
 CROPS = {"coffee": (130, 180), "chelsea": (15, 90), "astronaut": (20, 90)}
 SIDE = 270
 
 
 def fine_part(luminance: Tensor) -> Tensor:
-    """What a Gaussian blur of 2 pixels takes away."""
+    """The part that a Gaussian blur of 2 pixels removes."""
     return luminance - gaussian_blur2d(luminance, (13, 13), (RADIUS, RADIUS))
 
 
 def detail_gain(before: Tensor, after: Tensor) -> float:
-    """RMS of the fine part, after to before."""
+    """Ratio of the RMS of the fine part, after to before."""
     return float(fine_part(after).square().mean().sqrt() / fine_part(before).square().mean().sqrt())
 
 
 def noise_gain(before: Tensor, after: Tensor) -> float:
-    """RMS of the fine part over the flattest tenth of blocks, after to before."""
+    """Ratio of the RMS of the fine part over the flattest tenth of blocks, after to before."""
     energies = [torch.nn.functional.avg_pool2d(fine_part(y).square(), 8).flatten() for y in (before, after)]
     flat = energies[0] <= energies[0].quantile(0.1)
     return float((energies[1][flat].mean() / energies[0][flat].mean()).sqrt())
 
 
 def halo(before: Tensor, after: Tensor) -> float:
-    """Grey levels beyond the range of the surroundings, at steep edges."""
+    """Mean excess over the local range at steep edges, in grey levels."""
     window = torch.ones(9, 9)
     beyond = (after - dilation(before, window)).clamp(min=0) + (erosion(before, window) - after).clamp(min=0)
     slope = spatial_gradient(before).square().sum(2).sqrt()
@@ -62,7 +62,7 @@ def halo(before: Tensor, after: Tensor) -> float:
 
 
 def clipped(after: Tensor) -> float:
-    """Per cent of pixels outside the range by more than a grey level."""
+    """Percentage of pixels outside the range by more than a grey level."""
     return 100 * float(((after < -1 / 255) | (after > 256 / 255)).float().mean())
 
 
@@ -78,7 +78,7 @@ def unsharp(amount: float) -> Callable[[Tensor], Tensor]:
 
 
 def matching_amount(luminance: Tensor, gain: float) -> float:
-    """The amount of the unsharp mask that has a detail gain of ``gain``, which grows with it."""
+    """Find the amount of the unsharp mask with a detail gain of ``gain``, by bisection."""
     low, high = 0.0, 20.0
     for _ in range(30):
         middle = (low + high) / 2
@@ -90,7 +90,7 @@ def matching_amount(luminance: Tensor, gain: float) -> float:
 
 
 def main() -> None:
-    """Write one picture for each photograph and print the figures."""
+    """Write one picture for each photograph and print the measurements."""
     parser = argparse.ArgumentParser(description="Sharpening against an unsharp mask of equal detail gain.")
     parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where the pictures go")
     folder = parser.parse_args().folder

@@ -1,9 +1,9 @@
-"""What the ranks send when one image is spread over them: ``python -m benchmarks.distributed [--ranks 3]``.
+"""Communication between ranks that share one image: ``python -m benchmarks.distributed [--ranks 3]``.
 
-Counts the bytes of every tensor that a rank hands to ``torch.distributed`` in one forward and one backward pass, for
-images of several heights. A ring that sums over n ranks sends each such byte 2 (n - 1) / n times; what it sends on the
-wire besides is not counted. Processes of this machine are used, or, under ``torchrun -m benchmarks.distributed``, the
-ranks that it starts, with NCCL where there are GPUs.
+Counts the bytes of every tensor that a rank passes to ``torch.distributed`` in one forward and one backward pass, for
+images of several heights. A ring all-reduce over n ranks sends each such byte 2 (n - 1) / n times; protocol overhead is
+not counted. The ranks are processes on this machine, or, under ``torchrun -m benchmarks.distributed``, those that it
+starts, with NCCL if there are GPUs.
 """
 
 import argparse
@@ -30,12 +30,12 @@ ALPHA = (3.0, 3.0, 4.0, 1.05)
 
 @dataclass
 class Traffic:
-    """What this rank handed to ``torch.distributed``.
+    """Tensors that this rank passed to ``torch.distributed``.
 
     Attributes:
-        sent: bytes of ``sums`` (and maxima) over the ranks, of ``choices`` that the first rank tells the others, of
-            ``halo`` rows for neighbours, and of the ``shapes`` that ranks tell each other.
-        calls: how often, over all.
+        sent: bytes of ``sums`` (and maxima) over the ranks, of ``choices`` that the first rank broadcasts, of ``halo``
+            rows for neighbours, and of ``shapes`` in all-gathers.
+        calls: total number of calls.
     """
 
     sent: Counter[str] = field(default_factory=Counter)
@@ -49,7 +49,7 @@ class Traffic:
 
 @contextmanager
 def watched() -> Iterator[Traffic]:
-    """Count what is sent inside the block."""
+    """Count the tensors sent inside the block."""
     traffic = Traffic()
     reduce, broadcast, gather, swap = dist.all_reduce, dist.broadcast, dist.all_gather, dist.batch_isend_irecv
 
@@ -76,12 +76,12 @@ def watched() -> Iterator[Traffic]:
 
 
 def share(image: Tensor, rank: int, ranks: int) -> Tensor:
-    """The rows of an image that a rank has."""
+    """The rows of an image that a rank holds."""
     return image.tensor_split(ranks, dim=2)[rank]
 
 
 def measure(side: int, height: int, landmarks: int, device: torch.device) -> list[str]:
-    """A row of the table, from this rank."""
+    """Measure one case on this rank, and return a row of the table."""
     rank, ranks = dist.get_rank(), dist.get_world_size()
     whole = picture(side).repeat(1, 1, -(-height // side), 1)[:, :, :height]
     rows = share(whole, rank, ranks).to(device).requires_grad_()
@@ -114,7 +114,7 @@ HEAD += ["backward", "calls", "forward s", "backward s"]
 
 
 def work(options: argparse.Namespace) -> None:
-    """What every rank does; the first one prints."""
+    """Measure all cases on every rank; the first rank prints the table."""
     device = torch.device("cpu")
     if dist.get_backend() == "nccl":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))

@@ -12,7 +12,7 @@ from tests.browser import Editor, Tab, chromium
 
 
 def main() -> None:
-    """Open the cat, choose sliders, draw the wipe to the middle, and take the picture."""
+    """Open a photograph of a cat, move sliders, drag the before-and-after wipe to the middle, and take a screenshot."""
     target = Path(sys.argv[1]) / "editor.jpg"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,7 +1,7 @@
-"""What masks and edits have to keep, and how well they do: ``python -m benchmarks.edits [--out FILE]``.
+"""Claims about masks and edits, and whether they hold: ``python -m benchmarks.edits [--out FILE]``.
 
-One line for every promise, with its limit and what was measured, on photographs that ship with scikit-image. The larger
-comparisons have modules of their own: ``benchmarks.colorize``, ``benchmarks.sharpening``, ``benchmarks.figures``.
+Prints one line per claim, with its limit and the measured value, on photographs that ship with scikit-image. Larger
+comparisons have their own modules: ``benchmarks.colorize``, ``benchmarks.sharpening``, ``benchmarks.figures``.
 """
 
 import argparse
@@ -38,7 +38,7 @@ STEP = 7  # pixels that the camera moves from frame to frame
 
 @dataclass(frozen=True)
 class Promise:
-    """A figure that has to be at least, or at most, its limit."""
+    """A claim that a measured value is at least, or at most, its limit."""
 
     what: str
     limit: float
@@ -47,19 +47,19 @@ class Promise:
 
     @property
     def holds(self) -> bool:
-        """Is it kept?"""
+        """Whether the measured value is within the limit."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
 
 def _astronaut(side: int) -> tuple[Tensor, Tensor, Spectrum]:
-    """Photograph, spot on the suit, and the spectrum that compares colours."""
+    """Photograph, scribble on the suit, and spectrum of an operator that compares colours."""
     image, scale = scene("astronaut", side)
     operator = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all")
     return image, spots(image, scale, SUIT), operator.spectrum()
 
 
 def masks() -> Iterator[Promise]:
-    """Of a spot on the astronaut's suit, RGB guide, h = 25/255."""
+    """Masks of a scribble on the astronaut's suit, with RGB guide and h = 25/255."""
     _, spot, whole = _astronaut(512)
     _, small_spot, preview = _astronaut(256)
     mask = diffusion_mask(whole, spot)
@@ -83,7 +83,7 @@ def masks() -> Iterator[Promise]:
 
 
 def recolouring() -> Iterator[Promise]:
-    """One blue stroke on the suit."""
+    """Recolouring from one blue stroke on the suit."""
     image, scale = scene("astronaut", 256)
     colours, painted = strokes(image, scale, (SUIT, (0.1, 0.3, 0.9)))
     edited = recolor(image, colours, painted)
@@ -99,7 +99,7 @@ def recolouring() -> Iterator[Promise]:
 
 
 def focusing() -> Iterator[Promise]:
-    """The astronaut stays sharp, the shuttle behind her does not."""
+    """Defocus that keeps the astronaut sharp, but not the shuttle behind her."""
     image, scale = scene("astronaut", 256)
     region = spots(image, scale, (188, 60, 60, 60), (40, 260, 32, 160))
     face, shuttle = spots(image, scale, (180, 88, 72, 80)), spots(image, scale, (380, 0, 132, 240))
@@ -112,7 +112,7 @@ def focusing() -> Iterator[Promise]:
 
 
 def abstraction() -> Iterator[Promise]:
-    """Towards k = 0, and the mean under contrast."""
+    """Abstraction for k near 0, and the change of the mean under contrast."""
     image = scene("chelsea", 256)[0]
     for power, limit in ((0.0, 0.01), (1e-5, 0.1)):
         change = float(255 * (abstract(image, power=power) - image).square().mean().sqrt())
@@ -122,7 +122,7 @@ def abstraction() -> Iterator[Promise]:
 
 
 def pan() -> Iterator[Promise]:
-    """Ten frames of a camera that moves over the astronaut, edited together and each alone."""
+    """Flicker in ten frames of a pan over the astronaut, edited together and each alone."""
     whole = scene("astronaut", 512)[0]
     film = [whole[..., 60 + STEP * i : 160 + STEP * i, 130 + STEP * i : 250 + STEP * i] for i in range(10)]
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
@@ -151,7 +151,7 @@ TOPICS: tuple[Callable[[], Iterator[Promise]], ...] = (masks, recolouring, focus
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print a line for every promise; exit with 1 if one is broken."""
+    """Print a line per claim; exit with status 1 if one does not hold."""
     parser = argparse.ArgumentParser(description="What masks and edits have to keep, and how well they do.")
     parser.add_argument("--out", type=Path, help="also write them as JSON")
     options = parser.parse_args(arguments)

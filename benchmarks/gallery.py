@@ -1,6 +1,6 @@
 """The README's pictures of edits, before and after: ``python -m benchmarks.gallery [FOLDER]``.
 
-Each has three panels: what is given, with strokes or spots painted on it, what the edit makes of them, and its result.
+Each has three panels, such as the photograph with scribbles, what they select, and the result.
 """
 
 import argparse
@@ -29,7 +29,7 @@ ALPHA = (3.0, 3.0, 4.0, 1.0)
 
 
 def detail() -> dict[str, Tensor]:
-    """Detail of a suit."""
+    """Detail enhancement of a suit."""
     image, scale = scene("astronaut", SIZE)
     spot = spots(image, scale, (60, 300, 20, 20))
     wide = (..., slice(130, 130 + round(512 / WIDE)), slice(None))
@@ -42,7 +42,7 @@ def detail() -> dict[str, Tensor]:
 
 
 def recolouring() -> dict[str, Tensor]:
-    """A red motorcycle to a blue one."""
+    """Recolouring of a red motorcycle to blue."""
     image, scale = scene("motorcycle", SIZE)
     colours, painted = strokes(image, scale, ((350, 205, 40, 20), BLUE))
     edited = recolor(image, colours, painted)
@@ -54,7 +54,7 @@ def recolouring() -> dict[str, Tensor]:
 
 
 def colourising() -> dict[str, Tensor]:
-    """A cup of coffee from its grey values and a few strokes."""
+    """Colourisation of a grey photograph of a cup of coffee from a few strokes."""
     image, scale = scene("coffee", SIZE)
     painted = spots(image, scale, *TRUE)
     grey = luminance(image)
@@ -66,7 +66,7 @@ def colourising() -> dict[str, Tensor]:
 
 
 def focusing() -> dict[str, Tensor]:
-    """A portrait."""
+    """Defocus behind a portrait."""
     image, scale = scene("astronaut", SIZE)
     image = image[..., : round(image.shape[-1] / WIDE), :]
     region = spots(image, scale, *SUBJECT)
@@ -78,7 +78,7 @@ def focusing() -> dict[str, Tensor]:
 
 
 def abstraction() -> dict[str, Tensor]:
-    """A cat, painted."""
+    """Abstraction of a photograph of a cat."""
     image = scene("chelsea", SIZE)[0]
     return {
         "A photograph": image,
@@ -88,7 +88,7 @@ def abstraction() -> dict[str, Tensor]:
 
 
 def front() -> Tensor:
-    """Two photographs with scribbles, beside what becomes of them: recoloured, and out of focus behind the subject."""
+    """Two photographs with scribbles, each beside its result: recoloured, and out of focus behind the subject."""
     bike, scale = scene("motorcycle", 741)
     colours, painted = strokes(bike, scale, ((350, 205, 40, 20), BLUE))
     portrait = scene("astronaut", 512)[0][..., :346, :]

@@ -1,8 +1,8 @@
 """Results, times and memory on a GPU: ``python -m benchmarks.gpu [--quick]``.
 
-Every result is compared with that of the processor in float64. Times of building an operator and of filtering one
-channel stand beside what their matrix products and their reads of the factor take at the rates measured on this GPU.
-Without a GPU it says so and ends with status 2.
+Every result is compared with that of the CPU in float64. Times of building an operator and of filtering one channel are
+printed beside the time that their matrix products and their reads of the factor take at rates measured on this GPU.
+Without a GPU the program prints an error and exits with status 2.
 """
 
 import argparse
@@ -36,21 +36,21 @@ from nlfilter_torch import (
 
 MEGAPIXELS = (0.25, 1.0, 4.0, 16.0)
 LANDMARKS, FEATURES = 100, 25
-BUILDING_READS, FILTERING_READS = 5, 4  # of the factor: one is written, and read by four sweeps; two for each of W, W^2
+BUILDING_READS, FILTERING_READS = 5, 4  # of the factor: one write and four sweeps; two for each of W, W^2
 SLIDERS = (3.0, 3.0, 4.0, 1.05)
-BATCH, CROP, FEW = 8, 128, 48  # of the training step
+BATCH, CROP, FEW = 8, 128, 48  # images, side and landmarks of the training step
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What a device does in a second: products in float32, and bytes that it copies."""
+    """Operations per second in float32 matrix products, and bytes read and written per second by copies."""
 
     flops: float
     bytes: float
 
 
 def picture(height: int, width: int, device: str, batch: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Smooth shapes with texture, (B, 3, H, W), the same on every device."""
+    """Smooth shapes with texture, (B, 3, H, W), identical on every device."""
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(batch, 3, 9, 9, generator=generator)
     smooth = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")
@@ -93,7 +93,7 @@ def results(device: str, side: int = 96, dtype: torch.dtype = torch.float32) -> 
 
 
 def differences(device: str, side: int = 96) -> dict[str, float]:
-    """Largest difference of each result from that of the processor in float64."""
+    """Largest difference of each result from that of the CPU in float64."""
     expected, found = results("cpu", side, torch.float64), results(device, side)
     return {
         name: (found[name].cpu().double() - values).abs().max().item()
@@ -104,13 +104,13 @@ def differences(device: str, side: int = 96) -> dict[str, float]:
 
 
 def padded_difference(found: Tensor, expected: Tensor) -> float:
-    """The same for eigenvalues (B, R), which accelerators pad with zeros."""
+    """Largest difference of eigenvalues (B, R), which accelerators pad with zeros."""
     count = min(found.shape[1], expected.shape[1])
     return (found[:, :count] - expected[:, :count]).abs().max().item()
 
 
 def seconds(call: Callable[[], object], device: str, repeats: int = 7) -> float:
-    """Median time of a call once everything it has asked of the device is done; the first call is not counted."""
+    """Median time of a call, including all work that it starts on the device; the first call is not counted."""
     taken = []
     for _ in range(1 + repeats):
         wait(device)
@@ -122,13 +122,13 @@ def seconds(call: Callable[[], object], device: str, repeats: int = 7) -> float:
 
 
 def wait(device: str) -> None:
-    """Until a device has done all that it was asked to do."""
+    """Wait until all work of a device is finished."""
     if device == "cuda":
         torch.cuda.synchronize()
 
 
 def measured_rates(device: str, size: int) -> Rates:
-    """Products of square matrices of ``size`` without TF32, and copies of as many numbers as 16 of them have."""
+    """Measure products of square matrices of side ``size`` without TF32, and copies as large as 16 such matrices."""
     square, long = torch.rand(size, size, device=device), torch.rand(16 * size * size, device=device)
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = False
@@ -142,7 +142,7 @@ def measured_rates(device: str, size: int) -> Rates:
 
 
 def floors(pixels: int, rates: Rates) -> tuple[float, float]:
-    """Least seconds to build an operator and to filter one channel of order 2, by products and memory."""
+    """Lower bounds in seconds for building an operator and filtering one channel with order 2, from the rates."""
     products = 2 * pixels * LANDMARKS * (FEATURES + 2 + LANDMARKS / 2)  # distances, and half of a triangle's product
     factor = 4 * pixels * LANDMARKS
     return (
@@ -152,7 +152,7 @@ def floors(pixels: int, rates: Rates) -> tuple[float, float]:
 
 
 def size_row(megapixels: float, device: str, rates: Rates) -> str:
-    """Times and memory of one size, as a row of a table."""
+    """Measure times and memory for one size, and return a row of the table."""
     side = round((megapixels * 1e6) ** 0.5)
     image = picture(side, side, device)[:, :1]
     alpha = torch.ones(3, device=device)
@@ -172,7 +172,7 @@ def size_row(megapixels: float, device: str, rates: Rates) -> str:
 
 
 def training_step(device: str, batch: int = BATCH, crop: int = CROP) -> Callable[[], object]:
-    """One step of gradient descent through building and filtering."""
+    """Create a function that makes one step of gradient descent through building and filtering."""
     layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.1, num_landmarks=FEW)
     layer.to(device)
     optimizer, image = torch.optim.SGD(layer.parameters(), lr=1e-3), picture(crop, crop, device, batch)
@@ -186,7 +186,7 @@ def training_step(device: str, batch: int = BATCH, crop: int = CROP) -> Callable
 
 
 def report(device: str, sizes: Iterable[float], rate_size: int, *, side: int = 96, crop: int = CROP) -> None:
-    """Print everything."""
+    """Print all tables."""
     print("| result | largest difference from float64 on the processor |\n|---|---|")
     for name, difference in differences(device, side).items():
         print(f"| {name} | {difference:.1e} |", flush=True)

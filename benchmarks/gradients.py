@@ -1,9 +1,9 @@
-"""Time and memory of a training step, beside plain autograd: ``python -m benchmarks.gradients [--quick]``.
+"""Time and memory of a training step, compared with plain autograd: ``python -m benchmarks.gradients [--quick]``.
 
 The gradient of a weighted sum of the filtered image with respect to guide, alpha and bandwidth, on one grey picture in
-float32. The peer, :mod:`tests.plain_autograd`, is the same filter as plain tensor operations, differentiated through 14
-steps of balancing. Each method runs in a process of its own, so that neither sees the other's memory; peaks are the
-kernel's high-water mark over what was resident before the first step (Linux only).
+float32. The comparison is with :mod:`tests.plain_autograd`, the same filter in plain tensor operations, differentiated
+through 14 steps of balancing. Each method runs in its own process, so that memory is measured separately; peaks are the
+kernel's high-water mark minus the resident memory before the first step (Linux only).
 """
 
 import argparse
@@ -34,7 +34,7 @@ def library(guide: Tensor, bandwidth: Tensor, alpha: Tensor, landmarks: int) -> 
 
 
 def plain(guide: Tensor, bandwidth: Tensor, alpha: Tensor, landmarks: int) -> Tensor:
-    """The same by plain autograd."""
+    """The same filter with plain autograd."""
     return plain_filter(guide, guide, alpha, photometric_bandwidth=bandwidth, num_landmarks=landmarks)
 
 
@@ -42,11 +42,11 @@ METHODS = {"library": library, "plain": plain}
 
 
 def measure(method: str, side: int, landmarks: int, repeats: int) -> dict[str, float | list[float]]:
-    """Peak memory of the first step in MiB, then times of the following ones in seconds."""
+    """Measure peak memory of the first step in MiB, and times of the following steps in seconds."""
     guide = picture(side).requires_grad_()
     leaves = (guide, torch.tensor(BANDWIDTH, requires_grad=True), torch.tensor(ALPHA, requires_grad=True))
     weights = torch.randn(guide.shape, generator=torch.Generator().manual_seed(0))
-    small = picture(64).requires_grad_()  # threads and lazy imports are not what is measured
+    small = picture(64).requires_grad_()  # starts threads and lazy imports before measuring
     (METHODS[method](small, leaves[1], leaves[2], 10) * weights[..., :64, :64]).sum().backward()
 
     forget_peak()
@@ -69,7 +69,7 @@ def measure(method: str, side: int, landmarks: int, repeats: int) -> dict[str, f
 
 
 def in_fresh_process(method: str, options: argparse.Namespace) -> dict[str, float]:
-    """The figures of one method: medians, and the peak."""
+    """Measure one method in a fresh process; return median times and peak memory."""
     command = [sys.executable, "-m", "benchmarks.gradients", "--child", method]
     for name in ("side", "landmarks", "repeats"):
         command += [f"--{name}", str(getattr(options, name))]
@@ -84,12 +84,12 @@ def in_fresh_process(method: str, options: argparse.Namespace) -> dict[str, floa
 
 
 def verdict(holds: bool) -> str:
-    """How a figure compares with its limit."""
+    """Text for whether a limit is kept."""
     return "holds" if holds else "FALLS SHORT"
 
 
 def main() -> None:
-    """Print the table and what it means."""
+    """Print the table and the claims."""
     parser = argparse.ArgumentParser(description="Time and memory of a training step, beside plain autograd.")
     parser.add_argument("--side", type=int, default=512, help="height and width of the picture")
     parser.add_argument("--landmarks", type=int, default=100, help="number of landmarks m")

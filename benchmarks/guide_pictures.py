@@ -1,6 +1,6 @@
 """The pictures of docs/: ``python -m benchmarks.guide_pictures [FOLDER] [--only NAME,...]``; prints their figures.
 
-Every function makes one picture, at the photograph's own scale; its docstring says what to look at.
+Each function makes one picture, at the original size of the photograph; its docstring describes what to look at.
 """
 
 import argparse
@@ -36,19 +36,19 @@ from nlfilter_torch.plotting import plot_response, show_eigenvectors, show_image
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 LEVELS = 255.0
-FACE, WHISKERS = (20, 130, 250), (60, 110, 240)  # top, left, side of what is shown of a picture
-MANY = 1000  # landmarks that stand for the whole truth
-SUIT = (slice(150, 160), slice(30, 40))  # a spot on the astronaut's suit, at half size
+FACE, WHISKERS = (20, 130, 250), (60, 110, 240)  # top, left and side of the part that is shown
+MANY = 1000  # landmarks of the reference
+SUIT = (slice(150, 160), slice(30, 40))  # square on the astronaut's suit, at half size
 
 
 def crop(image: Tensor, window: tuple[int, int, int]) -> Tensor:
-    """The part of an image that is shown."""
+    """Cut out the part of an image that is shown."""
     top, left, side = window
     return image[..., top : top + side, left : left + side]
 
 
 def filtered(image: Tensor, alpha: Tensor = ALPHA, **options: object) -> Tensor:
-    """A photograph under sliders, colours kept."""
+    """Apply sliders to a photograph, keeping its colours."""
     operator = nonlocal_operator(rgb_to_grayscale(image), **options)  # type: ignore[arg-type]
     return edit_luminance(image, lambda planes: polynomial_filter(operator, planes, alpha))
 
@@ -73,10 +73,10 @@ def presets_fur() -> Figure:
 
 
 def bandwidth() -> Figure:
-    """Photometric bandwidth: above the finest layer, below what the same sliders make of the photograph.
+    """Photometric bandwidth: the finest layer (top), and the photograph edited with the same sliders (bottom).
 
-    A small one keeps all but the grain out of the finest layer; a large one puts edges and shading into the layers, and
-    the sliders change contrast.
+    With a small bandwidth, the finest layer has only the grain; with a large one, layers have edges and shading too,
+    and the sliders change contrast.
     """
     image = photograph("chelsea")
     luminance = rgb_to_grayscale(image)
@@ -94,7 +94,7 @@ def bandwidth() -> Figure:
 
 
 def patch_size() -> Figure:
-    """Patch size: single pixels make nearly a tone curve; larger patches tell texture from shading."""
+    """Patch size: single pixels give nearly a tone curve; larger patches separate texture from shading."""
     image = photograph("chelsea")
     panels = {"before": image}
     for size in (1, 5, 11):
@@ -103,7 +103,7 @@ def patch_size() -> Figure:
 
 
 def landmarks() -> Figure:
-    """Landmarks: the difference from a filter with a thousand, ten times as strong, by k-means and on a grid."""
+    """Landmarks from k-means and on a grid: difference from a filter with a thousand landmarks, amplified ten times."""
     luminance = rgb_to_grayscale(photograph("chelsea", 160, 240))
     options = {"photometric_bandwidth": estimate_bandwidth(luminance)}
     truth = polynomial_filter(nonlocal_operator(luminance, num_landmarks=MANY, **options), luminance, ALPHA)
@@ -126,7 +126,7 @@ def _suit() -> tuple[Tensor, Tensor]:
 
 
 def spatial_bandwidth() -> Figure:
-    """Spatial bandwidth: the mask of a spot on the suit, without one, at a fifth of the short side and at a twelfth."""
+    """Spatial bandwidth: the mask of a square on the suit for none, a fifth and a twelfth of the short side."""
     image, region = _suit()
     panels = {"the spot": image * (1 - region) + region}
     for pixels in (None, 51.0, 21.0):
@@ -139,7 +139,7 @@ def spatial_bandwidth() -> Figure:
 
 
 def time_and_width() -> Figure:
-    """Time (down) and width (across) of the mask of a spot on the suit."""
+    """Diffusion time (down) and width (across) of the mask of a square on the suit."""
     image, region = _suit()
     spectrum = nonlocal_operator(image, photometric_bandwidth=25 / LEVELS, guide_channels="all").spectrum()
     panels = {}
@@ -152,7 +152,7 @@ def time_and_width() -> Figure:
 
 
 def single_sliders() -> Figure:
-    """One slider at a time: three times the layer above, none of it below."""
+    """One slider at a time: the layer times three (top), and without the layer (bottom)."""
     image = photograph("chelsea")
     operator = nonlocal_operator(rgb_to_grayscale(image))
     panels = {}
@@ -168,7 +168,7 @@ def single_sliders() -> Figure:
 
 
 def edits() -> Figure:
-    """The edits, on one photograph of 300x200 pixels with a spot on the saucer and five on the cup."""
+    """The edits, on one photograph of 300x200 pixels, with one scribble on the saucer and five on the cup."""
     image = photograph("coffee", 200, 300)
     saucer, cup = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])
     saucer[..., 106:122, 52:68], cup[..., 60:74, 92:98] = 1, 1
@@ -212,7 +212,7 @@ def eigenvectors() -> Figure:
 
 
 def response() -> Figure:
-    """What sliders make of the eigenvalues."""
+    """The response of the sliders to eigenvalues."""
     luminance = rgb_to_grayscale(photograph("chelsea"))
     return plot_response(ALPHA, nonlocal_operator(luminance).spectrum())
 
@@ -234,7 +234,7 @@ PICTURES = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write the pictures as JPEG files and say what to look at."""
+    """Write the pictures as JPEG files, and print what to look at."""
     parser = argparse.ArgumentParser(description="The pictures of the documentation.")
     parser.add_argument("folder", nargs="?", type=Path, default=Path("docs/pictures"), help="where the pictures go")
     parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(PICTURES)}, with commas between")

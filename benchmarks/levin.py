@@ -1,7 +1,8 @@
 """Levin, Lischinski and Weiss, "Colorization using Optimization", SIGGRAPH 2004, the paper's [29], in scipy.sparse.
 
-The chroma of a pixel is to be the weighted mean of that of its eight neighbours, with weights that fall as luminance
-differs, in units of its local variance; painted pixels keep their own. One sparse system, solved for both channels.
+The chroma of a pixel is the weighted mean of the chroma of its eight neighbours, with weights that decrease with the
+difference in luminance relative to its local variance; painted pixels keep their chroma. One sparse system is factored
+once and solved for both channels.
 """
 
 import numpy as np
@@ -17,7 +18,7 @@ LEAST_VARIANCE = 2e-6
 
 
 def neighbours(luminance: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Luminance and index of every pixel of the 3x3 window, (9, H, W); NaN and -1 outside the image."""
+    """Luminance and index of every pixel in the 3x3 window, (9, H, W); NaN and -1 outside the image."""
     height, width = luminance.shape
     values = np.pad(luminance, 1, constant_values=np.nan)
     indices = np.pad(np.arange(height * width).reshape(height, width), 1, constant_values=-1)
@@ -27,14 +28,14 @@ def neighbours(luminance: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def system(luminance: Array, painted: NDArray[np.bool_]) -> sparse.csc_matrix:
-    """The matrix (N, N): identity less weights, identity alone in the rows of painted pixels."""
+    """The matrix (N, N): identity minus weights, and only the identity in rows of painted pixels."""
     values, indices = neighbours(luminance)
     squared = (values - luminance) ** 2
     variance = SHARE_OF_VARIANCE * np.nanvar(values, axis=0)
     nearest = np.nanmin(np.delete(squared, 4, axis=0), axis=0)
     variance = np.maximum(np.maximum(variance, -nearest / np.log(LEAST_WEIGHT)), LEAST_VARIANCE)
     weights = np.exp(-squared / variance)
-    weights[4] = 0  # itself
+    weights[4] = 0  # the pixel itself
     weights = np.nan_to_num(weights)
     weights /= weights.sum(axis=0)
     weights[:, painted] = 0
@@ -47,6 +48,6 @@ def system(luminance: Array, painted: NDArray[np.bool_]) -> sparse.csc_matrix:
 
 
 def propagate(luminance: Array, chroma: Array, painted: NDArray[np.bool_]) -> Array:
-    """Chroma (C, H, W) of the whole image from chroma (C, H, W) that is known where ``painted`` (H, W)."""
+    """Solve for the chroma (C, H, W) of the image, given ``chroma`` (C, H, W) where ``painted`` (H, W)."""
     factors = solvers.splu(system(luminance, painted))
     return np.stack([factors.solve((c * painted).ravel()).reshape(c.shape) for c in chroma])

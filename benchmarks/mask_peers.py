@@ -1,4 +1,4 @@
-"""Masks from scribbles by other methods; each takes an image (1, 3, H, W) and two masks (1, 1, H, W) of scribbles."""
+"""Other methods for masks from scribbles; each takes an image (1, 3, H, W) and two masks (1, 1, H, W) of scribbles."""
 
 import warnings
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from nlfilter_torch import diffusion_mask, nonlocal_operator, propagate_strokes
 from nlfilter_torch.edits.colour import colour_guide
 
 Mask = Callable[[Tensor, Tensor, Tensor], Tensor]
-COMPONENTS, FLOOR = 5, 4.0  # of a Gaussian mixture, and its least variance in squared units of Lab
+COMPONENTS, FLOOR = 5, 4.0  # of a Gaussian mixture, and its smallest variance in squared Lab units
 
 
 def _array(image: Tensor) -> NDArray[np.float64]:
@@ -35,9 +35,9 @@ def _tensor(alpha: Any) -> Tensor:
 
 
 def closed_form(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """Closed-form matting, scribbles as its trimap."""
+    """Closed-form matting with the scribbles as trimap."""
     front, back = _seeds(inside, outside)
-    # Solved here: estimate_alpha_cf gives up on trimaps with so little known, its preconditioner fails on them.
+    # Not estimate_alpha_cf: its preconditioner fails on trimaps with so few known pixels.
     known = np.where(front | back, 100.0, 0.0).ravel()
     system = pymatting.cf_laplacian(_array(image)) + diags(known)
     inverse = diags(1 / system.diagonal())
@@ -46,7 +46,7 @@ def closed_form(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
 
 
 def grabcut(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """GrabCut, eight iterations, from the better start of what the Gaussian mixture says."""
+    """GrabCut with eight iterations, initialised by the Gaussian mixture, which gives better results."""
     front, back = _seeds(inside, outside)
     guess = gaussian_mixture(image, inside, outside)[0, 0].numpy() > 0.5
     labels = np.where(guess, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -76,7 +76,7 @@ def _log_density(pixels: NDArray[np.float64], seeds: NDArray[np.float64]) -> NDA
 
 
 def gaussian_mixture(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """The probability of the object under one mixture of Gaussians in Lab for each side."""
+    """The probability of the object, from Gaussian mixtures in Lab for foreground and background."""
     front, back = _seeds(inside, outside)
     lab = rgb2lab(_array(image))
     odds = _log_density(lab.reshape(-1, 3), lab[front]) - _log_density(lab.reshape(-1, 3), lab[back])
@@ -90,19 +90,19 @@ def walker(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
     front, back = _seeds(inside, outside)
     labels = np.where(front, 1, np.where(back, 2, 0))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of probabilities just outside [0, 1], which are clamped
+        warnings.simplefilter("ignore", UserWarning)  # about probabilities just outside [0, 1], which are clamped
         found = random_walker(_array(image), labels, beta=130, mode="cg_j", channel_axis=2, return_full_prob=True)
     return _tensor(found[0])
 
 
 def diffusion(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """:func:`diffusion_mask` of colours, the paper's way."""
+    """:func:`diffusion_mask` of colours, the paper's method."""
     operator = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all")
     return diffusion_mask(operator.spectrum(), inside, negative=outside)
 
 
 def strokes(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """:func:`propagate_strokes` on the guide of recolouring."""
+    """:func:`propagate_strokes` with the guide of recolouring."""
     operator = nonlocal_operator(colour_guide(image), patch_size=3, photometric_bandwidth=0.12, guide_channels="all")
     return propagate_strokes(operator.spectrum(), inside, torch.maximum(inside, outside)).clamp(0, 1)
 

@@ -1,7 +1,7 @@
 """Time and peak memory of one operator in a fresh process: ``python -m benchmarks.memory [--side 1024]``.
 
-Peaks are the kernel's own high-water mark (VmHWM), so nothing is missed between two looks; Linux only. The first call
-pays for start-up (threads, lazy imports), later ones are what a program sees.
+Peaks are the kernel's high-water mark (VmHWM), which misses nothing between samples; Linux only. The first call
+includes start-up costs (threads, lazy imports), later ones do not.
 """
 
 import argparse
@@ -21,7 +21,7 @@ MIB = 2**20
 
 
 def resident(field: str) -> float:
-    """A memory figure of this process in MiB: ``VmRSS`` now, or ``VmHWM`` at its highest."""
+    """Memory of this process in MiB: ``VmRSS`` now, or ``VmHWM`` at the peak."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) / 1024
@@ -29,12 +29,12 @@ def resident(field: str) -> float:
 
 
 def forget_peak() -> None:
-    """Let VmHWM start again from what is resident now."""
+    """Reset VmHWM to the memory that is resident now."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
 def picture(side: int) -> torch.Tensor:
-    """The middle of the retina in grey, (1, 1, side, side), enlarged beyond its own 1411 pixels."""
+    """The middle of the retina in grey, (1, 1, side, side), enlarged if ``side`` exceeds its 1411 pixels."""
     retina = rgb2gray(skimage.data.retina())
     if side <= min(retina.shape):
         top, left = (retina.shape[0] - side) // 2, (retina.shape[1] - side) // 2

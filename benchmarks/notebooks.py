@@ -1,7 +1,7 @@
-"""The notebooks, run, with outputs small enough for a repository: ``python -m benchmarks.notebooks notebooks``.
+"""Runs the notebooks, and shrinks their outputs for the repository: ``python -m benchmarks.notebooks notebooks``.
 
-Each ``.py`` in the folder is run in a kernel of its own, and written as ``.ipynb`` beside it, with pictures as JPEG.
-What it took is printed: seconds of processor, on all cores together, and of waiting, and bytes of the file.
+Each ``.py`` in the folder is run in its own kernel and written as ``.ipynb`` beside it, with pictures as JPEG. Prints
+CPU seconds over all cores, elapsed seconds, and the size of the file.
 """
 
 import argparse
@@ -17,13 +17,13 @@ import nbformat
 from nbclient import NotebookClient
 from PIL import Image
 
-WIDEST = 1000  # pixels of a picture
+WIDEST = 1000  # largest width of a picture in pixels
 QUALITY = 82
 WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def run(notebook: Any, folder: Path) -> None:
-    """Run all cells in a folder, and shrink what they print and show."""
+    """Run all cells with ``folder`` as working directory, and shrink their outputs."""
     client = NotebookClient(
         notebook, timeout=600, kernel_name="python3", record_timing=False, resources={"metadata": {"path": folder}}
     )
@@ -32,7 +32,7 @@ def run(notebook: Any, folder: Path) -> None:
 
 
 def tidy(notebook: Any) -> None:
-    """Shrink the outputs of a notebook that was run; in place of sliders stands what they showed first."""
+    """Shrink the outputs of a notebook that was run; widgets are replaced by their first outputs."""
     states = notebook.metadata.get("widgets", {}).get("application/vnd.jupyter.widget-state+json", {}).get("state", {})
     first = [output for state in states.values() for output in state.get("state", {}).get("outputs", ())]
     for number, cell in enumerate(notebook.cells):
@@ -47,7 +47,7 @@ def tidy(notebook: Any) -> None:
 
 
 def smaller(output: dict[str, Any]) -> dict[str, Any]:
-    """An output with its picture as JPEG, and without the text that stands for it."""
+    """Convert the picture of an output to JPEG, and drop its text representation."""
     data = output.get("data", {})
     if "image/png" not in data:
         return output
@@ -63,13 +63,13 @@ def smaller(output: dict[str, Any]) -> dict[str, Any]:
 
 
 def processor() -> float:
-    """Seconds that processes that have ended took."""
+    """CPU seconds of child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def main() -> None:
-    """Run the scripts of a folder, or those that are named."""
+    """Run all scripts of a folder, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="of scripts, without .py; all if none is given")

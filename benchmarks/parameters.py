@@ -1,8 +1,8 @@
-"""The parameters of the edits as a page of the documentation, and in how many places each is declared.
+"""Writes the parameters of all edits as a page of the documentation, and counts where each is declared.
 
     python -m benchmarks.parameters docs/parameters.md
 
-Without a file it prints the places only; the exit status is 1 if a parameter is declared more than once.
+Without a file only the declarations are printed; the exit status is 1 if a parameter is declared more than once.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.shared_parameters import FILTER
 
 PACKAGE = Path(nlfilter_torch.__file__).parent
-INTERFACES = ("cli", "app")  # whose files may declare parameters of any edit
+INTERFACES = ("cli", "app")  # folders whose files could declare parameters of any edit
 FILES = ("edits/presets.py", "edits/recipe.py", "edits/steps.py", "edits/applying.py", "tiled/recipe.py")
 HEAD = """# Parameters
 
@@ -33,13 +33,13 @@ def page() -> str:
 
 
 def table(edit: Edit) -> str:
-    """The parameters of an edit, a row for each."""
+    """A table with one row per parameter of an edit."""
     head = "| name | default | range | unit | in Python | what it does |\n|---|---|---|---|---|---|\n"
     return head + "".join(f"| {' | '.join(cells(edit, parameter))} |\n" for parameter in edit)
 
 
 def cells(edit: Edit, parameter: Parameter) -> tuple[str, ...]:
-    """What the table says about a parameter."""
+    """The cells of a parameter's row."""
     value = parameter.default
     if value is None and parameter.share:
         shown = f"{100 * parameter.share:g} % of the short side"
@@ -56,7 +56,7 @@ def cells(edit: Edit, parameter: Parameter) -> tuple[str, ...]:
 
 
 def places(edit: Edit, parameter: Parameter) -> list[str]:
-    """Where a parameter of an edit has a declaration with values of its own: ``file:line`` of each."""
+    """Find the declarations of a parameter of an edit that have literal values: ``file:line`` of each."""
     names = {parameter.name, parameter.keyword}
     found = []
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -75,7 +75,7 @@ def places(edit: Edit, parameter: Parameter) -> list[str]:
 
 @cache
 def parsed(path: Path) -> ast.Module:
-    """A file of the package."""
+    """The syntax tree of a file of the package."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
@@ -87,7 +87,7 @@ def written_in(path: Path) -> list[tuple[int, str]]:
 
 @cache
 def used(edit: str) -> set[str]:
-    """Names of what the edit of a name is declared with, its own too."""
+    """Names used in the declaration of an edit, including its own."""
     bodies = [parsed(path).body for path in (PACKAGE / "edits").glob("*parameters.py")]
     assigned = [node for body in bodies for node in body if isinstance(node, ast.Assign)]
     scope = next(node for node in assigned if named(node.targets[0]) == edit.upper())
@@ -95,12 +95,12 @@ def used(edit: str) -> set[str]:
 
 
 def named(node: ast.expr) -> str:
-    """The name that a node is, or nothing."""
+    """The identifier of a name node, or an empty string for other nodes."""
     return node.id if isinstance(node, ast.Name) else ""
 
 
 def declares(node: ast.AST, name: str) -> bool:
-    """Whether a node is ``Parameter("name", ...)``, or the call of a function that makes one."""
+    """Whether a node is ``Parameter("name", ...)``, or a call of a function that creates a parameter."""
     return (
         isinstance(node, ast.Call)
         and named(node.func) in ("Parameter", "_curve", "gain", "sliders", "choice")
@@ -110,7 +110,7 @@ def declares(node: ast.AST, name: str) -> bool:
 
 
 def literals(tree: ast.Module) -> list[tuple[int, str]]:
-    """Lines and names of arguments and fields whose default is written out, but for None."""
+    """Lines and names of arguments and fields whose default is a literal other than None."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef):
@@ -124,14 +124,14 @@ def literals(tree: ast.Module) -> list[tuple[int, str]]:
 
 
 def written_out(node: ast.expr) -> bool:
-    """Whether a value is made of numbers and words alone."""
+    """Whether a value consists of literals only, and is not None."""
     constants = [n for n in ast.walk(node) if isinstance(n, ast.Constant)]
     others = [n for n in ast.walk(node) if isinstance(n, ast.Name | ast.Attribute | ast.Subscript | ast.Call)]
     return bool(constants) and not others and any(n.value is not None for n in constants)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the places, write the page, and return the exit status."""
+    """Print the declarations, write the page, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", nargs="?", type=Path, help="the page to write")
     file = parser.parse_args(arguments).file

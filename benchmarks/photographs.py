@@ -1,4 +1,4 @@
-"""Photographs that ship with scikit-image, as tensors: colours and sizes that the figures ask for."""
+"""Photographs that ship with scikit-image, as tensors in the colours and sizes that benchmarks need."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -19,7 +19,7 @@ LETTERS = 27  # height of captions in pixels: phones show pictures of three colu
 
 @cache
 def photograph(name: str, height: int | None = None, width: int | None = None) -> torch.Tensor:
-    """A photograph (1, C, H, W) in [0, 1], float32; with a size, its middle is cut to that shape and then reduced."""
+    """A photograph (1, C, H, W) in [0, 1], float32; with a size, its middle is cropped to that shape and reduced."""
     picture = (LOADERS.get(name) or getattr(skimage.data, name))() / 255.0
     picture = picture[..., :3] if picture.ndim == 3 else picture[..., None]
     if height is not None and width is not None:
@@ -33,12 +33,12 @@ def photograph(name: str, height: int | None = None, width: int | None = None) -
 
 
 def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, torch.Tensor]:
-    """Photographs (1, 3, H, W), reduced to a short side: every PNG, JPEG and TIFF file of a folder, or scikit-image's.
+    """Photographs (1, 3, H, W), reduced to a short side: all PNG, JPEG and TIFF files of a folder, or scikit-image's.
 
     Args:
-        folder: None takes scikit-image's photographs of these ``names``.
-        side: pixels of the short side; smaller photographs stay as they are.
-        names: of scikit-image.
+        folder: None takes scikit-image's photographs.
+        side: pixels of the short side; smaller photographs are not changed.
+        names: of scikit-image's photographs.
     """
     if folder is None:
         found = {name: photograph(name) for name in names}
@@ -51,7 +51,7 @@ def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, 
 
 
 def reduced_to(picture: torch.Tensor, side: int) -> torch.Tensor:
-    """A photograph reduced to a short side; smaller ones stay as they are."""
+    """Reduce a photograph to a short side; smaller ones are not changed."""
     scale = side / min(picture.shape[-2:])
     if scale >= 1:
         return picture.float()

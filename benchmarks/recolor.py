@@ -1,10 +1,11 @@
-"""Recolouring and defocus of things with known borders: ``python -m benchmarks.recolor [--pictures FOLDER] [--quick]``.
+"""Recolouring and defocus with known object borders: ``python -m benchmarks.recolor [--pictures FOLDER] [--quick]``.
 
-Composites (:mod:`benchmarks.composites`). For recolouring the object is one thing of one strong colour: the texture of
-its photograph, tinted. Covered is what takes at least half of the change that the object alone would take, outside what
-changes by more than two levels, and the error at the border is the root mean square against the composite of the
-recoloured object, in levels. For defocus, kept is how much of the object is in focus, and blurred how much of the rest;
-halo is the error beside the object against the background blurred alone.
+Measured on composites (:mod:`benchmarks.composites`). For recolouring, the object has one strong colour: it is the
+texture of its photograph, tinted. The expected result is the composite of the recoloured object. "Covered" is the share
+of the object that changes by at least half of the expected change, "outside" the share of the background that changes
+by more than two grey levels, and "border" the RMS error at the border, in grey levels. For defocus, "kept" is the share
+of the object that stays in focus, "blurred" the share of the background that does not, and "halo" the error beside the
+object, compared with a background that is blurred alone.
 ``--set choosing`` takes the photographs and seeds that the defaults were chosen on.
 """
 
@@ -24,13 +25,13 @@ from nlfilter_torch.edits.recolor import Recoloring
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint
 RADIUS = 0.03  # of the blur, as a share of the short side
-BESIDE = 0.06  # width of what counts as beside the object, likewise
+BESIDE = 0.06  # width of the area beside the object, as a share of the short side
 CHANGED = 2 / 255
 LIMITS = {"covered": 90.0, "outside": 10.0, "outside, keep": 5.0, "border": 20.0, "kept": 85.0, "kept, two": 95.0}
 
 
 def tinted(composite: Composite, number: int) -> Composite:
-    """The composite with an object of one colour."""
+    """The composite, with an object of one colour."""
     tint = torch.tensor(TINTS[number % len(TINTS)]).view(1, 3, 1, 1)
     grey = split_luminance(composite.object)[0]
     thing = ((0.45 + 0.8 * (grey - grey.mean())) / 0.45 * tint).clamp(0, 1)
@@ -39,24 +40,24 @@ def tinted(composite: Composite, number: int) -> Composite:
 
 
 def recoloured(composite: Composite, colour: Tensor, under: Tensor) -> Tensor:
-    """The composite of the object in its new colour."""
+    """The expected result: the composite of the object in its new colour."""
     chroma = split_luminance(colour.expand_as(composite.image))[1]
     old = (split_luminance(composite.image)[1] * under).sum((2, 3)) / under.sum()
     change = Recoloring(chroma[:, None, :, 0, 0], old[:, None], torch.ones(1, 1, dtype=torch.bool))
     within = torch.ones_like(composite.alpha)
     thing = change(composite.object, within, [colours_beside(split_luminance(composite.object)[1], within)])
     mixed = composite.alpha * thing + (1 - composite.alpha) * composite.background
-    # Luminance is that of the photograph: what is compared is colour.
+    # Only colour is compared, so luminance is that of the photograph.
     return merge_luminance(split_luminance(composite.image)[0], split_luminance(mixed)[1])
 
 
 def rms(difference: Tensor, where: Tensor) -> float:
-    """In levels, over pixels."""
+    """RMS difference in grey levels over a weighted set of pixels."""
     return 255 * float((difference.square().mean(1, keepdim=True) * where).sum() / where.sum()) ** 0.5
 
 
 def measure_recolor(composite: Composite, number: int, count: int, seed: int, *, keep: bool) -> dict[str, float]:
-    """Shares in percent and errors of one recolouring."""
+    """Measure one recolouring: shares in percent, and errors."""
     scene = tinted(composite, number)
     inside = scene.scribbles(count, seed)[0]
     colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
@@ -77,7 +78,7 @@ def measure_recolor(composite: Composite, number: int, count: int, seed: int, *,
 
 
 def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, float]:
-    """Shares in percent and the halo of one defocus."""
+    """Measure one defocus: shares in percent, and errors."""
     inside, _ = composite.scribbles(count, seed)
     radius = RADIUS * min(composite.image.shape[-2:])
     probe = torch.cat([composite.image, composite.alpha], dim=1)
@@ -93,7 +94,7 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     near = torch.nn.functional.max_pool2d(probe[:, 3:], 2 * round(BESIDE * min(step.shape[-2:])) + 1, 1,
                                           round(BESIDE * min(step.shape[-2:])))  # fmt: skip
     beside = (ground & (near > 0.5)).float()
-    seen = step > CHANGED  # where a blur shows
+    seen = step > CHANGED  # where blur is visible
     return {
         "kept": 100 * float((sharp > 0.5)[core & seen].float().mean()),
         "blurred": 100 * float((sharp < 0.5)[ground & seen].float().mean()),
@@ -103,7 +104,7 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
 
 
 def report(title: str, cases: list[dict[str, float]], limits: dict[str, str]) -> None:
-    """Print means, the share of cases within each limit, and the worst."""
+    """Print means, the worst tenth, and the share of cases within each limit."""
     print(f"\n{title}: mean, worst tenth, of {len(cases)}")
     for name in cases[0]:
         values = sorted(case[name] for case in cases)

@@ -1,7 +1,7 @@
 """Tables and plots from the JSON of :mod:`benchmarks.speed`: ``python -m benchmarks.report FILE.json``.
 
-Writes ``speed.md`` and two plots into a folder, and a copy of the JSON where that is another folder. With ``--readme``
-it puts claims and peers between the two marker comments of that file, so that no figure is ever typed.
+Writes ``speed.md`` and two plots into a folder, and a copy of the JSON if that is a different folder. With ``--readme``
+it writes claims and comparisons between the two marker comments of that file, so that no number is copied by hand.
 """
 
 import argparse
@@ -29,13 +29,13 @@ SERIES = {
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A markdown table, its first column to the left and the others to the right."""
+    """A markdown table, with the first column aligned left and the others right."""
     rule = ["---", *["---:"] * (len(header) - 1)]
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *rows))
 
 
 def claims_table(given: Sequence[Claim]) -> str:
-    """Every claim with its limit, what was measured, with quartiles where calls alternated, and whether it holds."""
+    """A table of claims: limit, measured value, with quartiles where calls alternated, and whether the claim holds."""
     verdicts = {True: "holds", False: "**falls short**", None: "not measured"}
 
     def measured(claim: Claim) -> str:
@@ -61,7 +61,7 @@ def claims_table(given: Sequence[Claim]) -> str:
 
 
 def main_table(results: Results) -> str:
-    """Operator, sliders and peers on one image, quickest first."""
+    """A table of operator, sliders and other filters on one image, fastest first."""
     main = records_of(results, "main")[0]
     floor = main["floor"]["seconds"]
     entries = [(name, timing, main) for name, timing in main["timings"].items() if ": " not in name]
@@ -83,7 +83,7 @@ def main_table(results: Results) -> str:
 
 
 def series_table(records: Sequence[Record], column: str, key: Any) -> str:
-    """One row per case: operator, one filtering, backward, error."""
+    """A table with one row per case: operator, one filtering, backward, error."""
 
     def cell(record: Record, name: str) -> list[str]:
         timing = record["timings"].get(name)
@@ -107,7 +107,7 @@ def series_table(records: Sequence[Record], column: str, key: Any) -> str:
 
 
 def comparisons_table(records: Sequence[Record]) -> str:
-    """Two calls that alternated per row: the median of each, and median and quartiles of the ratios of their pairs."""
+    """A table with two alternating calls per row: the median of each, and median and quartiles of paired ratios."""
     rows = []
     for record in records:
         ratio, (first, second) = record["ratio"], record["timings"].items()
@@ -124,7 +124,7 @@ def comparisons_table(records: Sequence[Record]) -> str:
 
 
 def other_tables(results: Results) -> list[str]:
-    """Sections for what is not a series with a floor."""
+    """Sections for all suites that are not a series with a floor."""
     compared = records_of(results, SUITE)
     parts = [f"## Two at a time, alternating\n\n{comparisons_table(compared)}"] if compared else []
     for suite, title in (
@@ -158,7 +158,7 @@ def other_tables(results: Results) -> list[str]:
 
 
 def _case_name(record: Record) -> str:
-    """What tells a record from the others of its suite."""
+    """The part of a record that distinguishes it from others of its suite."""
     if record["suite"] == "imports":
         return "a fresh process"
     if record["suite"] == "pictures":
@@ -167,7 +167,7 @@ def _case_name(record: Record) -> str:
 
 
 def machine_lines(results: Results) -> str:
-    """What everything was measured on."""
+    """Describe the machine and the run."""
     machine = results["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     kind = " **A quick run on tiny sizes: its figures say nothing about speed.**" if results["quick"] else ""
@@ -180,7 +180,7 @@ def machine_lines(results: Results) -> str:
 
 
 def explanation(results: Results) -> str:
-    """What the floor is, with its parts."""
+    """Explain the measurements and the floor."""
     main = next(iter(records_of(results, "main")), None)
     if main is None:
         return ""
@@ -215,17 +215,17 @@ def report(results: Results) -> str:
 
 
 def readme_part(results: Results) -> str:
-    """Claims and comparison, for the README."""
+    """Claims and comparisons, for the README."""
     return "\n\n".join(
         [claims_table(claims(results)), main_table(results), explanation(results), machine_lines(results)]
     )
 
 
 def between(text: str, part: str, begin: str, end: str) -> str:
-    """``text`` with what stands between two markers replaced.
+    """Replace the part of ``text`` between two markers.
 
     Raises:
-        ValueError: if it lacks one of them.
+        ValueError: if a marker is missing.
     """
     before, first, rest = text.partition(begin)
     _, last, after = rest.partition(end)
@@ -235,7 +235,7 @@ def between(text: str, part: str, begin: str, end: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.report", description=__doc__)
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.speed")
     parser.add_argument("--folder", type=Path, help="where the report goes (default: beside FILE)")

@@ -1,16 +1,16 @@
-"""Halo and noise of sharpening to one gain: ``python -m benchmarks.sharpening [--quick]``.
+"""Halo and noise of sharpening at equal gain: ``python -m benchmarks.sharpening [--quick]``.
 
-Four photographs in grey at 256x256, as they are and with white noise of 10 and 20 grey levels. The strength of every
+Four photographs in grey at 256x256, without noise and with white noise of 10 and 20 grey levels. The strength of every
 method is set so that the gradient on strong edges (the steepest 4 % of pixels, measured along the clean photograph's
-gradient) becomes 1.5 times as large. Then
+gradient) becomes 1.5 times as large. The measurements are
 
 halo    mean overshoot near these edges: how far the result leaves the range of the clean photograph within 5 pixels,
         in grey levels;
-noise   how many times stronger the noise is in flat regions; of clean photographs, the grain finer than 1.5 pixels.
+noise   amplification of noise in flat regions; for clean photographs, of grain finer than 1.5 pixels.
 
-With noise there are four realisations: edges and halo are measured on their mean, noise is what they differ by. The
-bilateral and the guided filter have the settings that suit them best here, with edges in their detail: with sharper
-ones they never reach the gain.
+With noise there are four realisations: edges and halo are measured on their mean, and noise is the deviation from it.
+The bilateral and the guided filter have their best settings for this test, which leave edges in their detail: with
+settings that preserve edges better they never reach the gain.
 """
 
 import argparse
@@ -32,16 +32,16 @@ NOISES = (0, 10, 20)  # grey levels
 SIDE = 256
 GAIN = 1.5
 STRONG = 0.04  # share of pixels on strong edges
-REACH = 5  # pixels beside them that a halo is looked for in
+REACH = 5  # pixels around strong edges where halos are measured
 REALISATIONS = 4
-STRONGEST = 300.0  # a method that needs more than this is said not to reach the gain
+STRONGEST = 300.0  # a method that needs more than this does not reach the gain
 
-Strength = Callable[[float], Tensor]  # the photograph sharpened by an amount, 0 for not at all
+Strength = Callable[[float], Tensor]  # amount to the sharpened photograph; 0 leaves it unchanged
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A clean photograph, noisy copies of it, and where to look."""
+    """A clean photograph, noisy copies of it, and the areas to measure in."""
 
     clean: Tensor
     noisy: Tensor
@@ -50,7 +50,7 @@ class Scene:
 
     @staticmethod
     def of(name: str, noise: float, side: int) -> "Scene":
-        """A photograph with noise of that many grey levels, reduced to ``side``."""
+        """Create a scene from a photograph, reduced to ``side``, with ``noise`` in grey levels."""
         clean = reduce_channels(photograph(name, side, side), "luminance")
         generator = torch.Generator().manual_seed(0)
         copies = torch.randn(REALISATIONS, 1, side, side, generator=generator)
@@ -62,7 +62,7 @@ class Scene:
         return Scene(clean, clean + noise / 255 * copies if noise else clean, edges, flat)
 
     def edge_gain(self, result: Tensor) -> float:
-        """Gradient on strong edges, over that of the clean photograph."""
+        """Gradient on strong edges, relative to that of the clean photograph."""
         reference = _gradient(self.clean)
         direction = reference / reference.norm(dim=1, keepdim=True).clamp(min=1e-6)
 
@@ -80,7 +80,7 @@ class Scene:
         return float(255 * torch.maximum(mean - highest, lowest - mean).clamp(min=0)[near].mean())
 
     def noise_gain(self, result: Tensor) -> float:
-        """How much stronger noise is in flat regions."""
+        """Amplification of noise in flat regions."""
         return self._noise(result) / self._noise(self.noisy)
 
     def _noise(self, images: Tensor) -> float:
@@ -96,14 +96,14 @@ def _gradient(image: Tensor) -> Tensor:
 
 
 def methods(scene: Scene) -> dict[str, Strength]:
-    """Everything that is compared, as functions of strength."""
+    """All methods that are compared, as functions of their strength."""
     noisy = scene.noisy
     operator = nonlocal_operator(noisy)
     layers = detail_layers(operator, noisy)
     held = [
         polynomial_filter(operator, noisy, torch.tensor([2.0, 2.0, 2.0, 1.0]), residual=r) - noisy for r in (None, 1.0)
     ]
-    middle = sharpen(noisy, amount=2.0, limits="none") - noisy  # linear in the amount, as all of them
+    middle = sharpen(noisy, amount=2.0, limits="none") - noisy  # linear in the amount, like all methods here
     added = {
         "sharpen (softened guide)": middle,
         "sliders a,a,a,1": held[0],
@@ -131,7 +131,7 @@ OURS = "sharpen (softened guide)"
 
 
 def reach_gain(scene: Scene, strength: Strength) -> Tensor | None:
-    """The result at which strong edges have the gain, or None where they never do."""
+    """Find the result with the gain on strong edges, or None if the method does not reach it."""
     low, high = 0.0, 1.0
     while scene.edge_gain(strength(high)) < GAIN:
         low, high = high, 2 * high
@@ -144,7 +144,7 @@ def reach_gain(scene: Scene, strength: Strength) -> Tensor | None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print a table for each strength of noise and what it says."""
+    """Print a table for each noise level, and a summary."""
     parser = argparse.ArgumentParser(description="Halo and noise of sharpening to one gain.")
     parser.add_argument("--quick", action="store_true", help="two photographs at 64x64, to see that it runs")
     options = parser.parse_args(arguments)
@@ -171,7 +171,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def verdict(figures: dict[str, list[tuple[float, float] | None]], pictures: tuple[str, ...]) -> str:
-    """How often the library's sharpening has less noise than all peers, and how often a peer is better in both."""
+    """Count where the library's sharpening has the lowest noise gain, and list where a peer is better in both."""
     least, beaten = 0, []
     for i, name in enumerate(pictures):
         own = figures[OURS][i]

@@ -1,9 +1,9 @@
-"""Time, memory and exactness of pictures that are worked out by rows: ``python -m benchmarks.streaming``.
+"""Time, memory and accuracy of tiled filtering: ``python -m benchmarks.streaming``.
 
-A mosaic of photographs, each piece randomly rotated, darkened or lightened and textured, goes into a BigTIFF
-file; a fresh process filters it into another. Time is that of the processor, summed over its cores, so that other work
-on the machine does little to it. Peaks are the kernel's own (VmHWM; Linux only), over what is resident when the program
-and its libraries have been read. ``--quick`` runs everything on a fraction of a megapixel.
+A mosaic of photographs, each piece randomly rotated, darkened or lightened and textured, is written to a BigTIFF file;
+a fresh process filters it into another file. Time is CPU time, summed over cores, so that other programs affect it
+little. Peaks are the kernel's (VmHWM; Linux only), minus the memory that is resident after the program and its
+libraries are loaded. ``--quick`` runs everything on a fraction of a megapixel.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
-PLAIN: dict[str, Any] = {  # the filter as it is, in pixels of the file
+PLAIN: dict[str, Any] = {  # the filter without limits or threshold, in pixels of the file
     "limits": "none",
     "threshold": 0.0,
     "viewing_size": 0.0,
@@ -49,7 +49,7 @@ Array = NDArray[np.uint8]
 
 
 def photographs() -> list[Array]:
-    """Photographs (H, W, 3) that come with scikit-image, none smaller than a piece."""
+    """Photographs (H, W, 3) of scikit-image, padded to at least the size of a piece."""
     found = [getattr(skimage.data, name)() for name in (*NAMES, "retina", "hubble_deep_field")]
     found.append(skimage.data.stereo_motorcycle()[0])
     colour = [picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2) for picture in found]
@@ -58,7 +58,7 @@ def photographs() -> list[Array]:
 
 
 def mosaic(height: int, width: int) -> Iterator[Array]:
-    """Bands (PIECE or fewer, width, 3) of a picture of any size; the same every time."""
+    """Yield bands (PIECE or fewer, width, 3) of a reproducible picture of any size."""
     generator, sources = np.random.default_rng(0), photographs()
     for top in range(0, height, PIECE):
         band = np.empty((PIECE, -(-width // PIECE) * PIECE, 3), np.uint8)
@@ -73,7 +73,7 @@ def mosaic(height: int, width: int) -> Iterator[Array]:
 
 
 def write_mosaic(path: Path, side: int) -> None:
-    """A tiled BigTIFF of side x side pixels."""
+    """Write a tiled BigTIFF of side x side pixels."""
 
     def tiles() -> Iterator[Array]:
         for band in mosaic(side, side):
@@ -87,8 +87,8 @@ def write_mosaic(path: Path, side: int) -> None:
 
 
 def work(source: Path, target: Path, statistics: Statistics, landmarks: int, memory: int) -> dict[str, object]:
-    """Filter a file in this process, and say what it took."""
-    edit_luminance(torch.zeros(1, 3, 1, 1), lambda y: y)  # kornia is read when it is first needed
+    """Filter a file in this process, and return time and memory."""
+    edit_luminance(torch.zeros(1, 3, 1, 1), lambda y: y)  # imports kornia
     forget_peak()
     before, started, wall = resident("VmRSS"), time.process_time(), time.perf_counter()
     stages: dict[str, float] = {}
@@ -120,7 +120,7 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
 
 
 def in_fresh_process(folder: Path, source: Path, statistics: str, landmarks: int) -> dict[str, object]:
-    """:func:`work` in a process of its own, which has held nothing before."""
+    """Run :func:`work` in a fresh process."""
     arguments = [str(source), str(folder / "out.tif"), statistics, str(landmarks)]
     command = [sys.executable, "-m", "benchmarks.streaming", "--work", *arguments]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
@@ -129,7 +129,7 @@ def in_fresh_process(folder: Path, source: Path, statistics: str, landmarks: int
 
 
 def exactness(side: int, tiles: list[int]) -> dict[str, float]:
-    """Largest differences between rows and memory, and between tiles, as fractions of white."""
+    """Largest differences between tiled and in-memory results, and between tile heights, as fractions of white."""
     picture = np.concatenate(list(mosaic(side, side))).astype(np.float32) / np.float32(255)
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
     luminance = 0.299 * image[:, :1] + 0.587 * image[:, 1:2] + 0.114 * image[:, 2:]
@@ -140,7 +140,7 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
 
     usual = in_colour(polynomial_filter(nonlocal_operator(luminance), luminance, ALPHA))
     in_memory = time.process_time() - started
-    # Its own residual shows beside that of full passes.
+    # A tight tolerance, since otherwise its own residual would dominate the difference from full passes.
     whole = in_colour(polynomial_filter(nonlocal_operator(luminance, tolerance=1e-6), luminance, ALPHA))
 
     def by_rows(**options: Any) -> NDArray[np.float32]:
@@ -166,7 +166,7 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print and, if asked for, write JSON."""
+    """Measure, print, and write JSON if requested."""
     parser = argparse.ArgumentParser(description="Time, memory and exactness of pictures worked out by rows.")
     parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
@@ -209,7 +209,7 @@ def main() -> None:
 
 
 def table(figures: dict[str, Any]) -> None:
-    """The tables of docs/scale.md from the JSON of a run."""
+    """Print the tables of docs/scale.md from the JSON of a run."""
     print("| megapixels | m | statistics | processor, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|---|")
     for run in figures["runs"]:
         cpu, pixels = run["cpu_s"], run["megapixels"]
@@ -230,7 +230,7 @@ def table(figures: dict[str, Any]) -> None:
 
 
 def show(run: dict[str, object]) -> None:
-    """One line for a run."""
+    """Print one line for a run."""
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
     cpu, pixels = float(run["cpu_s"]), float(run["megapixels"])  # type: ignore[arg-type]
     print(

@@ -1,8 +1,8 @@
-"""CPU time of pictures worked out by rows, beside the same in memory: ``python -m benchmarks.streaming_cpu``.
+"""CPU time of edits in tiles compared with edits in memory: ``python -m benchmarks.streaming_cpu``.
 
-The mosaic of ``benchmarks.streaming`` is edited in memory and in tiles in turn, from 8 bits to 8 bits, in one process.
-Time is that of the processor, summed over all threads, per megapixel; figures are medians. ``--quick`` runs it on a
-fraction of a megapixel.
+The mosaic of ``benchmarks.streaming`` is edited alternately in memory and in tiles, from 8 bits to 8 bits, in one
+process. Prints medians of CPU time per megapixel, summed over all threads. ``--quick`` runs it on a fraction of a
+megapixel.
 """
 
 import argparse
@@ -26,12 +26,12 @@ Edit = Callable[[], NDArray[Any]]
 
 
 def as_tensor(rows: NDArray[np.uint8]) -> torch.Tensor:
-    """Rows (H, W, C) of 8 bits as an image (1, C, H, W)."""
+    """Convert rows (H, W, C) of 8 bits to an image (1, C, H, W)."""
     return torch.from_numpy(np.ascontiguousarray(rows.transpose(2, 0, 1), np.float32) / np.float32(255))[None]
 
 
 def ways(verb: str, picture: NDArray[np.uint8], memory: int) -> tuple[Edit, Edit]:
-    """An edit of a picture in memory, and in tiles."""
+    """Create functions that edit a picture in memory and in tiles."""
     edited, strokes = np.empty_like(picture), Boxes((*picture.shape[:2], 4))
 
     def in_memory() -> NDArray[Any]:
@@ -51,7 +51,7 @@ def ways(verb: str, picture: NDArray[np.uint8], memory: int) -> tuple[Edit, Edit
 
 
 def processor_time(edit: Edit) -> float:
-    """Seconds of all cores."""
+    """CPU seconds of an edit, summed over all cores."""
     started = time.process_time()
     edit()
     return time.process_time() - started
@@ -70,7 +70,7 @@ def main() -> None:
     print(f"| edit | megapixels | threads | in memory, s per MP | tiled with {options.memory:g} GB, s per MP | ratio |")
     print("|---|---|---|---|---|---|")
     for edit in ways("detail", np.concatenate(list(mosaic(300, 300))), 10**9):
-        edit()  # what is read or compiled when it is first needed
+        edit()  # lazy imports and compilation
     for megapixels in [0.04] if options.quick else options.megapixels:
         side = round((megapixels * 1e6) ** 0.5)
         picture = np.concatenate(list(mosaic(side, side)))

@@ -1,7 +1,7 @@
-"""Time, memory and exactness of stroke edits that are worked out by rows: ``python -m benchmarks.streaming_strokes``.
+"""Time, memory and accuracy of tiled stroke edits: ``python -m benchmarks.streaming_strokes``.
 
 The mosaic of ``benchmarks.streaming``, with some strokes on it, is recoloured and colourised from file to file, each in
-a fresh process; figures are taken as there. ``--quick`` runs everything on a fraction of a megapixel.
+a fresh process, and measured as in that module. ``--quick`` runs everything on a fraction of a megapixel.
 """
 
 import argparse
@@ -41,7 +41,7 @@ BOXES = (  # (top, left, height, width) as shares of the picture, and RGB
 
 @dataclass(frozen=True)
 class Boxes:
-    """Strokes (h, W, 4) with transparency, of which only the rows that are asked for exist."""
+    """Strokes (h, W, 4) with transparency; rows are drawn on request."""
 
     shape: tuple[int, int, int]
     dtype = np.dtype(np.uint8)
@@ -59,8 +59,8 @@ class Boxes:
 
 
 def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
-    """Edit a file in this process, and say what it took."""
-    colour_guide(torch.zeros(1, 3, 1, 1))  # kornia is read when it is first needed
+    """Edit a file in this process, and return time and memory."""
+    colour_guide(torch.zeros(1, 3, 1, 1))  # imports kornia
     forget_peak()
     before, started = resident("VmRSS"), time.process_time()
     with open_picture(source, memory) as picture:
@@ -76,7 +76,7 @@ def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
 
 
 def exactness(side: int) -> list[str]:
-    """Largest differences between rows and memory, of each edit."""
+    """Largest differences between tiled and in-memory results of each edit, as lines of text."""
     picture = np.concatenate(list(mosaic(side, side))).astype(np.float32) / np.float32(255)
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
     layer = Boxes((side, side, 4))[slice(0, side)].astype(np.float32) / np.float32(255)
@@ -105,7 +105,7 @@ def exactness(side: int) -> list[str]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure, and print the results."""
     parser = argparse.ArgumentParser(description="Time, memory and exactness of stroke edits worked out by rows.")
     parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
     parser.add_argument("--work", nargs=3, metavar=("VERB", "IN", "OUT"), help=argparse.SUPPRESS)

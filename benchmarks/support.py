@@ -1,8 +1,8 @@
-"""What works with other projects and with torch itself, from the tests that show it: a table in docs/clients.md.
+"""Writes the table in docs/clients.md: what works with other projects and with torch, and which test shows it.
 
     python -m benchmarks.support docs/clients.md
 
-A test with the marker ``client("what", "how")`` is a row. Without a file the table is printed.
+Each test with the marker ``client("what", "how")`` is a row. Without a file the table is printed.
 """
 
 import argparse
@@ -17,7 +17,7 @@ MARKER = "pytest.mark.client"
 
 
 def rows() -> Iterator[tuple[str, str, str]]:
-    """What each marked test is about, how that works, and the name of the test."""
+    """Yield subject, description and name of every marked test."""
     for path in sorted(TESTS.rglob("test_*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if not isinstance(node, ast.FunctionDef):
@@ -29,7 +29,7 @@ def rows() -> Iterator[tuple[str, str, str]]:
 
 
 def table() -> str:
-    """The table, by the names of what the tests are about."""
+    """The table, sorted by subject."""
     lines: dict[tuple[str, str], list[str]] = {}
     for what, how, test in rows():
         lines.setdefault((what, how), []).append(f"`{test}`")
@@ -38,7 +38,7 @@ def table() -> str:
 
 
 def main() -> None:
-    """Print the table, or write it into a page in the place of the one there."""
+    """Print the table, or replace the table in a page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path, nargs="?", help="the page of Markdown that has the table")
     page = parser.parse_args().page

@@ -1,9 +1,9 @@
 """Table I and Fig. 20 of the paper on twelve pictures that ship with scikit-image: ``python -m benchmarks.tables``.
 
-Table I: the part beta (eq. 19) of a picture's energy that its m = 100 eigenvectors hold, at the automatic bandwidth and
-at multiples of it. Fig. 20: the part that they miss, as relative RMSE, for growing m: with the m leading eigenvectors
-of 150 samples, as in the paper, and with m samples. Both for the paper's own method (uniform samples, no completion)
-and for the library's defaults, on grey pictures, long side at most 700.
+Table I: the share beta (eq. 19) of a picture's energy that its m = 100 eigenvectors capture, at the automatic bandwidth
+and at multiples of it. Fig. 20: the residual, as relative RMSE, for increasing m: with the m leading eigenvectors of
+150 samples, as in the paper, and with m samples. Both for the paper's own method (uniform samples, no completion) and
+for the library's defaults, on grey pictures, long side at most 700.
 """
 
 import argparse
@@ -40,8 +40,8 @@ METHODS: dict[str, dict[str, str]] = {
     "the paper's method (uniform samples, no completion)": {"landmarks": "uniform", "completion": "none"},
     "the library's defaults (k-means, completion)": {},
 }
-HELD = 0.998  # the share of energy that Table I asks of a bandwidth
-ROW_SUMS = 1e-2  # a filter whose row sums are further from 1 is no filter: the method broke
+HELD = 0.998  # share of energy that counts as sufficient in Table I
+ROW_SUMS = 1e-2  # largest deviation of row sums from 1; beyond it the method has failed
 
 PAPER_TABLE_I = """the paper's Table I (beta in %), h_y in units of its own patch weights, 1/4.2 of those of unit sum
 h_y                     2       4       6       8      10
@@ -53,7 +53,7 @@ PAPER_FIG_20 = """the paper's Fig. 20 is a plot; its text: the error shrinks as 
 
 @dataclass(frozen=True)
 class Held:
-    """What the eigenvectors of one operator hold of the picture."""
+    """Energy of the picture captured by the eigenvectors of one operator, and checks of the operator."""
 
     beta: float
     row_sum_error: float
@@ -61,17 +61,17 @@ class Held:
 
     @property
     def finite(self) -> bool:
-        """Is there an operator at all?"""
+        """Whether all values are finite."""
         return all(math.isfinite(value) for value in (self.beta, self.row_sum_error, self.largest_eigenvalue))
 
     @property
     def broke(self) -> bool:
-        """Is the operator no doubly stochastic filter?"""
+        """Whether the operator is not a doubly stochastic filter."""
         return not (self.finite and self.row_sum_error <= ROW_SUMS and self.largest_eigenvalue <= 1 + ROW_SUMS)
 
     @property
     def relative_rmse(self) -> float:
-        """Appendix B, in per cent: what orthonormal eigenvectors miss is what they do not hold."""
+        """Relative RMSE in percent (Appendix B): the residual of a projection on orthonormal eigenvectors."""
         return 100 * math.sqrt(max(0.0, 1 - self.beta))
 
 
@@ -88,7 +88,7 @@ def measure(
 ) -> Held:
     """Build the operator and project the picture on its eigenvectors, or on the ``rank`` leading ones."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a broken balancing is told by the row sums
+        warnings.simplefilter("ignore")  # failed balancing shows in the row sums
         operator = nonlocal_operator(image, photometric_bandwidth=bandwidth, num_landmarks=count, **options)
     spectrum = operator.spectrum(rank)
     return Held(
@@ -110,24 +110,24 @@ def table_1(name: str, long_side: int, options: dict[str, str], multiples: Seque
 
 
 def figure_20(name: str, long_side: int, options: dict[str, str], counts: Sequence[int] = COUNTS) -> list[Held]:
-    """What the leading eigenvectors of one picture hold, for growing numbers of them."""
+    """Energy captured by the leading eigenvectors of one picture, for increasing numbers of them."""
     image = picture(name, long_side)
     return [measure(image, auto(image), max(counts), options, rank=count) for count in counts]
 
 
 def growing_samples(name: str, long_side: int, options: dict[str, str], counts: Sequence[int] = COUNTS) -> list[Held]:
-    """What all eigenvectors of one picture hold, for growing numbers of samples."""
+    """Energy captured by all eigenvectors of one picture, for increasing numbers of samples."""
     image = picture(name, long_side)
     return [measure(image, auto(image), count, options) for count in counts]
 
 
 def is_rising(values: Sequence[float]) -> bool:
-    """Does no value lie below the one before it, by half of what a table shows?"""
+    """Whether no value is below the previous one by more than half a digit of the table."""
     return all(a <= b + 5e-5 for a, b in pairwise(values))
 
 
 def print_rows(head: Sequence[object], rows: Iterator[tuple[str, list[Held]]], value: Callable[[Held], float]) -> Rows:
-    """Print a table as its rows come, with ! where the row sums of the filter are off by more than a hundredth."""
+    """Print a table row by row, with ! where the row sums of the filter are off by more than a hundredth."""
     print(f"{'':18}" + "".join(f"{text:>8} " for text in head))
     done = {}
     for name, row in rows:
@@ -137,7 +137,7 @@ def print_rows(head: Sequence[object], rows: Iterator[tuple[str, list[Held]]], v
 
 
 def print_table_1(long_side: int, options: dict[str, str]) -> None:
-    """Table I and what it says."""
+    """Print Table I and a summary."""
     measured = ((name, table_1(name, long_side, options)) for name in PICTURES)
     rows = print_rows([f"{m} auto" for m in MULTIPLES], measured, lambda held: 100 * held.beta)
     start = MULTIPLES.index(1.0)
@@ -154,7 +154,7 @@ def print_table_1(long_side: int, options: dict[str, str]) -> None:
 
 
 def print_figure_20(long_side: int, options: dict[str, str], measured: Callable[..., list[Held]]) -> None:
-    """Fig. 20, of retained eigenvectors or of samples, and what it says."""
+    """Print Fig. 20, by eigenvectors or by samples, and a summary."""
     every = ((name, measured(name, long_side, options)) for name in PICTURES)
     rows = print_rows([f"m = {count}" for count in COUNTS], every, lambda held: held.relative_rmse)
     falling = sum(is_rising([held.beta for held in row]) for row in rows.values())
@@ -162,7 +162,7 @@ def print_figure_20(long_side: int, options: dict[str, str], measured: Callable[
 
 
 def main() -> None:
-    """Print both tables for both methods, beside the paper's own figures."""
+    """Print both tables for both methods, and the paper's own figures."""
     parser = argparse.ArgumentParser(description="Table I and Fig. 20 of the paper on twelve pictures.")
     parser.add_argument("--long-side", type=int, default=LONG_SIDE, help="reduce the pictures to this long side")
     options = parser.parse_args()

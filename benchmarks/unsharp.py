@@ -10,12 +10,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# Of the adaptive method, for grey levels from 0 to 255: variances that tell flat, medium and high activity apart, the
-# gain wanted in the latter two, step of the adaptation and forgetting of its correlation matrix.
+# The adaptive method, for grey levels from 0 to 255: variances that separate flat, medium and high activity, the gains
+# wanted for medium and high activity, step size of the adaptation, and forgetting factor of its correlation matrix.
 ACTIVITY = (60.0, 200.0)
 WANTED = (4.0, 3.0)
 STEP, FORGETTING = 0.1, 0.5
-SLACK = 0.1  # of the constrained method: overshoot as a share of the range of the surroundings
+SLACK = 0.1  # of the constrained method: overshoot as a share of the local range
 
 
 def gaussian(image: Tensor, sigma: float) -> Tensor:
@@ -27,33 +27,34 @@ def gaussian(image: Tensor, sigma: float) -> Tensor:
 
 
 def unsharp(image: Tensor, sigma: float) -> Tensor:
-    """Plain unsharp masking: what a Gaussian takes away."""
+    """Plain unsharp masking: the part that a Gaussian removes."""
     return image - gaussian(image, sigma)
 
 
 def band(image: Tensor, fine: float, coarse: float) -> Tensor:
-    """Unsharp masking that spares the finest grain: a difference of Gaussians."""
+    """Unsharp masking without the finest grain: a difference of Gaussians."""
     return gaussian(image, fine) - gaussian(image, coarse)
 
 
 def bilateral(image: Tensor, range_sigma: float) -> Tensor:
-    """What a bilateral filter of 11x11 pixels takes away."""
+    """The part that a bilateral filter of 11x11 pixels removes."""
     from kornia.filters import bilateral_blur
 
     return image - bilateral_blur(image, (11, 11), range_sigma, (3.0, 3.0))
 
 
 def guided(image: Tensor, eps: float) -> Tensor:
-    """What a guided filter of 11x11 pixels takes away."""
+    """The part that a guided filter of 11x11 pixels removes."""
     from kornia.filters import guided_blur
 
     return image - guided_blur(image, image, 11, eps)
 
 
 def adaptive(image: Tensor) -> Tensor:
-    """Second differences along rows and columns, each times a gain that a recursion adapts along the row.
+    """Second differences along rows and columns, each times a gain that is adapted recursively along the row.
 
-    Where the image is active, the gains drive its local dynamics towards a multiple; where it is flat, to no change.
+    In active areas, the gains adapt until the local dynamics is a multiple of its original; in flat areas, until it is
+    unchanged.
     """
     dtype, image = image.dtype, 255 * image.double()
     padded = F.pad(image, (1, 1, 1, 1), mode="reflect")
@@ -82,14 +83,14 @@ def adaptive(image: Tensor) -> Tensor:
 
 
 def _dynamics(image: Tensor) -> Tensor:
-    """Difference of a pixel to its eight neighbours."""
+    """Local dynamics: difference of a pixel to its eight neighbours."""
     kernel = -torch.ones(1, 1, 3, 3, dtype=image.dtype)
     kernel[..., 1, 1] = 8
     return F.conv2d(F.pad(image, (1, 1, 1, 1), mode="reflect"), kernel)
 
 
 def constrained(image: Tensor, amount: float, radius: int = 2) -> Tensor:
-    """Unsharp masking whose overshoot is held to a tenth of the range of the surroundings, as the paper's [28] does."""
+    """Unsharp masking with overshoot limited to a tenth of the local range, as in the paper's [28]."""
     size = 2 * radius + 1
     highest, lowest = F.max_pool2d(image, size, 1, radius), -F.max_pool2d(-image, size, 1, radius)
     slack = SLACK * (highest - lowest)

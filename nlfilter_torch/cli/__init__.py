@@ -1,6 +1,6 @@
-"""The command line ``nlfilter-torch``. Options that commands share are in ``options``.
+"""The command line ``nlfilter-torch``. Options shared by several commands are in ``options``.
 
-Bad input of any kind is reported in one sentence on the standard error stream and exit status 2.
+Invalid input of any kind is reported in one sentence on standard error, with exit status 2.
 """
 
 import sys

@@ -31,9 +31,9 @@ Open = Annotated[
 
 
 def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Port = 0, open: Open = True) -> None:
-    """Edit a photograph in the browser: sliders, brush, before and after.
+    """Edit a photograph in the browser, with sliders and a brush, and compare before and after.
 
-    The page is served by this machine to itself; nothing is sent or fetched elsewhere. Ctrl+C ends it.
+    The page is served locally; nothing is sent to or fetched from other machines. Ctrl+C ends the editor.
 
     Example: `nlfilter-torch app photo.jpg`
     """

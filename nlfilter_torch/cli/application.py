@@ -1,4 +1,4 @@
-"""The command line put together from its commands, and how it reports bad input."""
+"""The assembled command line, and how it reports invalid input."""
 
 import math
 import reprlib
@@ -28,10 +28,10 @@ NAME = "nlfilter-torch"
 
 
 class Verb(TyperCommand):
-    """A command whose errors show a wrong number, and that refuses NaN and infinity."""
+    """A command that shows out-of-range numbers in its errors, and rejects NaN and infinity."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Raise ValueError where an option is NaN or infinite, BadParameter where it is beyond its range."""
+        """Parse the arguments; raise ValueError if an option is NaN or infinite, BadParameter if it is out of range."""
         given = list(args)
         try:
             rest = super().parse_args(ctx, args)
@@ -81,15 +81,15 @@ def _common(
         ),
     ] = False,
 ) -> None:
-    """Edit photographs with a filter that treats similar places alike, wherever they are.
+    """Edit photographs with a filter that treats similar places alike, wherever they are in the picture.
 
-    It compares small patches all over the picture and separates fine texture, larger details and shading, so that each
-    can be made stronger or weaker. `nlfilter-torch COMMAND --help` explains each command.
+    It compares small patches from the whole picture and separates fine texture, larger details and shading, so that
+    each can be made stronger or weaker. `nlfilter-torch COMMAND --help` explains each command.
     """
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run the command line; bad input becomes one sentence and exit status 2, Ctrl-C status 130."""
+    """Run the command line and return its exit status: 2 after one sentence for invalid input, 130 for Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
@@ -105,12 +105,12 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _refuse(message: str) -> int:
-    # Typer puts the class of an error before some of its messages.
+    # Typer begins some messages with the class of the error.
     sentence = " ".join(message.replace("Value error, ", "").split())
     sys.stderr.write(f"{NAME}: {sentence}\n")
     return 2
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Print a warning without its place in the code."""
+    """Print a warning without its location in the code."""
     sys.stderr.write(f"{NAME}: note: {message}\n")

@@ -1,4 +1,4 @@
-"""``nlfilter-torch apply``: a whole edit out of a file, on a photograph."""
+"""``nlfilter-torch apply``: apply a saved edit to a photograph."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +27,7 @@ def apply(
     memory: options.Memory = None,
     full: options.Full = False,
 ) -> None:
-    """Edit a photograph as another one was edited in the browser: sliders, strokes and all.
+    """Apply an edit saved in the browser to a photograph, including its sliders and strokes.
 
     Photographs larger than memory are edited in tiles.
 

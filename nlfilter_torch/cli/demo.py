@@ -16,7 +16,7 @@ SELECTION_BANDWIDTH = 25 / options.LEVELS
 
 
 def demo(folder: Folder = Path("out")) -> None:
-    """Show what this program does, on a photograph that comes with it.
+    """Show what this program does, on an example photograph.
 
     Writes pictures of the photograph before and after, of its layers, of the patterns that the filter finds, of the
     response of the sliders and of a region extended to everything that looks like it, and prints a table.

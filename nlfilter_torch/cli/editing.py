@@ -1,4 +1,4 @@
-"""What every verb does that turns one photograph into another: read, check, edit, write; in tiles if it has to be."""
+"""The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -22,7 +22,7 @@ from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.sources import Rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics
 
-MOST = 1e6  # gigabytes that anyone may have
+MOST = 1e6  # gigabytes; upper limit of ``--memory``
 
 
 def allowed_memory(gigabytes: float | None) -> int:
@@ -35,7 +35,7 @@ def allowed_memory(gigabytes: float | None) -> int:
 
 
 def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int) -> Photograph | None:
-    """The photograph, or None if it has to be read by rows."""
+    """Read the photograph, or return None if it must be read by rows."""
     if is_zarr(Path(source)) or is_zarr(Path(target)):
         return None
     try:
@@ -49,11 +49,11 @@ class Job:
     """A photograph that is edited by rows.
 
     Attributes:
-        picture: that is read.
-        kind: dtype of what is written.
-        memory: bytes that are left.
-        report: told of the progress.
-        files: closes what was opened.
+        picture: the input.
+        kind: dtype of the output.
+        memory: bytes that are still free.
+        report: called with the progress.
+        files: closes opened files.
     """
 
     picture: StoredPicture
@@ -68,12 +68,12 @@ class Job:
         return self.picture.shape[0], self.picture.shape[1]
 
     def passes(self, full: bool, folder: Path) -> Passes:
-        """Over the photograph, from every pixel or from a sample of them; what comes between them is in a folder."""
+        """Tiling options, with statistics from all pixels or from a sample, and a folder for temporary files."""
         statistics: Statistics = "full" if full else "sample"
         return Passes(self.kind, statistics, memory=max(self.memory, 1), report=self.report, folder=folder)
 
     def open(self, path: Path) -> StoredPicture:
-        """Another picture, read by rows as long as the job takes."""
+        """Open another picture to be read by rows; it is closed at the end of the job."""
         found = self.files.enter_context(open_picture(path, self.memory))
         self.memory -= found.cached
         return found
@@ -90,17 +90,17 @@ def edit_file(
     by_rows: Callable[[Job], Rows],
     coloured: bool = False,
 ) -> None:
-    """Write ``edit`` of the photograph in one file to another or the same, with all that the file carries.
+    """Edit the photograph in a file, and write it to another file or the same one, with its metadata.
 
     Args:
         source: the file to read.
         target: the file to write.
-        depth: of the output, None for that of the input.
-        edit: from the photograph to new pixels (1, C, H, W).
-        bytes_per_pixel: memory that the edit needs for each pixel of an image.
-        memory: gigabytes that may be used, None for a fifth of the machine's.
-        by_rows: the same edit of a photograph that is larger.
-        coloured: that the edit by rows gives colours to a grey photograph.
+        depth: of the output; None is that of the input.
+        edit: computes new pixels (1, C, H, W) from the photograph.
+        bytes_per_pixel: memory that the edit needs per pixel of an image.
+        memory: gigabytes that may be used; None is a fifth of the machine's.
+        by_rows: the same edit for photographs that do not fit in memory.
+        coloured: whether the edit by rows adds colours to a grey photograph.
     """
     allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:

@@ -1,4 +1,4 @@
-"""A command for every edit: its options are made from the declaration of its parameters."""
+"""One command per edit, with options generated from the declaration of its parameters."""
 
 import inspect
 from collections.abc import Callable, Iterable
@@ -19,7 +19,7 @@ TYPES = {"number": float, "count": int, "odd": int, "sliders": str}
 
 
 def plain_step(recipe: Recipe) -> Step | None:
-    """The only step of a recipe, if it is one that options of ``detail`` can say."""
+    """The only step of a recipe, if options of ``detail`` can express it."""
     step = recipe.steps[0] if len(recipe.steps) == 1 else None
     return step if step is not None and step.edit == "detail" and not step.strokes else None
 
@@ -30,7 +30,10 @@ def look_step(recipe: Recipe) -> Step | None:
 
 
 def preset_option(help: str, *, plain: bool = True) -> Any:
-    """An option for a preset, whose values take the place of the options' defaults; a ``plain`` one takes no others."""
+    """An option for a preset, whose values replace the defaults of other options.
+
+    If ``plain``, presets must be a look or a single step of detail without strokes.
+    """
 
     def use(context: typer.Context, name: str | None) -> str | None:
         step = None if name is None else plain_step(find_recipe(name))
@@ -53,7 +56,7 @@ PresetName = Annotated[
         "`nlfilter-torch fit` made, in place of the defaults here; options that are given count for more."
     ),
 ]
-#: Options for what is painted or marked on the photograph, by the name of the edit.
+#: Options for scribbles, regions and masks, by the name of the edit.
 SCRIBBLES: dict[str, dict[str, Any]] = {
     "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile, "show": options.Show},
     "recolor": {
@@ -75,7 +78,7 @@ SCRIBBLES: dict[str, dict[str, Any]] = {
 
 
 def option_value(parameter: Parameter, value: Any) -> Any:
-    """A value as its option gives it.
+    """Convert the value of a parameter to that of its option.
 
     >>> option_value(EDITS["detail"]["alpha"], (3.0, 1.05)), option_value(EDITS["tone"]["bandwidth"], 20.0)
     ('3,1.05', '20')
@@ -86,7 +89,7 @@ def option_value(parameter: Parameter, value: Any) -> Any:
 
 
 def option(parameter: Parameter, panel: str | None = None) -> Any:
-    """The annotation of an option, in a part of the help that has a title."""
+    """The annotation of a parameter's option; ``panel`` is the title of its section in the help."""
     kind: Any = Literal[parameter.choices] if parameter.choices else TYPES[parameter.kind]
     limits: dict[str, Any] = {}
     if parameter.words:
@@ -115,7 +118,7 @@ def _declared(parameter: Parameter, panel: str | None = None) -> inspect.Paramet
 
 
 def signature(edit: Edit) -> inspect.Signature:
-    """The arguments of the command of an edit."""
+    """The signature of an edit's command."""
     return inspect.Signature(
         [
             _argument("source", options.Source, inspect.Parameter.empty),
@@ -131,7 +134,7 @@ def signature(edit: Edit) -> inspect.Signature:
 
 
 def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of detail of these names, and those of more edits, in place of its ``**given``."""
+    """Replace ``**given`` of a command with the named options of detail and all options of the edits in ``more``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         found = inspect.signature(function, eval_str=True).parameters.values()
@@ -142,26 +145,26 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[.
                 if parameter.is_option and parameter.name not in added:
                     added[parameter.name] = _declared(parameter, f"Options of {edit.name}")
         signature = inspect.Signature([*own, *added.values()])
-        setattr(function, "__signature__", signature)  # noqa: B010  # typer looks at it, mypy does not know it
+        setattr(function, "__signature__", signature)  # noqa: B010  # read by typer; unknown to mypy
         return function
 
     return decorate
 
 
 def command(edit: Edit) -> Callable[..., None]:
-    """The command of an edit."""
+    """Create the command of an edit."""
 
     def run(source: str, target: str, **given: Any) -> None:
         edit_photograph(edit.name, source, target, **given)
 
     run.__name__, run.__doc__ = edit.name, edit.help
-    run.__signature__ = signature(edit)  # type: ignore[attr-defined]  # typer looks at it
+    run.__signature__ = signature(edit)  # type: ignore[attr-defined]  # read by typer
     run.__annotations__ = {}
     return run
 
 
 def step_of(edit: Edit, given: dict[str, Any]) -> Step:
-    """The step that options describe, without what is painted for it."""
+    """Create a step from options, without its scribbles."""
     values = {}
     for parameter in edit:
         if parameter.name not in given:
@@ -186,7 +189,7 @@ def edit_photograph(
     full: bool = False,
     **given: Any,
 ) -> None:
-    """Do the edit of a name to a file; options are those of its command, and those left out have their defaults."""
+    """Apply an edit, given by name, to a file; ``given`` are options of its command, by default those of the edit."""
     edit = EDITS[name]
     step = step_of(edit, given)
     preset = given.get("preset")
@@ -211,7 +214,7 @@ def edit_photograph(
     from nlfilter_torch.tiled.workers import undivided
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
-        """Say what the scribbles cover, and show it."""
+        """Print the colours that scribbles cover, and write the picture of ``--show``."""
         check_channels(name, read(slice(0, 1)).shape[1])
         if given.get("show") is not None and not any(True for _ in showing.overlays(drawn)):
             raise ValueError("--show needs scribbles to show; give --region X,Y,W,H, or leave it out")
@@ -220,7 +223,7 @@ def edit_photograph(
             showing.show(given["show"], name, step.arguments, size, read, drawn)
 
     def measured(named: dict[str, Any], picture: Source, read: showing.Read) -> NoiseReport:
-        """The report of the noise, which is estimated once, here, and its map, if asked for."""
+        """Estimate the noise unless it is given, write its map if requested, and return its report."""
         level = step.arguments(picture.size)["noise_level"]
         if level is None:
             named["noise_level"] = noise_of(picture)

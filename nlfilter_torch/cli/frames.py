@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 #: Edits without scribbles.
 UNPAINTED = tuple(edit for edit in EDITS.values() if not edit.needs)
 OWN = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
-PIXEL = 100  # bytes for each pixel of a frame, besides those of the edit, which works in tiles
+PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
 
 Frames = Annotated[
     Path,
@@ -71,12 +71,12 @@ def frames(
     memory: options.Memory = None,
     **given: Any,
 ) -> None:
-    """Edit all frames of a film alike, so that nothing flickers.
+    """Edit all frames of a film alike, without flicker.
 
-    The filter is made once, from frames spread over the film, and each frame is edited with it. Since things move,
-    distance counts only where --spatial-bandwidth is given. Films keep their sound, frame rate, time stamps, rotation
-    and colour properties (needs the extra `films`). Photographs in a folder keep their names, types, depths,
-    transparency, colour profiles and notes of the camera.
+    The filter is fitted once, to frames spread over the film, and applied to every frame. Since objects move, distance
+    counts only if --spatial-bandwidth is given. Films keep their sound, frame rate, time stamps, rotation and colour
+    properties (needs the extra `films`). Photographs in a folder keep their names, types, depths, transparency, colour
+    profiles and camera metadata.
 
     By sliders: `nlfilter-torch frames film.mp4 edited.mp4 --alpha 2,2,2,1`
 
@@ -103,10 +103,10 @@ def frames(
 
 
 def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: dict[str, Any]) -> Recipe:
-    """The edit that options describe.
+    """Create the edit from options.
 
     Raises:
-        ValueError: if there are options of other edits.
+        ValueError: if an option does not belong to the edit.
     """
     sources = {option: context.get_parameter_source(option) for option in (*given, "edit")}
     typed = [option for option, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
@@ -134,7 +134,7 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: 
 
 
 def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
-    """Edit a film; the number of its frames."""
+    """Edit a film, and return the number of its frames."""
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.io.films import check_film_output, open_film, write_film
 
@@ -146,7 +146,7 @@ def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[
 
 
 def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
-    """Edit the photographs of a folder; their number."""
+    """Edit the photographs in a folder, and return their number."""
     import torch
 
     from nlfilter_torch.cli.folders import pictures

@@ -1,4 +1,4 @@
-"""``nlfilter-torch inspect``: pictures and figures of the filter of a photograph."""
+"""``nlfilter-torch inspect``: pictures and diagnostics of the filter of a photograph."""
 
 import json
 from dataclasses import asdict
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Folder = Annotated[
     Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
 ]
-# What each figure of the diagnostics means, for someone who has not read the paper.
+# Meaning of each diagnostic, for readers who do not know the paper.
 MEANINGS = {
     "height": "pixels from top to bottom",
     "width": "pixels from left to right",
@@ -42,7 +42,7 @@ MEANINGS = {
 
 @with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
 def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **given: Any) -> None:
-    """Show how the filter sees a photograph: the patterns it finds, how strong they are, and how sliders change them.
+    """Show the filter of a photograph: the patterns it finds, how strong they are, and how sliders change them.
 
     Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table.
 
@@ -80,7 +80,7 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 
 
 def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
-    """The operator of a guide (1, 1, H, W), with the filter's parameters of a step."""
+    """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
     from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.edits.detail import options_of
     from nlfilter_torch.operator.build import nonlocal_operator

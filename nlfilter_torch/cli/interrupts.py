@@ -1,6 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGHUP end the work without a traceback or an unfinished file, and set the exit status.
+"""Ctrl-C, SIGTERM and SIGHUP end the program without a traceback or an unfinished file, and set the exit status.
 
-This module is imported before anything that takes time.
+This module is imported first, since other imports take time.
 """
 
 import _thread
@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-INTERRUPTED = 128 + signal.SIGINT  # exit status, as shells have it for Ctrl-C
-PAUSE = 0.05  # seconds until an interrupt is repeated that could not be raised where it arrived
+INTERRUPTED = 128 + signal.SIGINT  # exit status that shells use for Ctrl-C
+PAUSE = 0.05  # seconds after which an interrupt is sent again, if it could not be raised where it arrived
 SHOW_CURSOR = "\x1b[?25h"
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -22,24 +22,24 @@ class Ended(SystemExit):
     """SIGTERM or SIGHUP, raised in the main thread so that unfinished files are removed."""
 
     def __init__(self, number: int) -> None:
-        """The exit status is the one that shells use for the signal of that number."""
+        """Set the exit status that shells use for signal ``number``."""
         self.number, self.status = number, 128 + number
         super().__init__(self.status)
 
 
 def tell() -> int:
-    """Say that the work was interrupted; return the exit status."""
+    """Report the interrupt and return the exit status."""
     sys.stderr.write("nlfilter-torch: interrupted; no file is half written\n")
     return INTERRUPTED
 
 
 @contextmanager
 def handled() -> Iterator[None]:
-    """Turn signals into exceptions that end the work.
+    """Turn signals into exceptions that end the program.
 
-    An interrupt during a destructor or a callback, such as those after each import, is repeated: Python cannot raise it
-    there, but would print "Exception ignored in" and continue the work. So is one during an import while a file is
-    unfinished: the imported code could catch the exception.
+    An interrupt during a destructor or a callback, such as those after each import, is sent again later: Python cannot
+    raise it there, but would print "Exception ignored in" and continue. An interrupt during an import while a file is
+    unfinished is sent again too: the imported code could catch the exception.
     """
     former = sys.unraisablehook
     repeats: list[threading.Timer] = []
@@ -54,7 +54,7 @@ def handled() -> Iterator[None]:
             former(lost)
             return
         number = lost.exc_value.number if isinstance(lost.exc_value, Ended) else signal.SIGINT
-        repeat(number)  # raised here, it would be lost again
+        repeat(number)  # an exception raised here would be lost again
 
     handlers = _install(repeat)
     sys.unraisablehook = hook
@@ -69,7 +69,7 @@ def handled() -> Iterator[None]:
 
 
 def _send(number: int) -> None:
-    """Send a signal to the main thread, also while it waits in a system call where the platform can do that."""
+    """Send a signal to the main thread, even while it waits in a system call if the platform supports that."""
     main = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and main is not None:
         signal.pthread_kill(main, number)
@@ -78,10 +78,10 @@ def _send(number: int) -> None:
 
 
 def _install(repeat: Callable[[int], None]) -> dict[int, signal.Handlers]:
-    """Handle the signals whose handlers are still Python's own; return these handlers.
+    """Replace the handlers of signals that still have Python's own, and return the former handlers.
 
     Background jobs of a shell ignore SIGINT, jobs under nohup ignore SIGHUP, and a program that runs this one may have
-    handlers of its own; these are left alone.
+    its own handlers; those are left unchanged.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -93,7 +93,7 @@ def _install(repeat: Callable[[int], None]) -> dict[int, signal.Handlers]:
 
 
 def _handle(number: int, frame: FrameType | None, repeat: Callable[[int], None]) -> None:
-    """Raise an exception; during an import, whose code could catch it, end the process or wait for the import."""
+    """Raise an exception; during an import, which could catch it, end the process or send the signal again later."""
     files = sys.modules.get("nlfilter_torch.io.photographs")
     if _importing(frame):
         if getattr(files, "unfinished", None):
@@ -111,7 +111,7 @@ def _handle(number: int, frame: FrameType | None, repeat: Callable[[int], None])
 
 
 def _importing(frame: FrameType | None) -> bool:
-    """Whether the command line, which may itself be run by an import, is importing something."""
+    """Whether the command line is importing a module; it may itself be run by an import."""
     while frame is not None and frame.f_globals.get("__name__") != "nlfilter_torch.cli":
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True

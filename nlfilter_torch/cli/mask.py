@@ -1,4 +1,4 @@
-"""``nlfilter-torch mask``: a soft mask of a thing in a photograph, as a picture of its own."""
+"""``nlfilter-torch mask``: write a soft mask of an object in a photograph."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -58,12 +58,12 @@ def mask(
         return values(size) | {"generator": seeded(seed)}
 
     def selected_by(size: tuple[int, int], read: scribbles.Open) -> tuple[Any, Any]:
-        """Regions of the foreground and the background."""
+        """Foreground and background scribbles."""
         inside = scribbles.selection(size, mask, region, "--region", read)
         return inside, scribbles.selection(size, None, background, "--background", read)
 
     def tell(drawn: tuple[Any, Any], size: tuple[int, int], read: showing.Read) -> None:
-        """Say what the scribbles cover, and show it."""
+        """Print the colours that scribbles cover, and write the picture of ``--show``."""
         scribbled = (drawn[:1], {"keep": drawn[1]})
         showing.tell_colours(showing.overlays(scribbled), read)
         if show is not None:
@@ -104,11 +104,11 @@ def mask(
 
 
 def _first_channel(rows: "Rows") -> Iterator[Any]:
-    """The mask alone, without the transparency of the photograph."""
+    """Drop the transparency of the photograph."""
     for part, values in rows:
         yield part, values[..., :1]
 
 
 mask.__doc__ = MASK.help
-mask.__signature__ = signature(MASK)  # type: ignore[attr-defined]  # typer looks at it
+mask.__signature__ = signature(MASK)  # type: ignore[attr-defined]  # read by typer
 mask.__annotations__ = {}

@@ -1,4 +1,4 @@
-"""What ``nlfilter-torch denoise`` says: the noise that it found, and how much it changed."""
+"""The report of ``nlfilter-torch denoise``: the noise of the photograph, and how much it was changed."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,17 +15,17 @@ from nlfilter_torch.edits.noise import Noise
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 from nlfilter_torch.tiled.sources import WHITE, Rows, RowSource
 
-VISIBLE = 0.5  # grey levels; eight bits round to as much
-LARGEST = 64  # grey levels, which are white in a map
-ROWS, AROUND = 256, 2  # of the photograph that are read at once, and beside them
+VISIBLE = 0.5  # grey levels; the rounding error of eight bits
+LARGEST = 64  # grey levels; white in a map
+ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides
 
 
 class NoiseReport:
-    """Of one photograph, in grey levels.
+    """Noise of a photograph, and how much denoising changed it, in grey levels.
 
     Args:
-        noise: of it.
-        given: whether the user gave it.
+        noise: of the photograph.
+        given: whether the noise level was given by the user.
     """
 
     def __init__(self, noise: Noise, *, given: bool) -> None:
@@ -35,13 +35,13 @@ class NoiseReport:
         self._squares, self._count = 0.0, 0
 
     def add(self, before: NDArray[np.generic], after: NDArray[np.generic]) -> None:
-        """Count what some rows (h, W, S) were and are, each as it is stored."""
+        """Add the difference of some rows (h, W, S) before and after, both in their stored dtypes."""
         difference = _scaled(after) - _scaled(before)
         self._squares += float(np.square(difference, dtype=np.float64).sum())
         self._count += difference.size
 
     def watched(self, rows: Rows, source: RowSource) -> Rows:
-        """Rows that are edited, counted on their way; what was found and done is printed after the last."""
+        """Pass edited rows through, adding their differences, and print the report after the last."""
         for part, values in rows:
             colours = 3 if values.shape[2] >= 3 else 1  # the rest is transparency
             before = np.asarray(source[part]).reshape(values.shape)
@@ -50,7 +50,7 @@ class NoiseReport:
         self.tell()
 
     def tell(self) -> None:
-        """Print it."""
+        """Print the report."""
         level, change = LEVELS * self._level, LEVELS * (self._squares / max(self._count, 1)) ** 0.5
         found = f"denoise: noise of {level:.2f} grey levels {'given' if self._given else 'found'}{self._ends}"
         if self._level < QUIET:
@@ -66,8 +66,8 @@ def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tenso
 
     Args:
         noise: of the photograph.
-        size: (H, W) of it.
-        read: rows of it, (1, C, h, W).
+        size: (H, W) of the photograph.
+        read: reads rows (1, C, h, W) of the photograph.
         path: an image file.
     """
     parts = []

@@ -1,7 +1,7 @@
-"""Options that several commands share, in a photographer's units.
+"""Options shared by several commands, in units familiar to photographers.
 
-The modules of commands import torch only inside the functions that run, so that help, lists and errors in options
-appear at once.
+Modules of commands import torch only inside the functions that run, so that help, lists and errors in options appear
+at once.
 """
 
 import math
@@ -23,7 +23,7 @@ DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "floa
 
 
 def parse_sliders(text: str, option: str) -> tuple[float, ...]:
-    """Sliders separated by commas, as an option gives them.
+    """Parse sliders separated by commas.
 
     >>> parse_sliders("3, 3,4,1.05", "--alpha")
     (3.0, 3.0, 4.0, 1.05)
@@ -46,7 +46,7 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
 
 
 def parse_number(text: str, parameter: Parameter) -> float | str:
-    """The value of an option that takes a positive number, or a word of the parameter.
+    """Parse the value of an option that takes a positive number, or one of the parameter's words.
 
     >>> from nlfilter_torch.edits.parameters import EDITS
     >>> [parse_number(text, EDITS["detail"]["bandwidth"]) for text in ("51", "auto")]

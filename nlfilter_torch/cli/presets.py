@@ -1,4 +1,4 @@
-"""``nlfilter-torch presets``: the presets that have a name."""
+"""``nlfilter-torch presets``: list the named presets."""
 
 from typing import Annotated
 
@@ -13,7 +13,7 @@ Name = Annotated[
 
 
 def presets(name: Name = None) -> None:
-    """List the presets that `nlfilter-torch detail --preset NAME` knows, or print one of them as a file.
+    """List the presets for `nlfilter-torch detail --preset NAME`, or print one of them as a file.
 
     To start one of your own: `nlfilter-torch presets crisp > mine.json`
     """

@@ -1,4 +1,4 @@
-"""Progress on the standard error stream: bars on a terminal, elsewhere a line now and then."""
+"""Progress on standard error: bars on a terminal, otherwise a line every few seconds."""
 
 import sys
 import threading
@@ -31,7 +31,7 @@ def _bar(*columns: ProgressColumn) -> Progress:
 
 @contextmanager
 def _lines(wanted: bool) -> Iterator[progress.Progress]:
-    """Progress that is printed every few seconds, by a thread, if that is wanted."""
+    """Print progress every few seconds from a thread, if ``wanted``."""
     current, ended = progress.Progress(), threading.Event()
 
     def tell() -> None:
@@ -53,9 +53,9 @@ def _lines(wanted: bool) -> Iterator[progress.Progress]:
 
 @contextmanager
 def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
-    """A bar of ``total`` steps; yields a function that begins the step of a name and ends the one before.
+    """Show a bar of ``total`` steps; yield a function that ends the current step and begins the one of a given name.
 
-    Without ``lines`` nothing is printed where there is no terminal.
+    Without ``lines``, nothing is printed if there is no terminal.
     """
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with _bar(*columns) as bar, _lines(bar.disable and lines) as current:
@@ -70,7 +70,7 @@ def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def stages() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar that starts again with every stage; yields a function of the stage, what is done, and the total."""
+    """Show a bar that restarts with every stage; yield a function of the stage, the amount done and the total."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with _bar(*columns) as bar, _lines(bar.disable) as lines:
         task = bar.add_task("")

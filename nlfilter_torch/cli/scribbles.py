@@ -19,7 +19,7 @@ from nlfilter_torch.io.rows import StoredPicture
 from nlfilter_torch.tiled.sources import Picture, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
-Open = Callable[[Path], StoredPicture]  # reads a picture over it
+Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask
 Floats = NDArray[np.float32]
 DOT = 0.03  # side of the square around a point, as a share of the short side
 
@@ -34,9 +34,9 @@ class Rectangle:
 
     @staticmethod
     def parse(text: str, option: str, size: tuple[int, int]) -> "Rectangle":
-        """Read ``X,Y,W,H``, or ``X,Y`` for a small square around a point, and ``:NOTE`` for a photograph of a size.
+        """Parse ``X,Y,W,H``, or ``X,Y`` for a small square around a point, both optionally with ``:NOTE``.
 
-        Numbers are pixels, or with a percent sign shares of the width (X, W) or height (Y, H).
+        Numbers are in pixels, or with a percent sign relative to the width (X, W) or height (Y, H) in ``size``.
 
         >>> Rectangle.parse("2,3,4,5:red", "--region", (20, 30))
         Rectangle(rows=slice(3, 8, None), columns=slice(2, 6, None), note='red')
@@ -74,7 +74,7 @@ class Rectangle:
 
 
 def _pixels(text: str, length: int) -> float:
-    """A number of pixels, from one or from a share of a length."""
+    """Parse a number of pixels or a percentage of a length."""
     text = text.strip()
     if not text.endswith("%"):
         return int(text)
@@ -86,24 +86,24 @@ def _pixels(text: str, length: int) -> float:
 
 @dataclass(frozen=True)
 class Overlay(ABC):
-    """What lies over a photograph: a picture of its size, and rectangles on top. Rows (h, W, S).
+    """Scribbles or masks over a photograph, as rows (h, W, S): a picture of its size, and rectangles on top.
 
     Attributes:
         shape: (H, W, S).
-        picture: or None.
-        rectangles: the channels that each sets, and to what.
+        picture: the picture, or None.
+        rectangles: with the channels that each sets, and their values.
     """
 
     shape: tuple[int, int, int]
     picture: Picture | None
     rectangles: list[tuple[Rectangle, slice, list[float]]]
     dtype = np.dtype(np.float32)
-    marked: ClassVar[int]  # the channel that is above 0 where something is marked
+    marked: ClassVar[int]  # channel that is above 0 where something is marked
     empty: ClassVar[str]  # end of the error for a picture in which nothing is marked
 
     @abstractmethod
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
-        """Some rows of the picture, before rectangles are laid over it."""
+        """Rows of the picture without the rectangles."""
 
     def __getitem__(self, rows: slice) -> Floats:
         """The rows from ``rows.start`` to ``rows.stop``."""
@@ -119,7 +119,7 @@ class Overlay(ABC):
         """All rows, as planes (1, S, H, W).
 
         Raises:
-            ValueError: if there is a picture in which nothing is marked.
+            ValueError: if nothing is marked in the picture.
         """
         rows = slice(0, self.shape[0])
         if self.picture is not None and not self._of_picture(rows, self.picture)[..., self.marked].any():
@@ -128,7 +128,7 @@ class Overlay(ABC):
 
 
 class Regions(Overlay):
-    """Weights of regions, the first of them in the picture."""
+    """Masks of regions; the picture is the first of them."""
 
     marked, empty = 0, "black everywhere; paint white what is to be selected"
 
@@ -139,18 +139,18 @@ class Regions(Overlay):
 
 
 class Strokes(Overlay):
-    """Colours in RGB and their mask, in four channels."""
+    """Coloured scribbles: RGB and their mask, in four channels."""
 
     marked, empty = 3, "transparent everywhere; paint at least one stroke"
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         tile = picture.tile(rows.start, rows.stop, 0)
-        colours = tile.pixels[0].expand(3, -1, -1).permute(1, 2, 0)  # a grey picture gives its value to all three
+        colours = tile.pixels[0].expand(3, -1, -1).permute(1, 2, 0)  # a grey picture has one channel
         return np.concatenate([colours.to(torch.float32), transparency(tile, "float32")], axis=2)
 
 
 def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Scribbles and masks from the options of an edit, in the form of :func:`scribbles_of`, as rows."""
+    """Read scribbles and masks from the options of an edit; as in :func:`scribbles_of`, but sources of rows."""
     mask, regions = given.get("mask"), given.get("region")
     if step.edit in ("recolor", "colorize"):
         keep = selection(size, None, given.get("keep"), "--keep", read)
@@ -170,7 +170,7 @@ def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tup
 
 
 def at_once(scribbles: tuple[Any, ...], named: dict[str, Any]) -> tuple[tuple[Tensor, ...], dict[str, Any]]:
-    """What :func:`of_edit` gives as tensors."""
+    """Convert the result of :func:`of_edit` to tensors."""
     planes = [rows.at_once() for rows in scribbles if rows is not None]
     if scribbles and isinstance(scribbles[0], Strokes):
         planes = list(planes[0].split([3, 1], dim=1))
@@ -178,7 +178,7 @@ def at_once(scribbles: tuple[Any, ...], named: dict[str, Any]) -> tuple[tuple[Te
 
 
 def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Open) -> Strokes:
-    """From ``--strokes`` and ``--region``."""
+    """Read coloured scribbles from ``--strokes`` and ``--region``."""
     if path is None and not regions:
         raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
     rectangles = []
@@ -198,7 +198,7 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
 
 
 def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
-    """A single region from a mask file and the rectangles of an option, or None if neither is given."""
+    """Read a single region from a mask file and the rectangles of an option, or return None if neither is given."""
     rectangles = []
     for text in texts or []:
         rectangle = Rectangle.parse(text, option, size)
@@ -211,9 +211,9 @@ def selection(size: Size, path: Path | None, texts: list[str] | None, option: st
 def _slider_regions(
     size: Size, path: Path | None, texts: list[str] | None, alpha: Tensor, read: Open
 ) -> tuple[Regions, Tensor]:
-    """K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, at least one of them given.
+    """Read K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, of which at least one is given.
 
-    A mask, and a rectangle without its own sliders, has the sliders ``alpha`` (k+1,).
+    The mask, and rectangles without their own sliders, have the sliders ``alpha`` (k+1,).
     """
     rectangles, sliders = [], [] if path is None else [alpha]
     for text in texts or []:
@@ -230,7 +230,7 @@ def _slider_regions(
 
 
 def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = False) -> Picture | None:
-    """A picture over a photograph of ``size``; raises unless it has that size and the transparency it needs."""
+    """Open a picture over a photograph; raise ValueError unless it has its size and, if needed, transparency."""
     if path is None:
         return None
     stored = read(path)

@@ -1,4 +1,4 @@
-"""What scribbles cover: their colours as text, a note where one covers unlike things, and a picture of it all."""
+"""What scribbles cover: their colours as text, a note where one covers very different colours, and a picture."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -18,15 +18,15 @@ from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
-PIXELS = 500_000  # of the picture that shows scribbles, at most
-UNLIKE = 0.2  # distance in hundredths of Lab beyond which two colours are very different
-FEW = 0.15  # share of such pixels that a scribble may cover
+PIXELS = 500_000  # largest size of the picture that shows scribbles
+UNLIKE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
+FEW = 0.15  # share of such pixels above which a note is printed
 ROWS = 64
-DIM = 0.4  # light of what is outside the mask, which is shown without colour
+DIM = 0.4  # brightness outside the mask, where the picture is shown in grey
 
 
 def overlays(drawn: tuple[tuple[Any, ...], dict[str, Any]]) -> Iterator[tuple[str, Overlay]]:
-    """Scribbles of an edit, with the option that they come from."""
+    """Yield the scribbles of an edit, with the option that they come from."""
     scribbles, named = drawn
     for option, found in (*(("--region", each) for each in scribbles), ("--keep", named.get("keep"))):
         if isinstance(found, Overlay):
@@ -34,7 +34,7 @@ def overlays(drawn: tuple[tuple[Any, ...], dict[str, Any]]) -> Iterator[tuple[st
 
 
 def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
-    """Print the colour under each rectangle; and a note on the standard error stream if it covers very unlike ones."""
+    """Print the colour under each rectangle, and a note on standard error if it covers very different colours."""
     for option, overlay in drawn:
         for rectangle, _, _ in overlay.rectangles:
             pixels = read(rectangle.rows)[..., rectangle.columns].float().clamp(0, 1).flatten(2)
@@ -69,10 +69,10 @@ def show(
 
     Args:
         target: an image file.
-        edit: the name of the edit whose scribbles they are, or ``mask``.
-        arguments: of its function, for a size and for every how many pixels it has one.
+        edit: the name of the edit that the scribbles are for, or ``mask``.
+        arguments: computes the arguments of its function for a reduced size and its sampling step in pixels.
         size: (H, W) of the photograph.
-        read: its rows.
+        read: reads its rows.
         drawn: the scribbles, as of :func:`~nlfilter_torch.cli.scribbles.of_edit`.
     """
     stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / PIXELS)))
@@ -83,16 +83,16 @@ def show(
     painted = region[:, 3:].ceil() if is_strokes else region.amax(1, keepdim=True).ceil()
     options = arguments((image.shape[-2], image.shape[-1]), stride)
     if edit == "colorize":
-        mask = torch.ones_like(painted)  # every pixel takes a colour
+        mask = torch.ones_like(painted)  # all pixels are coloured
     else:
         names = {parameter.keyword for parameter in MASK}
-        if edit == "detail":  # its other bandwidths are those of the filter
+        if edit == "detail":  # other bandwidths are those of the detail filter
             options = {"reach": options["reach"], "photometric_bandwidth": options["mask_bandwidth"]}
         taken = {name: value for name, value in options.items() if name in names}
         if edit == "defocus":
             taken["reach"] = REACH
         mask = region_mask(image, painted, kept, **taken, generator=seeded())
-    outside = DIM * image.mean(1, keepdim=True)  # no colour is like every picture's
+    outside = DIM * image.mean(1, keepdim=True)  # grey, since any tint may occur in the picture
     shown = torch.lerp(outside.expand_as(image), image, mask)
     colours = region[:, :3] if is_strokes else shown.new_tensor((0.1, 0.8, 0.3)).view(1, 3, 1, 1).expand_as(shown)
     shown = torch.lerp(shown, colours, 0.75 * painted)
@@ -104,7 +104,7 @@ def show(
 
 
 def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
-    """Scribbles, reduced; one that covers less than a pixel stays in sight."""
+    """Reduce scribbles; one that covers less than a pixel remains visible."""
 
     def rows(part: slice) -> Tensor:
         return torch.from_numpy(overlay[part]).permute(2, 0, 1)[None]
@@ -113,7 +113,7 @@ def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
 
 
 def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[[Tensor, int], Tensor]) -> Tensor:
-    """Every ``stride`` pixels in both directions as one, without more than some rows in memory."""
+    """Pool blocks of ``stride`` pixels along each axis, with only some rows in memory at once."""
     height = size[0] // stride * stride
     starts = range(0, height, ROWS * stride)
     return torch.cat([pool(read(slice(a, min(a + ROWS * stride, height))), stride) for a in starts], dim=2)

@@ -1,8 +1,8 @@
-"""One edit for all frames of a film: fitted to some frames, and applied to each of them a few rows at a time.
+"""One edit for all frames of a film: fitted to some reference frames, and applied to each frame a few rows at a time.
 
-What an edit takes from the whole picture (landmarks, sums, means, the strength of the noise) it takes from the
-references, in an order that does not depend on the picture. The first time the answers are kept; for every other frame
-they are given again, so that equal spots are edited equally in all of them.
+Everything that an edit computes from the whole picture (landmarks, sums, means, the noise level) it computes from the
+reference frames, in an order that does not depend on the picture. The results are cached the first time and returned
+again for every other frame, so that equal patches are edited equally in all frames.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,21 +32,21 @@ from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import Block, Sums
 from nlfilter_torch.tiled.tiles import Passes
 
-LEARNT_FROM = 1 << 16  # pixels of all references together; twice or half as many are as close to all pixels
-FAR = 1e6  # a spatial bandwidth in pixels at which distance does not count
+LEARNT_FROM = 1 << 16  # pixels of all references together; twice or half as many approximate all pixels equally well
+FAR = 1e6  # spatial bandwidth in pixels at which distance has no effect
 Answer = TypeVar("Answer")
 Rows = NDArray[np.float32]
 
 
 @dataclass(eq=False)
 class References:
-    """Frames that an edit is fitted to, and what it asked of them so far, in order."""
+    """Frames that an edit is fitted to, and the results computed from them so far, in order."""
 
     pictures: list[Picture]
     answers: list[Any] = field(default_factory=list)
 
     def forget_pixels(self) -> None:
-        """Leave only the answers: nothing more will be asked."""
+        """Free the frames and keep only the results, once all of them are known."""
         self.pictures = []
         for answer in self.answers:
             if isinstance(answer, References):
@@ -57,7 +57,7 @@ class References:
 
 @dataclass(eq=False)
 class LearntFilter:
-    """The filter of all references: its kernel and balancing, and blocks of the pixels that it was made from."""
+    """The filter of all references: its kernel and balancing, and blocks of the pixels that it was fitted to."""
 
     pilot: Pilot
     balancing: PixelScaling
@@ -65,7 +65,7 @@ class LearntFilter:
 
 
 class FrameOperator(TiledOperator):
-    """The filter of the references, for the pixels of a frame."""
+    """The filter of the references, applied to the pixels of a frame."""
 
     frame: "Frame"
 
@@ -89,12 +89,12 @@ class FrameOperator(TiledOperator):
 
 
 class Frame(Tiled):
-    """A frame as the source of an edit that is fitted to the references.
+    """A frame as the source of an edit that is fitted to reference frames.
 
     Args:
         picture: the frame.
-        passes: how it is read.
-        references: of its size.
+        passes: tiling options.
+        references: frames of the same size.
     """
 
     def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
@@ -102,7 +102,7 @@ class Frame(Tiled):
         self.references, self.asked = references, 0
 
     def answer(self, work: Callable[[], Answer]) -> Answer:
-        """What is known about the references already, or what a function finds out about them."""
+        """Return the next cached result for the references, or compute and cache it."""
         if self.asked == len(self.references.answers):
             with torch.no_grad():
                 self.references.answers.append(work())
@@ -110,7 +110,7 @@ class Frame(Tiled):
         return cast(Answer, self.references.answers[self.asked - 1])
 
     def each_reference(self) -> Iterator["Frame"]:
-        """The references, under the filters of this frame."""
+        """Yield the references, as frames that share the operators of this one."""
         for picture in self.references.pictures:
             other = Frame(picture, self.passes, self.references)
             other.operators, other.floats = self.operators, self.floats
@@ -137,7 +137,7 @@ class Frame(Tiled):
         return found
 
     def resized(self, size: tuple[int, int]) -> "Frame":
-        """The frame and the references in a smaller size."""
+        """The frame, with the references, in a smaller size."""
 
         def reduced() -> References:
             return References([Tiled.resized(other, size).picture for other in self.each_reference()])
@@ -146,7 +146,7 @@ class Frame(Tiled):
         return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
 
     def held(self, fitted: Fitted) -> Fitted:
-        """The edit as it is, since means are taken over other pictures than the one that it is needed for again."""
+        """Return the edit unchanged: stored planes would be those of the frame, but means are over the references."""
         return fitted
 
     def mean(self, planes: Planes) -> Tensor:
@@ -158,7 +158,7 @@ class Frame(Tiled):
         return self.answer(lambda: mean_of([Tiled.mean_of(other, fitted, function) for other in self.each_reference()]))
 
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
-        """The mean of what a function finds in the references."""
+        """The mean of a measurement over the references."""
         return self.answer(lambda: mean_of([function(other) for other in self.each_reference()]))
 
 
@@ -168,10 +168,10 @@ def mean_of(values: Sequence[Tensor]) -> Tensor:
 
 
 def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
-    """The filter of several pictures of one size, from an even sample of the pixels of each.
+    """Fit one filter to several pictures of one size, from an even sample of the pixels of each.
 
-    Every pixel has the coordinates that it has in its own picture. Weights are such that all pictures together count as
-    one of them.
+    Coordinates of a pixel are those in its own picture. The weights of all pictures together sum to the number of
+    pixels of one.
     """
     options = dict(guide.options)
     channels, bandwidth = options.pop("guide_channels", "luminance"), options.pop("photometric_bandwidth", "auto")
@@ -208,12 +208,12 @@ def whole(picture: Picture) -> Tensor:
 
 
 def film_steps(recipe: Recipe) -> tuple[Step, ...]:
-    """The steps of an edit as a film takes them: where things are in the picture does not count unless it is asked for.
+    """Adapt the steps of an edit to a film: position is ignored unless a spatial bandwidth is set.
 
-    Things move, and what is far from its place in all references would not be edited as it is there.
+    An object that moves far from its position in all references would otherwise be edited differently.
 
     Raises:
-        ValueError: if a step has strokes, or needs them.
+        ValueError: if a step has or needs strokes.
     """
     for step in recipe.steps:
         if step.strokes or step.declared.needs:
@@ -232,8 +232,8 @@ class FilmEdit:
     Args:
         recipe: steps without strokes.
         references: frames (H, W, C) of one size.
-        passes: how frames are read; the output is of its kind.
-        seed: of the randomness of every step.
+        passes: tiling options; ``kind`` is ignored.
+        seed: of the random numbers of every step.
 
     Raises:
         ValueError: if a step has strokes, or references differ in size.
@@ -253,13 +253,13 @@ class FilmEdit:
             pictures = [Picture(rows.clip(0, 1), "reference") for rows in edited]
 
     def edit(self, step: Step, picture: Picture, references: References) -> Rows:
-        """A frame (H, W, C) under a step."""
+        """Apply a step to a frame (H, W, C)."""
         frame = Frame(picture, self.passes, references)
         rows = frame.rows(fit_step(step, frame, (), {}, generator=seeded(self.seed)), plain=True)
         return np.concatenate([values for _, values in rows])
 
     def __call__(self, frame: Rows) -> Rows:
-        """A frame (H, W, C) under the edit; values may leave [0, 1]."""
+        """Apply the edit to a frame (H, W, C); values may leave [0, 1]."""
         for step, references in zip(self.steps, self.references, strict=True):
             source = frame if step is self.steps[0] else frame.clip(0, 1)
             frame = self.edit(step, Picture(source, "frame"), references)

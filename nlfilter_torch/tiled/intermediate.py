@@ -12,15 +12,15 @@ from nlfilter_torch.tiled.sources import Rows, RowSource
 
 @contextmanager
 def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iterator[RowSource]:
-    """Rows (h, W, S) of floats as a source of rows.
+    """Write rows (h, W, S) of floats to a temporary file, and yield it as a source of rows.
 
     Args:
         rows: of a picture, in order.
         size: (H, W) of the picture.
-        folder: with room for it; None is that of the system for temporary files.
+        folder: for the file; None is the system's folder for temporary files.
 
     Raises:
-        OSError: if the folder has no room.
+        OSError: if the file does not fit.
     """
     with TemporaryFile(dir=folder) as file:
         shape, kind = (*size, 0), np.dtype(np.float32)

@@ -1,4 +1,4 @@
-"""The filter of a picture that is read a few rows at a time: the few sums that it consists of, and its columns."""
+"""The filter of a picture that is read a few rows at a time: the sums that define it, and its columns."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -32,7 +32,7 @@ from nlfilter_torch.tiled.statistics import (
 )
 from nlfilter_torch.tiled.workers import in_order
 
-PARTS = 8  # of a sample, for several workers at once
+PARTS = 8  # blocks that a sample is split into, to be shared among workers
 
 
 @dataclass(eq=False)
@@ -41,8 +41,8 @@ class TilePixels:
 
     Attributes:
         image: their colours, (1, C, h, W).
-        features: of these pixels, (1, D, h W), for the guide of an operator.
-        first: number of the first pixel, along the rows of the picture.
+        features: computes their features (1, D, h W) for the guide of an operator.
+        first: row-major index of the first pixel in the picture.
         width: W of the picture.
     """
 
@@ -54,7 +54,7 @@ class TilePixels:
     _layers: tuple[Planes, Tensor] | None = None
 
     def columns(self, operator: "TiledOperator") -> Columns:
-        """Their columns, worked out once for each operator."""
+        """Columns of the pixels, computed once per operator."""
         if id(operator) not in self._columns:
             known = None
             if self.image.shape[3] == self.width:
@@ -65,7 +65,7 @@ class TilePixels:
         return self._columns[id(operator)]
 
     def once(self, layers: Planes) -> Tensor:
-        """What a function gives of these pixels, kept until another one is asked for."""
+        """Apply a function to the pixels, and cache its result until another function is given."""
         if self._layers is None or self._layers[0] is not layers:
             self._layers = layers, layers(self)
         return self._layers[1]
@@ -73,13 +73,13 @@ class TilePixels:
 
 @dataclass(frozen=True, eq=False)
 class BlockPixels:
-    """Pixels that an operator sums up over: their colours (1, C, 1, n), and their columns."""
+    """Pixels in a sum of an operator: their colours (1, C, 1, n), and their columns."""
 
     image: Tensor
     found: Columns
 
     def columns(self, operator: "TiledOperator") -> Columns:
-        """Their columns."""
+        """Columns of the pixels."""
         return self.found
 
 
@@ -91,21 +91,20 @@ def first_plane(pixels: Any) -> Tensor:
 
 @dataclass(eq=False)
 class TiledOperator:
-    """The filter of a picture, by the few sums that it consists of.
+    """The filter of a picture, represented by the sums over pixels that define it.
 
-    They are summed up when the first of them is needed, those that it is balanced by together with those of the planes
-    that are filtered.
+    The sums are computed on first use, those for balancing together with those of the filtered planes.
 
     Attributes:
-        guide: what it compares.
-        pilot: a first look at the picture.
-        report: told of the progress.
-        count: pixels of a sample for what a single pass cannot tell; None is none.
-        full: whether further passes over all pixels are made.
+        guide: guide of the picture.
+        pilot: kernel, even sample and initial balancing.
+        report: called with the progress.
+        count: size of the sample that complements the first pass; None for no sample.
+        full: whether to make further passes over all pixels.
         kernel: landmarks, bandwidths and window.
         bounded: whether eigenvalues are to be kept from exceeding 1.
-        workers: tiles that are worked out at once.
-        kept: columns from earlier passes.
+        workers: number of tiles computed at once.
+        kept: columns cached from earlier passes.
     """
 
     guide: GuidePicture
@@ -120,12 +119,15 @@ class TiledOperator:
     _balancing: PixelScaling | None = None
     _sample: list[Block] | None = None
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
-    _grams: Tensor | float = 0.0  # what those of the sample lack
+    _grams: Tensor | float = 0.0  # added to those of the sample
 
     @torch.no_grad()
     @full_precision
     def settle(self, planes: Planes = first_plane, order: int = 1) -> None:
-        """Unless that is done, balance, and sum up for powers of W and some planes that depend on colours alone."""
+        """Balance, and compute the sums for powers of W and planes that depend on colours alone.
+
+        Further calls do nothing.
+        """
         if self._balancing is not None:
             return
         total, completed, lacking = self.pilot.balancing, self.pilot.completed, None
@@ -152,7 +154,7 @@ class TiledOperator:
         self._sums[id(planes)] = (planes, replace(sample, correction=lacking.coefficients))
 
     def _look_again(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
-        """About ``count`` pixels, and what their sums under the pilot's guess lack to those of all pixels."""
+        """Draw about ``count`` pixels; also return the sums over all pixels minus theirs, both at the pilot's guess."""
         pilot = self.pilot
 
         def values(block: Block, columns: Columns) -> Tensor:
@@ -185,19 +187,19 @@ class TiledOperator:
         return lambda of: over_all(self.guide, self.kernel, self.report, stage, self.workers, self.kept)(of)
 
     def _among(self, blocks: list[Block]) -> Pass:
-        """A pass over some blocks."""
+        """A pass over the given blocks."""
         return lambda function: in_order(function, blocks, self.workers)
 
     @property
     def balancing(self) -> PixelScaling:
-        """What the scaling of a pixel is a function of."""
+        """Computes the scaling of any pixel from its column."""
         self.settle()
         assert self._balancing is not None  # for mypy
         return self._balancing
 
     @property
     def margin(self) -> int:
-        """How many pixels around a pixel its column depends on."""
+        """Number of pixels around a pixel that its column depends on."""
         return self.kernel.recipe.patch_weights.shape[0] // 2 + self.guide.margin
 
     def features(self, tile: Tile) -> Tensor:
@@ -207,37 +209,37 @@ class TiledOperator:
 
     def columns(self, features: Tensor) -> Columns:
         """Columns of pixels with features (1, D, n)."""
-        self.settle()  # first: it may change the kernel
+        self.settle()  # may change the kernel
         return self.scaled(*self.kernel.factor(features))
 
     def scaled(self, factor: Tensor, diagonal: Tensor) -> Columns:
-        """Columns of pixels with this factor and diagonal."""
+        """Columns of pixels with a given factor and diagonal."""
         return Columns(factor, *self.balancing(factor, diagonal))
 
     def over(self, stage: str) -> Pass:
-        """A pass over the sample, or over all pixels."""
+        """A pass over the sample, or over all pixels if there is none."""
         if self._sample is None:
             return self._over_all(stage)
         self.report(stage, 0, 1)
         return self._among(self._sample)
 
     def pixels(self, block: Block) -> BlockPixels:
-        """Those of a block, with columns."""
+        """The pixels of a block, with their columns."""
         return BlockPixels(block.image.unsqueeze(2), self.scaled(block.factor, block.diagonal))
 
     @torch.no_grad()
     @full_precision
     def sums(self, planes: Planes, order: int) -> Sums:
-        """The sums for the first ``order`` powers of W, and some planes.
+        """Sums for the first ``order`` powers of W and the given planes.
 
-        Those of planes that were not known when the first sums were taken are of all pixels: a sample that is drawn for
-        the balancing is off by several grey levels for what is large at a few pixels.
+        Sums of planes other than those given to :meth:`settle` are over all pixels: the sample is drawn for balancing,
+        and is off by several grey levels for planes that are large at a few pixels.
         """
         self.settle(planes, order)
         known = self._sums.get(id(planes))
         if known is None or known[1].moments.shape[1] < order:
             known = (planes, self._summed_up(planes, order, self._over_all("Summing up")))
-            self._sums[id(planes)] = known  # the planes are kept, so that no other ones get their number
+            self._sums[id(planes)] = known  # holds the planes too, so that their id is not reused
         return known[1]
 
     def _summed_up(self, planes: Planes, order: int, blocks: Pass) -> Sums:
@@ -259,7 +261,7 @@ class TiledOperator:
         return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
-        """The planes that a function of columns gives."""
+        """Planes computed by a function of columns."""
 
         def planes(pixels: Any) -> Tensor:
             shape: tuple[int, int] = pixels.image.shape[-2:]
@@ -268,12 +270,12 @@ class TiledOperator:
         return planes
 
     def at(self, places: Tensor) -> Blocks:
-        """The columns of single pixels, whose features are read at once and kept."""
+        """Columns of single pixels, whose features are read now and kept in memory."""
         features = self.features_at(places)
         return lambda: (self.columns(part).factor for part in features.split(sampling.CHUNK, dim=2))
 
     def layers(self, planes: Planes, order: int) -> Planes:
-        """Detail layers, by the sums for powers of W."""
+        """Detail layers, from the sums for powers of W."""
         coefficients = self.sums(planes, order).coefficients()
 
         def layers(pixels: Any) -> Tensor:
@@ -290,7 +292,7 @@ class TiledOperator:
     @torch.no_grad()
     @full_precision
     def mean(self, planes: Planes) -> Tensor:
-        """Means over the pixels, or over the sample."""
+        """Means over the sample, or over all pixels if there is none."""
         total, weight = torch.zeros(()), torch.zeros((), dtype=torch.float64)
         self.settle()
 

@@ -1,7 +1,7 @@
-"""Any rectangle of a picture under an edit that was fitted to the whole of it.
+"""Any rectangle of a picture, edited as part of the whole picture.
 
-What an edit learns from the whole picture is that of :mod:`nlfilter_torch.tiled.recipe`; then the columns of the
-rectangle's own pixels are enough. An editor shows a part of a large photograph at full size this way.
+Each step is fitted to the whole picture as in :mod:`nlfilter_torch.tiled.recipe`; after that only the columns of the
+rectangle's own pixels are needed. This is how the editor shows a part of a large photograph at full size.
 """
 
 from contextlib import ExitStack
@@ -27,12 +27,12 @@ from nlfilter_torch.tiled.strokes import by_rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics
 from nlfilter_torch.tiled.workers import in_order
 
-STRIP = 1 << 15  # pixels of a rectangle that are worked out at once
+STRIP = 1 << 15  # pixels of a rectangle that one worker computes at a time
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """Some rows and columns of a picture."""
+    """A range of rows and a range of columns of a picture."""
 
     rows: range
     columns: range
@@ -43,11 +43,11 @@ class Rectangle:
         return len(self.rows), len(self.columns)
 
     def grown(self, margin: int, size: tuple[int, int]) -> "Rectangle":
-        """With a margin, as far as a picture (H, W) has it."""
+        """Enlarge by a margin, clipped to a picture (H, W)."""
         return Rectangle(_grown(self.rows, margin, size[0]), _grown(self.columns, margin, size[1]))
 
     def aligned(self, step: int, size: tuple[int, int]) -> "Rectangle":
-        """Grown so that it begins and ends at multiples of a step, or at the border of a picture (H, W)."""
+        """Enlarge to multiples of a step, clipped to a picture (H, W)."""
         rows, columns = (
             range(axis.start // step * step, min(-(-axis.stop // step) * step, length))
             for axis, length in zip((self.rows, self.columns), size, strict=True)
@@ -55,12 +55,12 @@ class Rectangle:
         return Rectangle(rows, columns)
 
     def meets(self, other: "Rectangle") -> bool:
-        """Whether they have a pixel in common."""
+        """Whether the rectangles have a pixel in common."""
         pairs = ((self.rows, other.rows), (self.columns, other.columns))
         return all(a.start < b.stop and b.start < a.stop for a, b in pairs)
 
     def inside(self, other: "Rectangle") -> tuple[slice, slice]:
-        """Where it lies in another one that contains it."""
+        """Slices of this rectangle within another that contains it."""
         down, right = self.rows.start - other.rows.start, self.columns.start - other.columns.start
         return slice(down, down + len(self.rows)), slice(right, right + len(self.columns))
 
@@ -71,7 +71,7 @@ def _grown(places: range, margin: int, length: int) -> range:
 
 @dataclass(frozen=True)
 class SomeColumns:
-    """Rows of which only some columns are there."""
+    """Some columns of a source of rows."""
 
     whole: RowSource
     columns: range
@@ -83,7 +83,7 @@ class SomeColumns:
 
     @property
     def dtype(self) -> Any:
-        """That of the whole."""
+        """Dtype of the source."""
         return self.whole.dtype
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
@@ -92,7 +92,7 @@ class SomeColumns:
 
 
 def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
-    """The pixels of a rectangle."""
+    """Read the pixels of a rectangle."""
     margin = max((margin_of(operator) for operator in tiled.operators), default=0)
     around = part.grown(margin, tiled.size)
     picture = Picture(SomeColumns(tiled.picture.source, around.columns), tiled.picture.name)
@@ -110,14 +110,14 @@ def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
 
 
 def margin_of(operator: TiledOperator) -> int:
-    """How many pixels around a pixel its column depends on, where no guide is stored."""
+    """Number of pixels around a pixel that its column depends on if no guide is stored."""
     return operator.kernel.recipe.patch_weights.shape[0] // 2 + operator.guide.guide.margin
 
 
 @torch.no_grad()
 @full_precision
 def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
-    """A rectangle (1, C, h, w) of a picture under an edit that was fitted to it."""
+    """Apply an edit that was fitted to a picture to a rectangle (1, C, h, w) of it."""
     around = part if fitted.finish is None else part.aligned(fitted.step, tiled.size).grown(fitted.margin, tiled.size)
     step = max(1, STRIP // len(around.columns))
     rows = around.rows
@@ -127,7 +127,7 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     ]
     landmarks = max((operator.kernel.landmarks.shape[2] for operator in tiled.operators), default=1)
     for operator in tiled.operators:
-        operator.settle()  # before several strips at once need it
+        operator.settle()  # before several workers need it
 
     def planes_of(strip: Rectangle) -> Tensor:
         return fitted.pixels(pixels_of_part(tiled, strip))
@@ -140,11 +140,11 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
 
 
 class Stage:
-    """A picture between two steps of an edit, and the step after it as it was fitted last.
+    """A picture between two steps of an edit, and the step last fitted to it.
 
     Args:
         picture: rows.
-        stack: what is closed with it.
+        stack: closes its temporary file.
     """
 
     def __init__(self, picture: Picture, stack: ExitStack) -> None:
@@ -152,7 +152,7 @@ class Stage:
         self._fitted: tuple[Step, Tiled, Fitted] | None = None
 
     def fit(self, step: Step, passes: Passes) -> tuple[Tiled, Fitted]:
-        """A step fitted to the picture."""
+        """Fit a step to the picture, unless it was the last one fitted."""
         if self._fitted is None or self._fitted[0] != step:
             self._fitted = None
             tiled = Tiled(self.picture, passes)
@@ -163,7 +163,7 @@ class Stage:
         return self._fitted[1:]
 
     def after(self, step: Step, passes: Passes) -> "Stage":
-        """The picture after a step, in a temporary file."""
+        """Apply a step to the whole picture; the result is in a temporary file."""
         tiled, fitted = self.fit(step, replace(passes, kind="float32"))
         stack = ExitStack()
         clipped = ((rows, values.clip(0, 1)) for rows, values in tiled.rows(fitted))
@@ -172,7 +172,7 @@ class Stage:
         return Stage(Picture(source, self.picture.name), stack)
 
     def forget_columns(self) -> None:
-        """Free what passes over the whole picture kept for further ones."""
+        """Free the columns cached between passes."""
         for operator in [] if self._fitted is None else self._fitted[1].operators:
             operator.kept = KeptColumns(1, 0)
 
@@ -182,7 +182,7 @@ class Stage:
 
 
 class Parts:
-    """Rectangles of a picture under an edit, and what was learnt from the whole picture for them.
+    """Edited rectangles of a picture, and the steps as fitted to the whole picture.
 
     Args:
         source: rows.
@@ -191,20 +191,20 @@ class Parts:
 
     def __init__(self, source: RowSource, name: str) -> None:
         self._stages = [Stage(Picture(source, name), ExitStack())]
-        self._known: tuple[Statistics, tuple[Step, ...]] = ("sample", ())  # how, and the steps between the stages
+        self._known: tuple[Statistics, tuple[Step, ...]] = ("sample", ())  # statistics, and steps between the stages
         self._last: tuple[Tiled, Fitted] | None = None
 
     def fit(self, recipe: Recipe, passes: Passes) -> None:
-        """Learn what an edit needs from the whole picture, as far as that has not been done; this may take long.
+        """Fit an edit to the whole picture, reusing steps that are fitted already; this may take long.
 
-        What is known after an error, also one that the progress report raises, is as good as before.
+        After an error, including one raised by the progress report, the steps fitted until then remain valid.
 
         Args:
             recipe: the edit.
-            passes: how the picture is read.
+            passes: tiling options.
 
         Raises:
-            ValueError, MemoryError, OSError: as of :func:`~nlfilter_torch.tiled.recipe.edit_rows`.
+            ValueError, MemoryError, OSError: as :func:`~nlfilter_torch.tiled.recipe.edit_rows`.
         """
         steps, (statistics, known) = recipe.acting, self._known
         self._last = None
@@ -225,7 +225,7 @@ class Parts:
             last.forget_columns()
 
     def edited(self, part: Rectangle) -> Tensor:
-        """A rectangle (1, C, h, w) of the picture under the edit that was fitted last, in [0, 1]."""
+        """A rectangle (1, C, h, w) of the picture after the edit that was fitted last, in [0, 1]."""
         if self._last is None:
             return self.original(part)
         return edited_part(*self._last, part).clamp(0, 1)

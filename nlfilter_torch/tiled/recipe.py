@@ -1,4 +1,4 @@
-"""A whole edit, as the editor saves it, on a picture larger than memory: its steps in turn, in tiles of rows."""
+"""A whole edit, as saved by the editor, on a picture larger than memory: one step after another, in tiles of rows."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -15,17 +15,17 @@ from nlfilter_torch.tiled.workers import undivided
 
 
 def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Rows:
-    """The rows (h, W, S) of the picture under :meth:`Recipe.apply`, in order.
+    """Yield the rows (h, W, S) of the picture edited as by :meth:`Recipe.apply`, in order.
 
     Args:
-        passes: over the rows, of every step.
-        source: as of :func:`stream_detail`.
+        passes: tiling options of every step.
+        source: as in :func:`stream_detail`.
         recipe: the edit.
         name: of the source, for error messages.
 
     Raises:
         ValueError: if a step needs the whole picture at once, or does not suit the picture.
-        OSError: if the folder has no room.
+        OSError: if a temporary file does not fit.
     """
     picture = Picture(source, name)
     steps = recipe.acting
@@ -43,7 +43,7 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
 
 
 def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
-    """The rows that a step makes of a picture."""
+    """Yield the rows of a picture after a step."""
     tiled = Tiled(Picture(source, name), passes)
     with undivided(passes.workers(1)):
         fitted = fit_step(step, tiled, *by_rows(step, tiled.size))

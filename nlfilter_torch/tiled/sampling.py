@@ -1,6 +1,7 @@
-"""A picture to the kernel of its filter and to an even sample of its pixels, reading it once, by rows.
+"""Sampling a picture that is read by rows.
 
-A sample of a picture's pixels for the sums that a filter consists of: rare ones first, and no gaps.
+One pass over the picture yields the pilot: the kernel of its filter and an even sample of its pixels. A second sample,
+for the sums that define the filter, favours rare pixels and has no gaps.
 """
 
 import math
@@ -31,18 +32,18 @@ from nlfilter_torch.tiled.statistics import Block, Pass
 from nlfilter_torch.tiled.workers import in_order, undivided
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
-STARTED = 1e-3  # residual of its balancing, which is a first guess
-CHUNK = 1 << 16  # scribbled pixels whose factor is there at once
+STARTED = 1e-3  # tolerance of its balancing, which is an initial guess
+CHUNK = 1 << 16  # scribbled pixels whose factor is in memory at once
 
 Report = Callable[[str, int, int], None]
 
 
 class KeptColumns:
-    """Columns of the first pixels of a picture, kept from one pass to the next.
+    """Cache of columns between passes, for the first pixels of a picture.
 
     Args:
-        each: pixels of a block of a pass.
-        count: how many pixels may be kept.
+        each: pixels in a block of a pass.
+        count: largest number of pixels to keep.
     """
 
     def __init__(self, each: int, count: int) -> None:
@@ -50,12 +51,12 @@ class KeptColumns:
         self.blocks: dict[int, tuple[Tensor, Tensor]] = {}
 
     def keep(self, first: int, columns: tuple[Tensor, Tensor]) -> None:
-        """Take the columns of the block that begins with a pixel, if there is room."""
+        """Store the columns of the block that begins at pixel ``first``, if there is room."""
         if first + columns[1].shape[1] <= self.count:
             self.blocks[first] = columns
 
     def find(self, pixels: slice) -> tuple[Tensor, Tensor] | None:
-        """Factor and diagonal of some pixels, if all are in one block that is kept."""
+        """Factor and diagonal of some pixels, or None unless all are in one stored block."""
         first = pixels.start // self.each * self.each
         known = self.blocks.get(first)
         if known is None or pixels.stop > first + known[1].shape[1]:
@@ -89,12 +90,12 @@ def over_all(
 
 @dataclass(frozen=True)
 class Pilot:
-    """A first look at a picture: its kernel, an even sample of its pixels and the balancing that they suggest.
+    """The kernel of a picture, an even sample of its pixels, and the balancing of that sample.
 
     Attributes:
         kernel: landmarks, bandwidths and window.
-        sample: even over the picture.
-        balancing: the moment t (1, M, 1) of balancing, as the sample has it.
+        sample: pixels spread evenly over the picture.
+        balancing: the moment t (1, M, 1) of the balanced sample.
         seed: for further samples.
     """
 
@@ -123,7 +124,7 @@ def take_pilot(
     guide_channels: GuideChannels = "luminance",
     generator: torch.Generator | None = None,
 ) -> Pilot:
-    """Bandwidth, landmarks and a first balancing, in one reading of the picture.
+    """Compute bandwidth, landmarks and an initial balancing in one pass over the picture.
 
     Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
     """
@@ -147,7 +148,7 @@ def take_pilot(
 
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     candidates = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
-    rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # the landmarks need what is in the generator
+    rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # ``generator`` is for the landmarks alone
     even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
     wanted = torch.cat([candidates, even])
     margin, automatic = max(patch_size // 2, 1), isinstance(photometric_bandwidth, str)
@@ -166,7 +167,7 @@ def take_pilot(
             bandwidth_of_gradient(torch.tensor(sum(slopes) / picture.pixels, dtype=torch.float64))
         )
     order = torch.empty_like(wanted)
-    order[wanted.argsort()] = torch.arange(len(wanted))  # place of each wanted pixel among those that were read
+    order[wanted.argsort()] = torch.arange(len(wanted))  # position of each wanted pixel in reading order
     recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, guide_channels)
     features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, recipe)
     image = torch.cat(values, dim=2)[:, :, order[len(candidates) :]]
@@ -179,16 +180,16 @@ def take_pilot(
         found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
         return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
 
-    with undivided(workers):  # of few pixels: a second thread would wait most of the time
+    with undivided(workers):  # so few pixels that a second thread would wait most of the time
         return fitted()
 
 
 def visit(
     picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str, *, every: bool = True
 ) -> Iterator[tuple[Tile, Tensor]]:
-    """Tiles of a pass, each with those of the sorted ``pixels`` that lie in it, as counted from its first one.
+    """Yield the tiles of a pass, each with the indices within the tile of those of the sorted ``pixels`` that it holds.
 
-    Tiles without any are read only if ``every`` one is asked for.
+    Tiles without any of the pixels are skipped unless ``every`` is True.
     """
     (height, width), rows = picture.size, picture.statistics_rows
     for start in range(0, height, rows):
@@ -200,7 +201,7 @@ def visit(
 
 
 def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
-    """The patches (1, C p^2, n), without weights, around some pixels of a tile with the guide (1, C, H, W)."""
+    """Unweighted patches (1, C p^2, n) around some pixels of a tile with the guide (1, C, H, W)."""
     padded = pad_border(guide, size // 2)[..., tile.halo[0] :, :]
     columns, stride = guide.shape[-1], padded.shape[-1]
     corners = chosen // columns * stride + chosen % columns
@@ -210,7 +211,7 @@ def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
 
 
 def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
-    """Features (1, D, n), as :func:`extract_features` gives them, from patches (1, C p^2, n) and pixels' indices."""
+    """Features (1, D, n), as of :func:`extract_features`, from patches (1, C p^2, n) and indices of their pixels."""
     window = recipe.patch_weights
     channels = patches.shape[1] // window.numel()
     scale = (window / channels).sqrt() / torch.as_tensor(recipe.photometric_bandwidth, dtype=window.dtype)
@@ -227,9 +228,10 @@ EVEN = 0.1  # share of a sample that is spread evenly over the picture
 class Draws:
     """Draws about ``count`` pixels of a picture, rare ones more likely than common ones.
 
-    A sum over all pixels is off most where few pixels make it up: an even sample of a million leaves the rarest patches
-    of a photograph off by two grey levels and more. The leverage of a pixel is its own share of what W makes of it,
-    ``d^2 |u|^2``, 1 over the number of its likes; in proportion to it every kind of pixel gets as many members.
+    Estimated sums have the largest errors where few pixels contribute: from an even sample of a million pixels, the
+    rarest patches of a photograph are off by two grey levels and more. The leverage score of a pixel, ``d^2 |u|^2``, is
+    its own weight in its filtered value, 1 over the number of similar pixels; sampling in proportion to it draws
+    equally many pixels of every kind.
     """
 
     def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
@@ -239,12 +241,12 @@ class Draws:
         self.rate = _rate(self.leverage(pilot.sample, columns), weight, self.even, count)
 
     def leverage(self, block: Block, columns: Columns) -> Tensor:
-        """Of the pixels of a block, whose columns these are: (n,) in float64."""
+        """Leverage scores (n,) in float64 of the pixels of a block, given their columns."""
         length = 1 - block.diagonal if self.completed else columns.factor.square().sum(1)
         return (columns.scaling.square() * length)[0].double()
 
     def __call__(self, block: Block, columns: Columns) -> Block:
-        """Those drawn from a block."""
+        """Draw pixels from a block."""
         likely = (self.even + self.rate * self.leverage(block, columns)).clamp(max=1.0)
         chosen, counts = draw(likely, np.random.default_rng([self.seed, block.number]))
         weights = (counts / likely[chosen]).to(block.weights)[None]
@@ -253,17 +255,17 @@ class Draws:
 
 
 def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Draw pixels, each as often on average as its rate says, one from every stretch of pixels whose rates sum to 1.
+    """Draw pixels with given expected counts, one from every run of pixels whose rates sum to 1.
 
-    Pixels beside each other are alike, so that a sample without gaps and clusters has sums several times as exact as
-    one of independent draws. The place within a stretch is random: a fixed one could meet the period of a texture.
+    Neighbouring pixels are similar, so that a sample without gaps and clusters gives sums several times as accurate as
+    independent draws. The position within a run is random: a fixed one could coincide with the period of a texture.
 
     Args:
-        rates: (n,) in (0, 1], float64. A pixel of rate 1 is drawn exactly once, any other twice at most.
-        generator: of the places.
+        rates: expected counts (n,) in (0, 1], float64. A pixel of rate 1 is drawn exactly once, others at most twice.
+        generator: of the positions.
 
     Returns:
-        The numbers (k,) of the drawn pixels, ascending, and how often each was drawn, (k,).
+        The indices (k,) of the drawn pixels, ascending, and how often each was drawn, (k,).
 
     Example:
         >>> draw(torch.tensor([1.0, 0.5, 0.5, 1.0], dtype=torch.float64), np.random.default_rng(0))
@@ -280,7 +282,7 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
 
 
 def _rate(leverage: Tensor, weight: float, even: float, count: int) -> float:
-    """The factor of the leverage at which about ``count`` pixels are drawn, from that of an even sample."""
+    """Find the factor of leverage scores at which about ``count`` pixels are drawn, given those of an even sample."""
     low, high = 0.0, 1 / max(float(leverage.min()), 1e-12)
     for _ in range(60):
         middle = (low + high) / 2

@@ -11,12 +11,12 @@ from torch import Tensor
 from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.tiled.sources import Picture, RowSource, transparency
 
-Rows = Callable[[int, int], Tensor]  # planes of the rows from the first to before the second
+Rows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
 @dataclass(frozen=True)
 class RegionRows:
-    """The weights of one of several regions: rows (h, W) of rows (h, W, K)."""
+    """The mask of region ``number``: rows (h, W), one channel of rows (h, W, K)."""
 
     masks: RowSource
     number: int
@@ -28,7 +28,7 @@ class RegionRows:
 
     @property
     def dtype(self) -> Any:
-        """That of the weights."""
+        """Dtype of the masks."""
         return self.masks.dtype
 
     def __getitem__(self, rows: slice) -> Any:
@@ -46,19 +46,19 @@ def read_scribbles(
     memory: int,
     report: Callable[[str, int, int], None],
 ) -> Scribbles:
-    """Read scribbles, their colours and what they cover.
+    """Read scribbles, their colours and the picture below them.
 
     Args:
         picture: below the scribbles.
         mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, or None.
-        colours: rows (H, W, 3), read under the mask only; (H, W, 4) without one; or None.
-        name: of the mask, for messages.
-        strokes: of the colours, likewise.
+        colours: rows (H, W, 3), read under the mask only; (H, W, 4) without a mask; or None.
+        name: of the mask, for error messages.
+        strokes: name of the colours, for error messages.
         memory: bytes that scribbled pixels may take.
-        report: told of the progress.
+        report: called with the progress.
 
     Raises:
-        ValueError: if one of them has another size or another number of channels, or a weight exceeds [0, 1].
+        ValueError: if the size or number of channels of an input does not fit, or a weight is outside [0, 1].
         MemoryError: if there are too many scribbled pixels.
     """
     over = None if colours is None else _overlay(picture, colours, strokes)
@@ -100,12 +100,12 @@ def read_scribbles(
 
 
 def _transparency(over: Picture) -> Rows:
-    """The transparency (h, W) of a picture."""
+    """Read the transparency (h, W) of a picture."""
     return lambda start, stop: torch.from_numpy(transparency(over.tile(start, stop, 0), "float32"))[..., 0]
 
 
 def _plane(picture: Picture, mask: RowSource, name: str) -> Rows:
-    """The rows (h, W) of a mask."""
+    """Read the rows (h, W) of a mask."""
     over = _overlay(picture, mask, name)
     if over.samples != 1:
         raise ValueError(f"{name} must have 1 channel, got {over.samples}; select one")
@@ -113,7 +113,7 @@ def _plane(picture: Picture, mask: RowSource, name: str) -> Rows:
 
 
 def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
-    """A source of rows of the same size as a picture."""
+    """Wrap a source of rows, which must have the size of a picture."""
     if tuple(rows.shape[:2]) != picture.size:
         raise ValueError(
             f"{name} must have the height and width of {picture.name}, {picture.size[0]}x{picture.size[1]}, got "
@@ -123,12 +123,12 @@ def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
 
 
 def floats_of_scribbled(numbers: int) -> int:
-    """Floats of a scribbled pixel with so many features, which are there twice while they are joined."""
+    """Floats per scribbled pixel with ``numbers`` features, which are in memory twice while they are concatenated."""
     return 2 * numbers + 40
 
 
 def check_room(picture: Picture, count: int, numbers: int, memory: int) -> None:
-    """Raise MemoryError if that many scribbled pixels with so many features take more than ``memory`` bytes."""
+    """Raise MemoryError if ``count`` scribbled pixels with ``numbers`` features take more than ``memory`` bytes."""
     needed = count * floats_of_scribbled(numbers) * picture.dtype.itemsize
     if needed > memory:
         raise MemoryError(

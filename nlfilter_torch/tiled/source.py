@@ -1,4 +1,4 @@
-"""A picture that is read a few rows at a time, as the source of an edit: sums in passes, and tiles of edited rows."""
+"""A picture that is read a few rows at a time as the source of an edit: sums in passes, output in tiles."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -23,17 +23,17 @@ from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource,
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
 from nlfilter_torch.tiled.workers import Result, in_order, undivided
 
-HELD = 1 / 16  # of the memory that planes may take which an edit needs again
-FINISHED = 64  # floats for each pixel of a tile while an edit finishes it: images, their transforms and products
+HELD = 1 / 16  # largest share of the memory for planes that an edit reuses
+FINISHED = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
 
 
 class Tiled:
-    """A picture, and how it is read.
+    """A picture that is read in tiles, as the source of an edit.
 
     Args:
         picture: rows.
-        passes: options of the tiling.
-        strokes: what errors call scribbles.
+        passes: tiling options.
+        strokes: name of the scribbles, for error messages.
     """
 
     batch = 1
@@ -44,18 +44,18 @@ class Tiled:
         self.picture, self.passes, self.strokes = picture, passes, strokes
         self.size, self.channels, self.dtype = picture.size, picture.colours, picture.dtype
         self.operators: list[TiledOperator] = []
-        self.floats = 8 * picture.colours + 40  # floats for each pixel of a tile, without features
+        self.floats = 8 * picture.colours + 40  # floats per pixel of a tile; each operator adds its features
         self.scribbled = 0  # pixels
-        self.kept = 0  # floats of columns
-        self.stored = 0  # floats of guides
+        self.kept = 0  # floats of cached columns
+        self.stored = 0  # floats of stored guides
 
     @torch.no_grad()
     @full_precision
     def operator(self, guide: Guide) -> "TiledOperator":
-        """The filter of the whole picture, its balancing from a sample of the pixels or from all of them.
+        """The filter of the whole picture, balanced on a sample of the pixels or on all of them.
 
         Raises:
-            MemoryError: if there is no room for the samples or for a row.
+            MemoryError: if the samples or a row do not fit in memory.
         """
         options = dict(guide.options)
         patch_size, count = options.get("patch_size", 5), options.get("num_landmarks", 100)
@@ -64,7 +64,7 @@ class Tiled:
         compared = guide.planes or (self.channels if options.get("guide_channels") == "all" else 1)
         numbers = patch_size**2 * compared + 2
         for other in self.operators:
-            other.kept = KeptColumns(1, 0)  # makes room
+            other.kept = KeptColumns(1, 0)  # frees memory
         self.kept = 0
         self.room(numbers, count)
         passes, picture = self.passes, GuidePicture(self.picture, guide)
@@ -93,10 +93,10 @@ class Tiled:
         return found
 
     def room(self, numbers: int, num_landmarks: int) -> int:
-        """Rows of a tile that fit in memory, with so many features of each pixel more.
+        """Rows of a tile that fit in memory, with ``numbers`` more features per pixel.
 
         Raises:
-            MemoryError: if there is not one, or no room for the samples.
+            MemoryError: if not even one row fits, or the samples do not.
         """
         check_room(self.picture, self.scribbled, numbers, self.passes.memory)
         return rows_that_fit(
@@ -109,17 +109,19 @@ class Tiled:
         )
 
     def floats_stored(self, numbers: int) -> int:
-        """Floats of scribbles, with so many features of each pixel, and of guides."""
+        """Floats of stored guides, and of scribbles with ``numbers`` features per pixel."""
         return self.stored + self.scribbled * floats_of_scribbled(numbers)
 
     def scribbles(
         self, mask: RowSource | None, colours: RowSource | None, name: str, *, needed: bool = True
     ) -> Scribbles:
-        """From rows (H, W) or (H, W, 1) and (H, W, 3); or from (H, W, 4) alone, whose last channel is the mask.
+        """Read scribbles from a mask, rows (H, W) or (H, W, 1), and colours, rows (H, W, 3).
+
+        Without a mask, colours are rows (H, W, 4), whose last channel is the mask.
 
         Raises:
-            ValueError: if one of them has another size or another number of channels, a weight exceeds [0, 1], or they
-                are ``needed`` and cover no pixel.
+            ValueError: if the size or number of channels of an input does not fit, a weight is outside [0, 1], or
+                scribbles are ``needed`` and cover no pixel.
             MemoryError: if there are too many scribbled pixels.
         """
         found = read_scribbles(
@@ -138,23 +140,23 @@ class Tiled:
         return found
 
     def regions(self, masks: RowSource, name: str) -> list[Scribbles]:
-        """From rows (H, W, K) in [0, 1].
+        """Read the scribbles of K regions from rows (H, W, K) in [0, 1].
 
         Raises:
-            ValueError, MemoryError: as of :meth:`scribbles`.
+            ValueError, MemoryError: as :meth:`scribbles`.
         """
         if len(masks.shape) == 2:
             return [self.scribbles(masks, None, name)]
         return [self.scribbles(RegionRows(masks, k), None, name) for k in range(masks.shape[2])]
 
     def colours(self, places: Tensor) -> Tensor:
-        """The colours (1, C, n) of single pixels, read from their rows."""
+        """Read the colours (1, C, n) of single pixels."""
         seen = visit(self.picture, 0, places, self.passes.report, "Looking", every=False)
         return torch.cat([tile.inner.flatten(2)[:, :, chosen] for tile, chosen in seen], dim=2)
 
     @torch.no_grad()
     def resized(self, size: tuple[int, int]) -> "Tiled":
-        """The picture in a smaller size, in memory: a source of its own, which is read as this one is."""
+        """The picture in a smaller size, in memory, as another tiled source."""
 
         def read(start: int, stop: int) -> Tensor:
             self.passes.report("Reducing", start, self.size[0])
@@ -172,7 +174,7 @@ class Tiled:
                 f"{name} must have the height and width of the picture, {self.size}, got {tuple(weights.shape[:2])}; "
                 "resize them"
             )
-        ends: list[float] = []  # interpolation may go beyond them, but hides no weight that is invalid
+        ends: list[float] = []  # of the weights; interpolation may exceed them, but must not hide an invalid weight
 
         def read(start: int, stop: int) -> Tensor:
             rows = torch.from_numpy(np.atleast_3d(np.array(weights[start:stop], np.float32)))
@@ -184,7 +186,7 @@ class Tiled:
         return found.clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
 
     def _resized(self, read: Read, size: tuple[int, int]) -> Tensor:
-        """Rows of this size in a smaller one."""
+        """Resize rows, which ``read`` returns in the size of the picture."""
         parts = resized_parts(read, self.size, size)
         return torch.cat(list(in_order(lambda part: part(), parts, self.passes.workers(1))), dim=2)
 
@@ -194,7 +196,7 @@ class Tiled:
         return torch.from_numpy(rows).permute(2, 0, 1)[None]
 
     def held(self, fitted: Fitted) -> Fitted:
-        """With its planes in memory, if they take a small part of it; else they are worked out as often as needed."""
+        """Compute the planes of an edit and keep them in memory, if small; else they are recomputed on every use."""
         if self.picture.pixels * self.channels * self.dtype.itemsize > HELD * self.passes.memory:
             return fitted
         planes = self.all(fitted)
@@ -207,7 +209,7 @@ class Tiled:
 
     @torch.no_grad()
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means over all pixels, with a pass over the picture."""
+        """Means over all pixels, in a pass over the picture."""
 
         def parts() -> Iterator[tuple[Tensor, Tensor]]:
             for part, values in self.rows(fitted, plain=True):
@@ -241,9 +243,9 @@ class Tiled:
         return torch.cat(list(self._of_tiles(part, 0, rows, "Reducing")), dim=2)
 
     def _of_tiles(self, function: Callable[[Tile], Result], margin: int, rows: int, stage: str) -> Iterator[Result]:
-        """What a function gives of each tile, in order.
+        """Apply a function to each tile, and yield the results in order.
 
-        That of the first tile is worked out before the others, since it may take sums of an operator.
+        The first tile is finished before the others begin, since it may compute the sums of an operator.
         """
 
         def tiles() -> Iterator[Tile]:
@@ -256,10 +258,10 @@ class Tiled:
         yield from in_order(function, each, self.passes.workers(1))
 
     def blocks(self, step: float, floats: int) -> InMemory:
-        """The picture reduced by means over blocks of an integer number of pixels each way, in memory.
+        """The picture, reduced by means over blocks of an integer number of pixels along each axis, in memory.
 
         Raises:
-            MemoryError: if there is no room for so many floats for each of its pixels.
+            MemoryError: if ``floats`` numbers for each of its pixels do not fit.
         """
         needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
         if needed > self.passes.memory:
@@ -271,7 +273,7 @@ class Tiled:
 
     @torch.no_grad()
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
-        """What a function finds."""
+        """Apply a measurement to the picture."""
         return function(self)
 
     def pixels_of(self, tile: Tile) -> TilePixels:
@@ -280,9 +282,10 @@ class Tiled:
         return TilePixels(tile.inner, lambda operator: operator.features(tile), tile.start * width, width)
 
     def parts_of(self, tile: Tile) -> Iterator[TilePixels]:
-        """The pixels of a tile, a few rows at a time, and the same rows together in tiles of any height.
+        """Split a tile into groups of a few rows, which are the same for tiles of any height.
 
-        The rounding of a product depends on its shape.
+        The height of tiles therefore does not affect results, although the rounding of a matrix product depends on its
+        shape.
         """
         width, step = self.size[1], self.passes.rows_together(self.size[1])
         features: dict[int, tuple[Tensor, ...]] = {}
@@ -298,25 +301,25 @@ class Tiled:
 
     @full_precision
     def edited(self, fitted: Fitted, tile: Tile) -> Tensor:
-        """The planes (1, C, h, W) that an edit makes of a tile, before it finishes them."""
+        """The planes (1, C, h, W) that an edit computes from a tile, before ``finish``."""
         return torch.cat([fitted.pixels(part) for part in self.parts_of(tile)], dim=2)
 
     @property
     def margin(self) -> int:
-        """How many rows around a tile its columns depend on."""
+        """Number of rows around a tile that its columns depend on."""
         return max((operator.margin for operator in self.operators), default=0)
 
     @property
     def plain(self) -> Passes:
-        """How it is read where the output is numbers as they are computed."""
+        """Tiling options for output in the dtype of the computation."""
         return replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
 
     def rows(self, fitted: Fitted, *, plain: bool = False) -> Rows:
-        """The rows (h, W, S) of the picture under an edit, in order.
+        """Yield the rows (h, W, S) of the edited picture, in order.
 
         Args:
-            fitted: to this source.
-            plain: whether they are numbers as they are computed, without transparency.
+            fitted: edit fitted to this source.
+            plain: whether rows are in the dtype of the computation, without transparency.
         """
         passes = self.plain if plain else self.passes
         landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
@@ -325,7 +328,7 @@ class Tiled:
         rows = max(1, rows // together) * together
         with undivided(workers):
             for operator in self.operators:
-                operator.settle()  # before several tiles at once need it
+                operator.settle()  # before several workers need it
         if fitted.finish is None:
             yield from passes.work_out(
                 self.picture,
@@ -358,12 +361,13 @@ class Tiled:
             yield from passes.work_out(self.picture, finished, margin, rows, workers=workers, transparent=not plain)
 
     def _rows_to_finish(self, fitted: Fitted, rows: int, workers: int) -> tuple[int, int]:
-        """Rows of a tile that is finished: its margins, several times if none were asked for, as far as memory allows.
+        """Rows per tile and number of workers for ``finish``.
 
-        And the workers: all, if such tiles fit in memory for each of them, or one.
+        A tile has at least as many rows as the margin, or several times as many if ``tile_rows`` is None, as far as
+        memory allows. There is only one worker unless memory allows such a tile for each of them.
 
         Raises:
-            MemoryError: if it allows none.
+            MemoryError: if no tile fits.
         """
         row = self.size[1] * FINISHED * self.dtype.itemsize
         most = self.passes.memory // row - 2 * fitted.margin

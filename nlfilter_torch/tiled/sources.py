@@ -45,7 +45,7 @@ class RowTarget(Protocol):
         """Type of the stored channels; integers are clipped and rounded."""
 
     def __setitem__(self, rows: slice, values: Any, /) -> None:
-        """Take these rows."""
+        """Store these rows."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Picture:
     Attributes:
         size: (H, W).
         colours: 1 or 3; a further channel is transparency, which is ignored.
-        dtype: in which to compute.
+        dtype: of the computation.
     """
 
     def __init__(self, source: RowSource, name: str = "source", *, planes: int | None = None) -> None:
@@ -106,11 +106,11 @@ class Picture:
 
     @property
     def pixels(self) -> int:
-        """How many there are."""
+        """Number of pixels."""
         return self.size[0] * self.size[1]
 
     def tile(self, start: int, stop: int, margin: int) -> Tile:
-        """The rows from ``start`` to ``stop`` and up to ``margin`` more on both sides.
+        """Read the rows from ``start`` to ``stop`` and up to ``margin`` more on both sides.
 
         Raises:
             ValueError: if the source returns rows of another shape than declared, or floats that are not finite.
@@ -136,7 +136,7 @@ class Picture:
         return Tile(start, planes, halo, stored[halo[0] : last - first - halo[1]])
 
     def tiles(self, margin: int, rows: int) -> Iterator[Tile]:
-        """All rows, in tiles of ``rows``."""
+        """Yield all rows, in tiles of ``rows``."""
         for start in range(0, self.size[0], rows):
             yield self.tile(start, min(start + rows, self.size[0]), margin)
 
@@ -150,9 +150,9 @@ class GuidePicture(Picture):
     """The guide of a picture.
 
     Attributes:
-        picture: what it is the guide of.
-        guide: makes it.
-        stored: the whole guide (1, C, H, W), if it is kept in memory.
+        picture: whose guide this is.
+        guide: computes the guide from the picture.
+        stored: the whole guide (1, C, H, W), if kept in memory.
     """
 
     def __init__(self, picture: Picture, guide: Guide) -> None:
@@ -161,7 +161,7 @@ class GuidePicture(Picture):
         self.stored: Tensor | None = None
 
     def store(self, rows: int, workers: int) -> None:
-        """Keep the whole guide, which is made in tiles of ``rows``, so that further passes need not make it again."""
+        """Compute the whole guide in tiles of ``rows``, and keep it in memory for further passes."""
         planes: Tensor | None = None
         tiles = self.picture.tiles(self.margin, rows)
         for start, part in in_order(lambda tile: (tile.start, self.seen(tile, 0).pixels), tiles, workers):
@@ -172,15 +172,15 @@ class GuidePicture(Picture):
 
     @property
     def margin(self) -> int:
-        """How many pixels around a pixel of the picture are read for its guide."""
+        """Number of pixels around a pixel that are read to compute its guide."""
         return 0 if self.stored is not None else self.guide.margin
 
     def tile(self, start: int, stop: int, margin: int) -> Tile:
-        """A tile of the guide, as :meth:`Picture.tile`."""
+        """Read a tile of the guide, as :meth:`Picture.tile`."""
         return self.seen(super().tile(start, stop, margin + self.margin), margin)
 
     def seen(self, tile: Tile, margin: int) -> Tile:
-        """The guide of a tile of the picture that has at least as large a margin as that takes."""
+        """The guide, with ``margin``, of a tile of the picture that has a margin large enough to compute it."""
         stop = tile.start + tile.stored.shape[0]
         halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
         if self.stored is not None:
@@ -193,7 +193,7 @@ class GuidePicture(Picture):
 
 
 def stored_as(values: Tensor, kind: str) -> NDArray[Any]:
-    """Channels (1, C, h, W) as rows (h, W, C) of dtype ``kind``; integers are clipped and rounded."""
+    """Convert channels (1, C, h, W) to rows (h, W, C) of dtype ``kind``; integers are clipped and rounded."""
     rows: NDArray[Any] = values[0].permute(1, 2, 0).numpy(force=True)
     if kind in WHITE:
         rows = np.rint(rows.clip(0, 1) * WHITE[kind])

@@ -1,15 +1,15 @@
-"""Blocks of pixels to the few sums over all of them that a filter consists of, in passes, with no vector of pixels.
+"""The sums over pixels that define a filter, in passes over blocks of pixels, without vectors of length N.
 
 With ``u`` the columns of the factor and ``c`` the diagonal, balancing is the equation ``t = sum_i u_i d_i(t)`` for the
 moment t (M numbers), since the scaling ``d_i`` of a pixel is a closed form of ``u_i . t`` and ``c_i``. Its Jacobian
-``I + F diag(1 / (1 + r)) F^T`` is symmetric with eigenvalues in [1, 2] and is summed up in the same pass, so that
-Newton's method needs two or three passes. With t known, one pass more gives ``G_j = F diag(r^j) F^T`` and ``b_i =
+``I + F diag(1 / (1 + r)) F^T`` is symmetric with eigenvalues in [1, 2] and is computed in the same pass, so that
+Newton's method needs two or three passes. Given t, one more pass computes ``G_j = F diag(r^j) F^T`` and ``b_i =
 F r^i y``, and from them all coefficients of ``W^i y = F^T c_i + r W^(i-1) y``: ``c_1 = b_0``, ``c_(i+1) = sum_j G_j
 c_(i-j) + b_i``.
 
-All of these equations say that something unknown, x, equals a sum ``f(x)`` over the pixels. A single pass gives the sum
-for a guess at x, and a sample how it changes from there: ``x = f(guess) + s(x) - s(guess)``, where s estimates f. The
-error is that of the sample times that of the guess.
+Each of these equations has the form ``x = f(x)``, where f is a sum over all pixels. A single pass computes f at an
+initial guess, and a sample estimates how f changes from there: ``x = f(guess) + s(x) - s(guess)``, where s estimates f.
+The error is the error of the sample times that of the guess.
 """
 
 from collections.abc import Callable, Iterable
@@ -27,14 +27,17 @@ from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
 
-CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}  # a step of that size, relative to t, leaves its square
+CONVERGED = {
+    torch.float32: 1e-5,
+    torch.float64: 1e-7,
+}  # relative Newton step; the error after it is its square
 MAX_PASSES = 12
 ALARM = 1e-3
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each stands for, (1, n); a number."""
+    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each represents (1, n); an index."""
 
     factor: Tensor
     diagonal: Tensor
@@ -51,15 +54,15 @@ class Block:
         return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(images, 2), torch.cat(weights, 1))
 
 
-Pass = Callable[[Callable[[Block], Any]], Iterable[Any]]  # what a function gives of each block, in order
+Pass = Callable[[Callable[[Block], Any]], Iterable[Any]]  # maps a function over blocks, in order
 
 
 def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correction: Tensor | float = 0.0) -> Tensor:
-    """The moment t (1, M, 1) of the pixels in ``blocks``, from a first guess ``total``.
+    """Solve for the moment t (1, M, 1) of the pixels in ``blocks``, from an initial guess ``total``.
 
-    ``correction``: what is added to their sum.
-    ``completed``: the kernel has a unit diagonal and no negative entry, so that no scaling can be large. A guess that
-    knows nothing of some pixels would give them one, and Newton's method would only halve it with every pass.
+    ``correction`` is added to the sum over the blocks. ``completed`` means that the kernel has a unit diagonal and no
+    negative entry, so that no scaling can be large. Scalings are then clamped, since they would start large for pixels
+    that the guess does not represent, and Newton's method would only halve them in every pass.
     """
     largest = LARGEST if completed else float("inf")
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
@@ -90,7 +93,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
 
 
 def limiter_by_passes(blocks: Pass, balancing: PixelScaling, dtype: torch.dtype) -> Tensor | None:
-    """The ``X^(1/2)`` (1, M, M) by which the factor is multiplied, or None where no eigenvalue exceeds 1."""
+    """Compute the ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
 
     def gram(at: Tensor, power: int) -> Tensor:
         def part(block: Block) -> Tensor:
@@ -106,13 +109,13 @@ def limiter_by_passes(blocks: Pass, balancing: PixelScaling, dtype: torch.dtype)
 
 @dataclass(frozen=True)
 class Sums:
-    """What a pass over a balanced image leaves.
+    """Sums from a pass over a balanced image.
 
     Attributes:
         grams: ``F diag(r^j) F^T``, (1, J, M, M), float64.
         moments: ``F r^i y``, (1, k, M, C), float64.
         dtype: of the factor.
-        correction: what the coefficients lack if these are sums over a sample, (1, k, M, C), float64.
+        correction: added to the moments if they are sums over a sample, (1, k, M, C), float64.
     """
 
     grams: Tensor
@@ -154,13 +157,13 @@ class Totals:
 
 @dataclass(frozen=True)
 class Guess:
-    """A guess at the balancing, and at the coefficients of the powers of W before the last.
+    """An initial guess of the balancing, and of the coefficients of all powers of W but the last.
 
     Attributes:
         moment: t, (1, M, 1).
         coefficients: (1, k - 1, M, C).
-        values: of a block under its columns, the planes y (1, C, n).
-        spectral: whether Gram matrices are to be summed up.
+        values: computes the planes y (1, C, n) of a block, given its columns.
+        spectral: whether Gram matrices are needed.
     """
 
     moment: Tensor
@@ -172,14 +175,14 @@ class Guess:
         """The columns of a block; ``half`` is ``u . t / 2``, (1, n), if known."""
         if half is None:
             half = spread((self.moment / 2).mT.to(block.factor), block.factor).squeeze(1)
-        scaling = positive_root(half, block.diagonal).clamp_(max=LARGEST)  # of a pixel that the guess knows nothing of
+        scaling = positive_root(half, block.diagonal).clamp_(max=LARGEST)  # large where the guess misses a pixel
         return Columns(block.factor, scaling, scaling * (scaling * block.diagonal))
 
     def totals(self, block: Block) -> tuple[Columns, Totals]:
-        """The columns of a block, and its part of the sums."""
+        """The columns of a block, and its contribution to the sums."""
         factor, (order, _, count) = block.factor, self.coefficients.shape[1:]
         rows = torch.cat([(self.moment / 2).mT, self.coefficients.transpose(2, 3).flatten(1, 2)], dim=1)
-        products = spread(rows.to(factor), factor)  # all in one read
+        products = spread(rows.to(factor), factor)  # in one read of the factor
         columns = self.columns(block, products[:, 0])
         powers = [self.values(block, columns)]
         for product in products[:, 1:].unflatten(1, (order, count)).unbind(1):
@@ -194,11 +197,11 @@ class Guess:
 
 
 def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
-    """One pass over pixels, for the first ``order`` powers of W.
+    """Compute the sums for the first ``order`` powers of W, in one pass.
 
     Args:
-        blocks: of the pixels.
-        values: what is filtered of a block, y (1, C, n), and its columns.
+        blocks: the pass over blocks of pixels.
+        values: computes the planes y (1, C, n) to filter in a block, and its columns.
         order: k, at least 1.
     """
 

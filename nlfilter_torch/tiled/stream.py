@@ -1,4 +1,4 @@
-"""Edits of pictures whose factor exceeds memory: statistics from passes or a sample, then tile by tile."""
+"""Edits of pictures whose factor exceeds memory: statistics from passes or a sample, then output in tiles."""
 
 from typing import Any, Literal
 
@@ -44,29 +44,29 @@ def stream_detail(
             anything that returns rows for a slice. One or three channels are colours; one more is transparency, which
             is copied. Integers are scaled to [0, 1].
         target: receives the rows in order, by assignment to a slice; of the source's shape and any dtype.
-        alpha: sliders (k+1,), as of :func:`~nlfilter_torch.polynomial_filter`; with regions (K, k+1), a row for each,
+        alpha: sliders (k+1,), as in :func:`~nlfilter_torch.polynomial_filter`; with regions (K, k+1), a row for each,
             or (k+1,) for all.
-        regions: rows (H, W, K) in [0, 1], above 0 on some or all of each of K regions, as of
+        regions: rows (H, W, K) in [0, 1], above 0 on some or all pixels of each of K regions, as in
             :func:`~nlfilter_torch.enhance`. None edits the whole picture.
-        negative: rows (H, W, 1 or K) in [0, 1], above 0 on some of what is in no region, or not in that one.
-        residual: as of :func:`~nlfilter_torch.polynomial_filter`; with it statistics are full, since the part that
+        negative: rows (H, W, 1 or K) in [0, 1], above 0 on some pixels outside all regions, or outside region k.
+        residual: as in :func:`~nlfilter_torch.polynomial_filter`; if given, statistics are full, since the part that
             the eigenvectors capture depends on rare pixels that a sample lacks.
-        reach: of the regions' masks, in [0, 1); larger takes in what is less alike.
+        reach: of the regions' masks, in [0, 1); a larger reach includes less similar pixels.
         channels: ``"luminance"`` edits brightness and keeps the colours, ``"all"`` edits every channel.
         statistics: ``"sample"`` balances the filter and computes its coefficients on a sample of the pixels that
             favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
             or four passes that each cost more than the output.
         sample: approximate number of pixels of that sample; with as many as the picture has, statistics are full.
-        tile_rows: rows of a tile, None as many as fit in ``memory``; with 256 MB or more, at least as many as make
-            16,384 pixels, or a multiple.
+        tile_rows: rows of a tile; None is as many as fit in ``memory``. With 256 MB or more, it is rounded to a
+            multiple of the rows that make 16,384 pixels.
         memory: bytes that may be used, besides those of source and target.
         report: called with the name of a stage, the part done and the total.
         **options: ``threshold``, ``limits``, ``viewing_size`` and bandwidths of :func:`~nlfilter_torch.enhance`, and
-            further ones of :func:`~nlfilter_torch.nonlocal_operator` but ``tolerance`` and ``patch_weights``;
-            bandwidths, also ``mask_bandwidth``, are numbers.
+            further ones of :func:`~nlfilter_torch.nonlocal_operator` except ``tolerance`` and ``patch_weights``;
+            bandwidths, including ``mask_bandwidth``, are numbers.
 
     Raises:
-        TypeError, ValueError: if an argument does not fit, or the source changes its size during the work.
+        TypeError, ValueError: if an argument does not fit, or the source changes its size while it is read.
         MemoryError: if the samples or a single row take more than ``memory``.
 
     Example:
@@ -117,27 +117,28 @@ def stream_recolor(
     there are no seams, and the size of the tiles does not matter.
 
     Args:
-        source: rows (H, W, 3) in RGB or (H, W, 4) with transparency, as of :func:`stream_detail`.
+        source: rows (H, W, 3) in RGB or (H, W, 4) with transparency, as in :func:`stream_detail`.
         target: receives the rows; of the source's shape.
         strokes: scribbles as rows (H, W, 3), RGB, read under ``stroke_mask`` only; or (H, W, 4), whose last channel is
             the mask. Integers are scaled to [0, 1].
         stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
             channels.
-        keep: likewise, above 0 on background scribbles, whose similar pixels keep their colours; None is none.
-        reach: as of :func:`~nlfilter_torch.recolor`, and so are ``photometric_bandwidth`` and ``patch_size``.
-        photometric_bandwidth: in hundredths of Lab.
+        keep: rows like those of ``stroke_mask``, or None, above 0 on background scribbles; pixels similar to these
+            keep their colours.
+        reach: as in :func:`~nlfilter_torch.recolor`, like ``photometric_bandwidth`` and ``patch_size``.
+        photometric_bandwidth: in Lab units divided by 100.
         patch_size: of the patches that are compared.
-        statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
+        statistics: as in :func:`stream_detail`, like ``sample``, ``tile_rows``, ``memory`` and ``report``.
         sample: number of pixels.
-        tile_rows: rows that are computed at once.
+        tile_rows: rows of a tile.
         memory: in bytes, besides that of the sources and the target.
         report: called with the name of a stage and its progress.
-        **options: of :func:`~nlfilter_torch.nonlocal_operator` but ``guide_channels``, ``tolerance`` and
+        **options: of :func:`~nlfilter_torch.nonlocal_operator` except ``guide_channels``, ``tolerance`` and
             ``patch_weights``.
 
     Raises:
-        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size.
-        MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
+        TypeError, ValueError: if an argument does not fit, there is no scribble, or a source changes its size.
+        MemoryError: if the samples, the scribbled pixels or a single row take more than ``memory``.
 
     Example:
         >>> import numpy as np
@@ -188,29 +189,29 @@ def stream_colorize(
     only on its own patch and position, so there are no seams, and the size of the tiles does not matter.
 
     Args:
-        source: rows (H, W) or (H, W, S), as of :func:`stream_detail`; of colours the luminance is taken.
+        source: rows (H, W) or (H, W, S), as in :func:`stream_detail`; colours are reduced to their luminance.
         target: receives the rows; (H, W, 3), or (H, W, 4) if the source has transparency.
         strokes: scribbles as rows (H, W, 3), RGB, read under ``stroke_mask`` only; or (H, W, 4), whose last channel is
             the mask. Integers are scaled to [0, 1].
         stroke_mask: rows (H, W) or (H, W, 1) in [0, 1] or of bool, above 0 on scribbles; None if ``strokes`` has four
             channels.
-        method: ``"regression"``; k-means takes all pixels at once.
-        strength: as of :func:`~nlfilter_torch.colorize`, and so are bandwidths, ``patch_size``, ``num_landmarks`` and
+        method: ``"regression"``; k-means would need all pixels at once.
+        strength: as in :func:`~nlfilter_torch.colorize`, like bandwidths, ``patch_size``, ``num_landmarks`` and
             ``generator``.
         photometric_bandwidth: in units of the image.
         spatial_bandwidth: in pixels; None is 0.5625 of the short side.
         patch_size: of the patches that are compared.
         num_landmarks: M of the operators.
         generator: source of randomness for the landmarks.
-        statistics: as of :func:`stream_detail`, and so are ``sample``, ``tile_rows``, ``memory`` and ``report``.
+        statistics: as in :func:`stream_detail`, like ``sample``, ``tile_rows``, ``memory`` and ``report``.
         sample: number of pixels.
-        tile_rows: rows that are computed at once.
+        tile_rows: rows of a tile.
         memory: in bytes, besides that of the sources and the target.
         report: called with the name of a stage and its progress.
 
     Raises:
-        TypeError, ValueError: if an argument does not fit, nothing is painted, or a source changes its size.
-        MemoryError: if the samples, the painted pixels or a single row take more than ``memory``.
+        TypeError, ValueError: if an argument does not fit, there is no scribble, or a source changes its size.
+        MemoryError: if the samples, the scribbled pixels or a single row take more than ``memory``.
 
     Example:
         >>> import numpy as np

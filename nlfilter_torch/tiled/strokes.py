@@ -1,4 +1,4 @@
-"""The strokes of a step as rows of a picture, in order."""
+"""The strokes of a step, rasterised a few rows at a time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class CoveredRows:
     """The mask of strokes over a picture: rows (h, W, 1) of zeros and ones.
 
     Attributes:
-        strokes: of any paint.
+        strokes: with any paint.
         size: (H, W).
     """
 
@@ -35,7 +35,7 @@ class CoveredRows:
         return (*self.size, 1)
 
     def any(self) -> bool:
-        """Whether they cover a pixel."""
+        """Whether the strokes cover a pixel."""
         starts = range(0, self.size[0], LOOKED_AT)
         return any(self[start : min(start + LOOKED_AT, self.size[0])].any() for start in starts)
 
@@ -61,5 +61,5 @@ class ColouredRows(CoveredRows):
 
 
 def by_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The strokes of a step as :func:`scribbles_of` has them, in rows."""
+    """The strokes of a step as in :func:`scribbles_of`, as sources of rows."""
     return scribbles_of(step, size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)

@@ -18,7 +18,7 @@ from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
-TOGETHER, AMPLE = 1 << 14, 1 << 28  # pixels of rows computed together, which take less time each, and bytes for that
+TOGETHER, AMPLE = 1 << 14, 1 << 28  # pixels computed together, for speed, if that many bytes may be used
 Statistics = Literal["sample", "full"]
 Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
 
@@ -38,8 +38,8 @@ class Passes:
         tile_rows: rows of a tile, see :meth:`rows_together`; None is as many as fit in memory.
         memory: bytes that may be used.
         report: called with the progress.
-        folder: with room for planes between two passes; None is the system's for temporary files.
-        threads: that tiles are divided among.
+        folder: for planes between two passes; None is the system's folder for temporary files.
+        threads: number of threads that tiles are divided among.
     """
 
     kind: str
@@ -72,17 +72,17 @@ class Passes:
             check_count(self.tile_rows, "tile_rows")
 
     def rows_together(self, width: int) -> int:
-        """Rows that are always computed together; a tile has as many, or a multiple."""
+        """Number of rows that are always computed together; the height of a tile is a multiple of it."""
         return max(1, (TOGETHER if self.memory >= AMPLE else 1) // width)
 
     def workers(self, num_landmarks: int) -> int:
-        """Tiles that are worked out at once, by threads of their own: as many as fit well."""
+        """Number of tiles computed at once, each by its own thread: as many as memory allows."""
         if self.memory < AMPLE:
             return 1
         return max(1, min(self.threads, self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
 
     def stores(self, taken: int) -> bool:
-        """Whether a guide of so many bytes is kept from one pass to the next."""
+        """Whether a guide of ``taken`` bytes is kept from one pass to the next."""
         return self.memory >= AMPLE and taken <= self.memory // 4
 
     def work_out(
@@ -96,7 +96,7 @@ class Passes:
         transparent: bool = True,
         stage: str = "Filtering",
     ) -> Rows:
-        """The edited rows, with their transparency if asked for, in tiles of ``rows``."""
+        """Yield the edited rows in tiles of ``rows``, with their transparency if ``transparent``."""
 
         def tiles() -> Iterator[Tile]:
             for tile in picture.tiles(margin, rows):
@@ -114,7 +114,7 @@ class Passes:
 
 
 def bytes_at_hand(pixels: int, num_landmarks: int) -> int:
-    """What pixels that are computed together take: their factor, and products as large."""
+    """Memory in bytes for pixels that are computed together: their factor, and products of the same size."""
     return 16 * pixels * num_landmarks
 
 
@@ -135,11 +135,11 @@ def fill(target: RowTarget, rows: Rows) -> None:
 
 
 def bytes_needed(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int = 0) -> int:
-    """What statistics and a row take at least; arguments as of :func:`rows_that_fit`."""
+    """Smallest memory in bytes for statistics and for rows; arguments as in :func:`rows_that_fit`."""
     size = picture.dtype.itemsize
     workers, rows = passes.workers(num_landmarks), passes.rows_together(picture.size[1])
     at_hand = workers * bytes_at_hand(rows * picture.size[1], num_landmarks) // 4
-    # The pilot with copies of its features and its factor; later the factors of both samples, and blocks.
+    # First the pilot, with copies of its features and its factor; later the factors of both samples, and blocks.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
     some = (pilot + min(picture.pixels, passes.sample)) * (num_landmarks + picture.colours + 2)
     later = some + workers * block * (num_landmarks + planes + 8)
@@ -155,18 +155,18 @@ def rows_that_fit(
     num_landmarks: int,
     held: int = 0,
 ) -> int:
-    """Rows of a tile that fit in the memory of the passes.
+    """Number of rows of a tile that fit in memory.
 
     Args:
         picture: to be edited.
-        passes: over its rows.
-        floats: for each pixel of a tile.
-        planes: features of a pixel.
+        passes: tiling options.
+        floats: per pixel of a tile.
+        planes: features per pixel.
         num_landmarks: M.
-        held: floats kept in memory besides.
+        held: floats that are kept in memory besides.
 
     Raises:
-        MemoryError: if there is not one, or no room for the samples.
+        MemoryError: if not even one row fits, or the samples do not.
     """
     row = picture.size[1] * floats * picture.dtype.itemsize
     least = bytes_needed(picture, passes, planes, num_landmarks, held)
@@ -181,7 +181,7 @@ def rows_that_fit(
 
 
 def pixels_kept(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int) -> int:
-    """Pixels whose columns can be kept from one pass to the next."""
+    """Number of pixels whose columns can be kept from one pass to the next."""
     if passes.memory < AMPLE:
         return 0
     spare = passes.memory * 7 // 10 - bytes_needed(picture, passes, planes, num_landmarks, held)

@@ -1,7 +1,7 @@
-"""Tiles worked out at once, each by a thread of its own: a tile's many short operations are not worth dividing.
+"""Several tiles at once, each in its own thread: the short operations on a tile are not worth dividing among threads.
 
-OpenMP divides each operation anew, and its threads wait for each other at full speed: beside another busy program most
-of the time goes into that. Tiled work therefore divides pictures, not operations.
+OpenMP divides every operation among threads that busy-wait for each other, so that most of the time is spent waiting if
+another program is busy. Tiled edits therefore divide the picture among threads, not single operations.
 """
 
 from collections import deque
@@ -15,16 +15,16 @@ import torch
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_setting = Lock()  # what torch begins new threads with is for all of a process, and is changed for a moment
+_setting = Lock()  # torch's default for new threads is shared by the process, and is changed temporarily
 
 
 def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
-    """The function of every item, without gradients, in the order of the items, which are taken as they are needed.
+    """Apply a function to items without gradients, and yield the results in order; items are consumed as needed.
 
     Args:
-        function: to be called by several threads at once.
-        items: of which one more is held than there are workers.
-        workers: threads, which share those that torch has for an operation; a single one is the calling thread.
+        function: called by several threads at once.
+        items: one more of them is in memory than there are workers.
+        workers: number of threads, which share torch's threads for operations; 1 runs in the calling thread.
     """
     call = torch.no_grad()(function)
     if workers == 1:
@@ -53,7 +53,10 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
 
 @contextmanager
 def undivided(workers: int) -> Iterator[None]:
-    """Have the calling thread not divide operations, where workers divide the picture; other threads still do."""
+    """Keep the calling thread from dividing operations among threads, if there are several workers.
+
+    Other threads still divide their operations.
+    """
     before = torch.get_num_threads()
     if workers == 1 or before == 1:
         yield
@@ -68,9 +71,9 @@ def undivided(workers: int) -> Iterator[None]:
 
 @contextmanager
 def _for_some_threads() -> Iterator[int]:
-    """Gives the number of threads that new ones divide an operation among, and keeps it from being changed inside.
+    """Yield the number of threads that new threads divide an operation among, and restore it afterwards.
 
-    Torch keeps a number for each thread, and the last that was set for threads to come.
+    Torch has a number for each thread; a new thread begins with the number that was last set in any thread.
     """
     with _setting, ThreadPoolExecutor(1) as another:
         threads = another.submit(torch.get_num_threads).result()
