@@ -157,7 +157,7 @@ class NonlocalOperator:
                 batch of 1 on either side is broadcast.
 
         Returns:
-            (B, C, H, W) in the image's dtype, with the mean of the image. Differentiable in image and operator.
+            (B, C, H, W) in the image's dtype, with the same mean as the image. Differentiable in image and operator.
 
         Raises:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of that size.

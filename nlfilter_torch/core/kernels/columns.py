@@ -125,7 +125,7 @@ def columns_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of :func:`columns` with respect to features, landmarks and the inverse Cholesky factor.
 
-    Beside the arguments of :func:`columns`, it takes the columns (B, M, N), the ``scale`` (B, N) by which they were
+    Besides the arguments of :func:`columns`, it takes the columns (B, M, N), the ``scale`` (B, N) by which they were
     limited, and gradients of the loss: ``gradient`` with respect to the columns, (B, M, N) or the pair (B, M, r) and
     (B, r, N) whose product it is, and ``diagonal`` (B, N) with respect to 1 - |u|^2 where that is not negative. For a
     triangular inverse Cholesky factor, its gradient above the diagonal may be omitted.
