@@ -1,4 +1,4 @@
-"""Weights from a safetensors file, checked against what a layer needs."""
+"""Reading weights from a safetensors file, with checks of names and shapes."""
 
 import json
 from collections.abc import Mapping
@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-LENGTH = 8  # bytes of the header's length, which come first
+LENGTH = 8  # size in bytes of the first field, the length of the header
 
 
 def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """Tensors of these names and shapes, in float32.
+    """Read float32 tensors of the given names and shapes.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or holds other tensors.
+        ValueError: if the file is damaged, or lacks a tensor of that name and shape.
     """
     try:
         content = path.read_bytes()
