@@ -136,7 +136,7 @@ class Training:
     def denoise(self, model: nn.Module, noisy: Tensor, told: Tensor) -> Tensor:
         """Crops denoised as a training does it."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            found: Tensor = model.noise_in(noisy, told)  # type: ignore[operator]
+            found: Tensor = model.estimate_noise(noisy, told)  # type: ignore[operator]
         return noisy - found
 
     def step(self, steps: int) -> None:

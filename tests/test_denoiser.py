@@ -70,12 +70,21 @@ def test_tiles_put_together_what_they_took_apart(size: tuple[int, int]) -> None:
     torch.testing.assert_close(in_tiles(image, noise, lambda x, n: x + n), image + noise, rtol=0, atol=1e-6)
 
 
+def test_tiles_cover_images_of_every_size() -> None:
+    for length in range(1, 600):
+        tiles = module._divided(length)
+        assert [tile.start for tile in tiles] == [STEP * n for n in range(len(tiles))]
+        assert tiles[-1].stop >= length + 2 * module.BORDER
+        assert all(tile.stop - tile.start == SIDE for tile in tiles[:-1])
+        assert tiles[-1].stop - tiles[-1].start <= SIDE
+
+
 def test_rows_that_begin_at_a_tile_are_those_of_the_whole() -> None:
     image = noisy(colour("chelsea", 300, 150)[:, :1], 0.1)
     noise = torch.full_like(image, 0.1)
     with torch.no_grad():
-        whole = in_tiles(image, noise, TRAINED_ONE.noise_in)
-        lower = in_tiles(image[..., STEP:, :], noise[..., STEP:, :], TRAINED_ONE.noise_in)
+        whole = in_tiles(image, noise, TRAINED_ONE.estimate_noise)
+        lower = in_tiles(image[..., STEP:, :], noise[..., STEP:, :], TRAINED_ONE.estimate_noise)
     torch.testing.assert_close(lower[..., SIDE:, :], whole[..., STEP + SIDE :, :], rtol=0, atol=1e-5)
 
 
@@ -311,5 +320,7 @@ def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.Monkey
 
     image = torch.zeros(1, 1, 400, 300)
     in_tiles(image, noise_map(0.1, image), watched)
-    assert {size[1:] for size in seen} == {(module.SIDE, module.SIDE)}
-    assert max(size[0] for size in seen) <= module.TOGETHER
+    sides = {side for size in seen for side in size[1:]}
+    assert min(sides) >= module.SMALLEST
+    assert max(sides) == module.SIDE
+    assert max(size[0] for size in seen) <= module.TILE_BATCH

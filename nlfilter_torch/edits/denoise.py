@@ -137,7 +137,7 @@ def _by_network(source: Source, noise: float | Tensor | Noise, strength: float |
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
         level = torch.where(level < QUIET, torch.zeros_like(level), level)
-        return image - _network(image).removed(image, level, turns=1)
+        return image - _network(image).estimate_in_tiles(image, level, turns=1)
 
     return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import groupby, product
 from pathlib import Path
 
 import torch
@@ -31,8 +32,9 @@ FAINT = 1 / 255  # noise level below which filtering is reduced in proportion
 BRIGHTEST = 2.0  # images of larger magnitude, which do not occur in training, are scaled down to this
 
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
-FRAME = 16  # width in pixels of the border added to images, so that their own border does not affect results
-TOGETHER = 8  # tiles processed at once
+SMALLEST = 56  # size of the last tile of a row or column, at least
+BORDER = 16  # width in pixels of the border added to images, so that their own border does not affect results
+TILE_BATCH = 8  # tiles processed at once
 
 
 class NonlocalDenoiser(nn.Module):
@@ -111,9 +113,9 @@ class NonlocalDenoiser(nn.Module):
         dtype = self.log_bandwidths.dtype
         levels = noise_map(noise, noisy).to(dtype)
         image = noisy.to(dtype)
-        return as_given(image - self.removed(image, levels, turns), noisy)
+        return as_given(image - self.estimate_in_tiles(image, levels, turns), noisy)
 
-    def removed(self, image: Tensor, noise: Tensor, turns: int) -> Tensor:
+    def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int) -> Tensor:
         """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype."""
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is quickest")
@@ -121,14 +123,14 @@ class NonlocalDenoiser(nn.Module):
 
         def mean(tile: Tensor, levels: Tensor) -> Tensor:
             found = [
-                self.noise_in(*(planes.rot90(n, (2, 3)) for planes in (tile, levels))).rot90(-n, (2, 3))
+                self.estimate_noise(*(planes.rot90(n, (2, 3)) for planes in (tile, levels))).rot90(-n, (2, 3))
                 for n in quarters
             ]
             return torch.stack(found).mean(0)
 
         return in_tiles(image, noise, mean)
 
-    def noise_in(self, noisy: Tensor, noise: Tensor) -> Tensor:
+    def estimate_noise(self, noisy: Tensor, noise: Tensor) -> Tensor:
         """Estimate the noise without dividing the image: called with crops in training, with tiles otherwise.
 
         Args:
@@ -137,26 +139,26 @@ class NonlocalDenoiser(nn.Module):
         """
         if noisy.shape[1] not in (1, 3):
             each = (planes.flatten(0, 1).unsqueeze(1) for planes in (noisy, noise.expand_as(noisy)))
-            return self.noise_in(*each).view_as(noisy)
+            return self.estimate_noise(*each).view_as(noisy)
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
         planes, levels = split_colours(noisy / scale, noise / scale)
         middle = planes.new_tensor([0.5, 0.0, 0.0]).view(1, -1, 1, 1)
         seen = torch.cat([2 * (planes - middle), 10 * levels], dim=1)
         features = self.first(seen.contiguous(memory_format=torch.channels_last))
         for layer in self.before:
-            features = features + layer(_bent(features))
+            features = features + layer(_activated(features))
         levels = levels[:, (0, 1, 1)]
         found = (planes - self.smooth(features, planes)) * (levels / FAINT).clamp(max=1.0)
-        features = self.join(torch.cat([_bent(features), 2 * (planes - found - middle), 2 * found], dim=1))
+        features = self.join(torch.cat([_activated(features), 2 * (planes - found - middle), 2 * found], dim=1))
         for layer in self.after:
-            features = features + layer(_bent(features))
-        left = self.last(_bent(features))
+            features = features + layer(_activated(features))
+        left = self.last(_activated(features))
         return join_colours(found + levels * left.to(planes), noisy.shape[1]) * scale
 
     def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
         """Filter planes (B, 3, H, W) with a guide and sliders computed from ``features``, averaging similar pixels."""
         height, width = planes.shape[-2:]
-        guide, logits = self.guide(_bent(features)).to(planes).split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
+        guide, logits = self.guide(_activated(features)).to(planes).split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
         alike, near = self.log_bandwidths.exp()
         places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / near
@@ -220,33 +222,35 @@ def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], 
     so that borders of tiles are not visible.
     """
     height, width = image.shape[-2:]
-    below, right = (
-        FRAME if n + 2 * FRAME < SIDE else -(-(n + 2 * FRAME - SIDE) // STEP) * STEP + SIDE - n - FRAME
-        for n in (height, width)
-    )
-    padding = (FRAME, right, FRAME, below)
+    down, across = _divided(height), _divided(width)
+    padding = (BORDER, across[-1].stop - width - BORDER, BORDER, down[-1].stop - height - BORDER)
     image, noise = (_extended(planes, padding) for planes in (image, noise))
-    rows, columns = image.shape[-2:]
-    side = (min(SIDE, rows), min(SIDE, columns))
-    places = [
-        (row, column) for row in range(0, rows - side[0] + 1, STEP) for column in range(0, columns - side[1] + 1, STEP)
-    ]
-    if len(places) == 1:
-        return function(image, noise)[..., FRAME : FRAME + height, FRAME : FRAME + width]
-    fade = torch.outer(*(_profile(n).to(image) for n in side))
-    total, weight = torch.zeros_like(image), image.new_zeros(rows, columns)
-    batch = len(image)
-    for first in range(0, len(places), TOGETHER):
-        windows = [
-            (..., slice(row, row + side[0]), slice(column, column + side[1]))
-            for row, column in places[first : first + TOGETHER]
-        ]
-        found = function(*(torch.cat([planes[window] for window in windows]) for planes in (image, noise)))
-        for window, tile in zip(windows, found.split(batch), strict=True):
-            total[window] += fade * tile
-            weight[window] += fade
-    inner = (..., slice(FRAME, FRAME + height), slice(FRAME, FRAME + width))
+    inner = (..., slice(BORDER, BORDER + height), slice(BORDER, BORDER + width))
+    if len(down) == len(across) == 1:
+        return function(image, noise)[inner]
+    total, weight = torch.zeros_like(image), image.new_zeros(image.shape[-2:])
+    for (height, width), tiles in groupby(sorted(product(down, across), key=_size), key=_size):
+        fade = torch.outer(_profile(height), _profile(width)).to(image)
+        windows = [(..., *tile) for tile in tiles]
+        for first in range(0, len(windows), TILE_BATCH):
+            some = windows[first : first + TILE_BATCH]
+            found = function(*(torch.cat([planes[window] for window in some]) for planes in (image, noise)))
+            for window, tile in zip(some, found.split(len(image)), strict=True):
+                total[window] += fade * tile
+                weight[window] += fade
     return total[inner] / weight[inner]
+
+
+def _divided(length: int) -> list[slice]:
+    """Divide one axis of an image, extended by a border on both sides, into tiles; the last may be smaller."""
+    length += 2 * BORDER
+    last = max(0, -(-(length - SIDE) // STEP)) * STEP
+    end = max(length, last + SMALLEST) if last else length
+    return [slice(start, min(start + SIDE, end)) for start in range(0, last + 1, STEP)]
+
+
+def _size(tile: tuple[slice, slice]) -> tuple[int, int]:
+    return tile[0].stop - tile[0].start, tile[1].stop - tile[1].start
 
 
 def _profile(length: int) -> Tensor:
@@ -277,7 +281,7 @@ def _mixture(like: Tensor) -> Tensor:
     return like.new_tensor(rows)
 
 
-def _bent(features: Tensor) -> Tensor:
+def _activated(features: Tensor) -> Tensor:
     """Activation before a convolution; leaky, so that units do not die."""
     return F.leaky_relu(features, 0.1)
 
