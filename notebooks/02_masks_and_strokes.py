@@ -64,7 +64,7 @@ show_images(masks, side=220)
 # %% [markdown]
 # ## 3. Sliders for each region
 #
-# Two regions, two rows of sliders: the suit gets crisp, the background smooth. The face belongs to neither and is unchanged.
+# Two regions, two rows of sliders: the suit becomes crisp, the background smooth. The face belongs to neither and is unchanged.
 
 # %%
 regions = torch.cat([spot(117, 24), spot(12, 100)], dim=1)

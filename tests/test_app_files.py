@@ -1,4 +1,4 @@
-"""Files that the editor opens and saves: as the command line writes them, and refusals that leave all as it was."""
+"""Files that the editor opens and saves: they equal those of the command line, and refusals change nothing."""
 
 import io
 import socket
@@ -73,7 +73,7 @@ def test_names_to_save_under(session: Session, name: str, photograph: Photograph
     assert session.opened is not None
     session.opened = replace(session.opened, name=name, photograph=photograph)
     assert session.suggested_name() == wanted
-    session.save(wanted)  # which can hold it
+    session.save(wanted)  # which supports this depth
     assert Session(session.folder).suggested_name() == ""
 
 

@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it keeps, and one sentence with exit status 2 for everything it cannot use."""
+"""The command line: its output, the metadata it keeps, and one sentence with exit status 2 for unusable input."""
 
 import json
 import signal
@@ -79,7 +79,7 @@ def test_all_channels_are_edited_on_request(photo: Path, tmp_path: Path, cat: to
 def test_alpha_of_ones_gives_the_file_back(
     tmp_path: Path, cat: torch.Tensor, suffix: str, depth: Depth, channels: int
 ) -> None:
-    """Depth, alpha, profile and EXIF stay; integer pixels come back exactly, floats to rounding."""
+    """Depth, alpha, profile and EXIF are kept; integer pixels are exact, floats equal to rounding."""
     exif = Image.Exif()
     exif[ExifTags.Base.Make] = "Maker"
     exif[ExifTags.Base.Orientation] = 1
@@ -132,7 +132,7 @@ def test_a_file_can_replace_itself(photo: Path) -> None:
 
 def test_inspect_writes_pictures_and_figures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "looks"
-    for _ in range(2):  # the folder may be there
+    for _ in range(2):  # the folder may exist
         assert main(["inspect", str(photo), str(folder), "--landmarks", "40", "--bandwidth", "20"]) == 0
     names = {"eigenvectors.png", "eigenvalues.png", "response.png", "diagnostics.json"}
     assert {file.name for file in folder.iterdir()} == names
@@ -166,7 +166,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one sentence of a refusal, without the name of the program."""
+    """Return the sentence of a refusal, without the name of the program."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     captured = capsys.readouterr()
@@ -298,7 +298,7 @@ def test_flat_and_tiny_pictures_are_looked_at(size: tuple[int, int], tmp_path: P
     source = tmp_path / "flat.png"
     write_photograph(Photograph(torch.full((1, 1, *size), 0.5), "uint8"), source)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of fewer pixels than landmarks
+        warnings.simplefilter("ignore")  # about fewer pixels than landmarks
         assert main(["inspect", str(source), str(tmp_path / "looks")]) == 0
     names = ["diagnostics.json", "eigenvalues.png", "eigenvectors.png", "response.png"]
     assert sorted(path.name for path in (tmp_path / "looks").iterdir()) == names
@@ -329,7 +329,7 @@ def test_an_interrupt_that_python_loses_comes_again(
 ) -> None:
     class Busy:
         def __del__(self) -> None:
-            raise KeyboardInterrupt  # as where Ctrl-C comes at this moment
+            raise KeyboardInterrupt  # as if Ctrl-C were pressed at this moment
 
     def work(*_: object, **__: object) -> None:
         Busy()

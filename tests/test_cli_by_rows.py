@@ -1,4 +1,4 @@
-"""Detail by rows on the command line: the result of one in memory, and what happens when something breaks."""
+"""`detail` by rows on the command line: the result equals that in memory, and failures are handled."""
 
 import os
 import resource
@@ -23,12 +23,12 @@ from nlfilter_torch.io.photographs import Photograph, read_photograph, write_pho
 from nlfilter_torch.io.tiff import TiffRows
 from tests.test_streaming_files import PROFILE, Array, cat
 
-LITTLE = "0.03"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
 
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples and blocks in proportion to small pictures."""
+    """Reduce samples and blocks in proportion to small pictures."""
     monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 8000)
     monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
 
@@ -89,7 +89,7 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     picture = cat(200, 300)
     zarr.create_array(store=tmp_path / "in.zarr", data=picture, chunks=(64, 64, 3))
     write_photograph(Photograph(torch.from_numpy(picture).permute(2, 0, 1)[None] / 255), tmp_path / "in.png")
-    for _ in range(2):  # the second time it takes the place of the first
+    for _ in range(2):  # the second output replaces the first
         assert detail(tmp_path / "in.zarr", tmp_path / "out.zarr", "--full") == 0
     assert detail(tmp_path / "in.png", tmp_path / "out.png") == 0
     wanted = read_photograph(tmp_path / "out.png").pixels[0].permute(1, 2, 0).numpy() * 255
@@ -140,7 +140,7 @@ def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPat
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The sentence of a `detail` that fails, which must leave no trace in the folder of its output."""
+    """Return the error sentence of a `detail` that fails, and check that it leaves nothing in the output folder."""
     folder = Path(str(arguments[1])).parent
     before = set(folder.iterdir())
     assert detail(*arguments) == 2
@@ -180,7 +180,7 @@ def test_damage_in_the_middle_is_named(photo: Path, tmp_path: Path, capsys: pyte
 
 @pytest.fixture
 def file_limit() -> Any:
-    """A limit in bytes to the size of files, which a full disk has, too."""
+    """A limit on the size of files in bytes, in place of a full disk."""
     from contextlib import contextmanager
 
     @contextmanager
@@ -200,7 +200,7 @@ def test_a_full_disk_is_named(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], file_limit: Any, target: str
 ) -> None:
     with file_limit(20_000):
-        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE, "--threshold", "0")  # nothing between
+        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE, "--threshold", "0")  # no temporaries
     assert f"{target} cannot be written: File too large; make room there or write elsewhere" in sentence
 
 
@@ -241,7 +241,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
 ) -> None:
     program = (
         "import signal, sys, time\n"
-        # A shell's background jobs, which these tests may be one of, ignore this signal, and so would their children.
+        # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from nlfilter_torch.tiled import sources as rows, tiles\n"
         "from nlfilter_torch.tiled.source import Tiled\n"
@@ -270,7 +270,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         process.wait()
     assert not (tmp_path / target).exists()
     left = list(tmp_path.glob(".*"))
-    assert bool(left) == (number == signal.SIGKILL)  # only what could not tidy up leaves a hidden part
+    assert bool(left) == (number == signal.SIGKILL)  # only a killed process leaves a hidden part
     if left:
         assert detail(photo, tmp_path / target, "--memory", LITTLE) == 0
-        assert not list(tmp_path.glob(".*"))  # and the next run tidies up
+        assert not list(tmp_path.glob(".*"))  # which the next run removes

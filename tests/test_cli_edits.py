@@ -1,4 +1,4 @@
-"""The edits as commands: what they make of files, strokes, masks and rectangles, and what they refuse."""
+"""The edits as commands: files, strokes, masks and rectangles, and input that is refused."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def run(verb: str, source: Path, *arguments: object) -> torch.Tensor:
 
 
 def is_written(found: torch.Tensor, wanted: torch.Tensor) -> bool:
-    """As close as eight bits allow."""
+    """Check that a file equals the expected image, to the rounding of eight bits."""
     return bool((found - wanted.clamp(0, 1)).abs().max() < 0.6 / 255)
 
 
@@ -78,7 +78,7 @@ def test_recolor(photo: Path, strokes: Path, pixels: torch.Tensor) -> None:
 
 
 def test_colorize(photo: Path, strokes: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
-    """Grey files become colour files; a photograph in colour is taken for a grey one."""
+    """Grey files become colour files; a photograph in colour is converted to grey first."""
     grey = (pixels * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
     write_photograph(Photograph(grey, "uint16", icc=b"a profile for grey"), tmp_path / "grey.png")
     mask = box(8, 10, 6, 8)

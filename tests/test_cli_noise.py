@@ -1,4 +1,4 @@
-"""What ``denoise`` says about the noise that it found and what it did, in memory and in tiles."""
+"""Messages of ``denoise`` about the measured noise and the change, in memory and in tiles."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the command line says and shows of scribbles: their colours, notes, shares of the picture, a picture of it."""
+"""Messages and pictures of scribbles on the command line: colours, notes, positions in per cent, and `--show`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The trained denoiser: nothing without noise, tiles without seams, all kinds of noise, gradients, and its file."""
+"""The trained denoiser: no change without noise, no seams between tiles, kinds of noise, gradients, and its file."""
 
 import json
 from pathlib import Path
@@ -116,7 +116,7 @@ def test_turns_are_averaged_and_better() -> None:
         half = TRAINED_ONE(image.rot90(2, (2, 3)), 0.1).rot90(2, (2, 3))
     scores = [decibels(found[turns], CAT) for turns in (1, 2, 4)]
     assert scores == sorted(scores)
-    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # of other tiles
+    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # the tiles differ
     with pytest.raises(ValueError, match="turns must be 1, 2 or 4, got 3"):
         TRAINED_ONE(image, 0.1, turns=3)
 
@@ -205,7 +205,7 @@ def test_noise_that_grows_with_the_light_is_found() -> None:
 
 
 def test_noise_is_not_that_of_the_dark() -> None:
-    """A bright disc before black: the flattest windows are black, and say little about the disc."""
+    """A bright disc on black: the flattest windows are black, and their noise is not that of the disc."""
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 200), indexing="ij")
     radius = (rows.square() + columns.square()).sqrt()
     clean = torch.where(radius < 0.85, 0.6 - 0.25 * radius, 0.0)[None, None]
@@ -217,7 +217,7 @@ def test_noise_is_not_that_of_the_dark() -> None:
 
 @pytest.mark.parametrize("level", [5, 15, 25, 50])
 def test_noise_is_found_beside_texture(level: int) -> None:
-    """Half of the picture is gravel, whose finest detail is as strong as noise of 20 levels."""
+    """Half of the picture is gravel, whose finest detail is as strong as noise of 20 grey levels."""
     gravel = picture("gravel", 160, 160, torch.float32)
     clean = torch.cat([gravel, torch.linspace(0.3, 0.7, 160).expand(1, 1, 160, 160)], dim=3)
     found = 255 * estimate_noise(noisy(clean, level / 255))

@@ -1,4 +1,4 @@
-"""What is true of every edit: dtypes, batches, repetition, gradients and bad input."""
+"""Properties of every edit: dtypes, batches, repetition, gradients and bad input."""
 
 from collections.abc import Callable
 

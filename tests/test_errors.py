@@ -37,7 +37,7 @@ NAN, INFINITY = float("nan"), float("inf")
 
 
 def raises(call: Callable[[], object], error: type[Exception], message: str) -> None:
-    """``<argument> must <requirement>, got <value>; <remedy>``, on one line, which begins with ``message``."""
+    """Check for ``<argument> must <requirement>, got <value>; <remedy>`` on one line that begins with ``message``."""
     with pytest.raises(error) as caught:
         call()
     found = str(caught.value)
@@ -90,7 +90,7 @@ def test_bad_images(function: str, bad: str) -> None:
 
 
 def test_empty_batches_are_refused_where_they_make_no_sense() -> None:
-    fits = ("nonlocal_operator", "estimate_bandwidth")  # all others have two images beside none
+    fits = ("nonlocal_operator", "estimate_bandwidth")  # all others: two images against an empty batch
     for function, (name, call) in TAKE_AN_IMAGE.items():
         if function not in fits:
             name = "image" if function == "NonlocalFilter" else name
@@ -242,12 +242,12 @@ def test_bad_arguments_of_masks(call: Callable[[], object], error: type[Exceptio
     raises(call, error, message)
 
 
-# --- what an error or a warning leaves behind
+# --- state after an error or a warning
 
 
 @pytest.mark.parametrize(("landmarks", "alarm"), [(100, 1.0), (20, 0.0)], ids=["too many landmarks", "no balance"])
 def test_warnings_point_at_the_caller(landmarks: int, alarm: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    # No small image leaves the row sums off by what is worth a warning, so any deviation has to do.
+    # Row sums of small images are too accurate for a warning, so here any deviation raises one.
     monkeypatch.setattr("nlfilter_torch.operator.balancing.ALARM", {GUIDE.dtype: alarm})
     monkeypatch.setattr("nlfilter_torch.operator.balancing.TOLERANCE", {GUIDE.dtype: 1e-17})
     with warnings.catch_warnings(record=True) as caught:

@@ -14,12 +14,12 @@ from nlfilter_torch.io.cameras import is_heic
 from nlfilter_torch.io.photographs import TooLarge, read_photograph
 
 SCENE = skimage.data.astronaut()[60:124, 130:210]
-# From CIE XYZ to the linear RGB of sRGB, which is the camera's here.
+# From CIE XYZ to linear sRGB, the colour space of this camera.
 SRGB = np.linalg.inv([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
 
 def write_dng(path: Path, scene: np.ndarray, orientation: int = 1) -> None:
-    """What a camera with a Bayer filter, white at 16,000, saw of a scene in sRGB."""
+    """Write a scene in sRGB as the file of a camera with a Bayer filter and white at 16,000."""
     light = scene / 255.0
     light = np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)
     mosaic = light[..., 1].copy()

@@ -69,7 +69,7 @@ def test_distance_does_not_count_unless_asked_for() -> None:
 
 
 def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sums over several references are those of a mean one: balancing, means, noise and all."""
+    """Several equal references give the same result as one: balancing, means and noise are averages."""
     monkeypatch.setattr("nlfilter_torch.operator.build.choose_landmarks", lambda features, *_: features[:, :, :1900:48])
     frame = crop(90, 190)
     for step in STEPS:
@@ -94,7 +94,7 @@ def test_steps_follow_each_other() -> None:
     found = FilmEdit(Recipe(steps), [frame], PASSES)(frame)
     apart = np.abs(found - edited(steps[1], edited(steps[0], frame).clip(0, 1)))
     assert apart.mean() < 0.02 / 255
-    assert apart.max() < 2 / 255  # rounding decides which pixels are candidates for a landmark
+    assert apart.max() < 2 / 255  # candidates for landmarks depend on rounding
 
 
 def test_strokes_are_refused() -> None:
@@ -173,7 +173,7 @@ def copy(source: Path, target: Path, edit: Any = lambda frame: frame) -> int:
 
 
 def facts(path: Path) -> dict[str, Any]:
-    """What a film must keep."""
+    """Properties that an edited film must keep."""
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
         context = stream.codec_context
@@ -217,7 +217,7 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
     seen: list[np.ndarray] = []
     assert copy(source, target, lambda frame: seen.append(frame) or frame) == 10
     found, wanted = facts(target), facts(source)
-    if options.get("varying"):  # a mean over gaps between frames as they are stored, which is not in their order
+    if options.get("varying"):  # the mean gap between frames in storage order, which is not their display order
         assert abs(found.pop("rate") / wanted.pop("rate") - 1) < 0.1
     for each in (found, wanted):
         each["length"] = round(float(each["length"]), 2)  # the file counts thousandths of a second
@@ -233,7 +233,7 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
 
 
 def test_colours_are_those_that_the_tags_say(tmp_path: Path) -> None:
-    """A colour stored by the formula of each matrix is found again, in films without a tag by their height."""
+    """A colour stored with each matrix is recovered; in films without a tag, the height determines the matrix."""
     colour = np.array([0.8, 0.3, 0.2])
     for tag, size, (red, blue) in (
         (1, 48, (0.2126, 0.0722)),
@@ -268,7 +268,7 @@ def test_samples_are_spread_over_the_film(tmp_path: Path) -> None:
         places = [next(i for i, frame in enumerate(frames) if np.array_equal(frame, sample)) for sample in samples]
         assert places[0] < 4 < places[1] < 8 < places[2]
         assert 1 <= len(film.sample(100)) <= 12
-        count = write_film(film, tmp_path / "out.mp4", lambda frame: frame, lambda number: None)  # from the start again
+        count = write_film(film, tmp_path / "out.mp4", lambda frame: frame, lambda number: None)  # again from the start
     assert count == 12
 
 
@@ -380,7 +380,7 @@ def test_a_film_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str
         with open_film(target) as film:
             for frame, rows in zip(film.frames(), before, strict=True):
                 wanted, found = edit(rows).clip(0, 1), film.pixels(frame)
-                # Chroma has half the resolution in the file, so that only brightness can agree.
+                # Chroma has half the resolution in the file, so only brightness can agree.
                 assert np.abs(_grey(found) - _grey(wanted)).mean() < 3 / 255
                 assert np.abs(_grey(wanted) - _grey(rows)).mean() > np.abs(_grey(found) - _grey(wanted)).mean()
         assert facts(target)["sound"] == facts(source)["sound"]

@@ -1,4 +1,4 @@
-"""``nlfilter-torch fit`` and ``detail --preset``: an edit goes into a file, and from there onto another photograph."""
+"""``nlfilter-torch fit`` and ``detail --preset``: an edit is saved to a file and applied to another photograph."""
 
 import json
 from pathlib import Path
@@ -59,7 +59,7 @@ def test_an_edit_of_another_kind_is_explained_in_part(before: Path, capsys: pyte
     after = before.with_name("after.png")
     pixels = read_photograph(before).pixels
     brighter = pixels.clone()
-    brighter[..., :40, :] = brighter[..., :40, :] + 0.1  # a place is nothing that the filter knows of
+    brighter[..., :40, :] = brighter[..., :40, :] + 0.1  # the filter does not depend on position
     write_photograph(Photograph(brighter), after)
     assert fit(before, after, before.with_name("look.json"), "--bandwidth", 10) == 0
     explained = float(capsys.readouterr().out.split("explained: ")[1].split(" %")[0])

@@ -1,4 +1,4 @@
-"""Diffusion maps and masks: against the dense paper, and what every mask has to be."""
+"""Diffusion maps and masks: against the dense reference, and properties of every mask."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_distances_are_those_of_the_dense_map(spectrum, dense, time: float) -> N
             (found - found[:, pixel : pixel + 1]).square().sum(0),
             reference.diffusion_distance(expected, expected[pixel]),
             rtol=2e-3,
-            atol=2e-2,  # of distances up to several hundred
+            atol=2e-2,  # for distances up to several hundred
         )
 
 
@@ -105,7 +105,7 @@ def test_masks_keep_colours_apart() -> None:
     region = torch.zeros_like(guide)
     region[..., 2:5, 2:5] = 1
     mask = diffusion_mask(spectrum, region)
-    dark, light = mask[..., :20], mask[..., 28:]  # away from the patches that hold both
+    dark, light = mask[..., :20], mask[..., 28:]  # away from patches that contain both
     assert dark.min() > 0.95
     assert light.max() < 0.5
     parts = segment_mask(spectrum, torch.cat([region, region.flip(-1)], dim=1))
@@ -160,7 +160,7 @@ def test_gradients_are_finite_where_eigenvalues_meet(name: str) -> None:
         assert tensor.grad.abs().max() > 0
 
 
-# --- what the masks are for: a spot on the astronaut's suit
+# --- a mask from a spot on the astronaut's suit
 
 
 def astronaut(side: int) -> torch.Tensor:
@@ -303,7 +303,7 @@ def test_a_region_like_no_landmark_is_worth_a_warning() -> None:
     image, region = noise(1, 1, 32, 32), torch.zeros(1, 2, 32, 32)
     few = nonlocal_operator(image, photometric_bandwidth=0.03).spectrum()
     best = few.factor[0].square().sum(0).argmax()
-    region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel like none
+    region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel that resembles none
     with pytest.warns(UserWarning, match="region 1 is like no landmark, so its mask may take in"):
         mask = diffusion_mask(few, region)
     assert (mask > 0.5).double().mean((2, 3))[0, 0] < 0.01

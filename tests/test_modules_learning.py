@@ -1,4 +1,4 @@
-"""What of a layer learns, where it starts, what it may become, and sliders that come from elsewhere."""
+"""Learned parameters of the layers: their choice, initial values and ranges, and sliders passed to a call."""
 
 import math
 from collections.abc import Callable

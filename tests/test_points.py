@@ -1,4 +1,4 @@
-"""Operators of weighted points: against the pixels that the points stand for, and against guides."""
+"""Operators of weighted points, compared with those of the pixels that the points represent, and of guides."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ FLOATS = (torch.float32, torch.float64)
 
 
 def features_of(image: Tensor) -> Tensor:
-    """Features (1, 9, N) of an image, as an operator makes them."""
+    """Features (1, 9, N) of an image, as an operator computes them."""
     operator = nonlocal_operator(image, patch_size=3, photometric_bandwidth=0.2, num_landmarks=2)
     return operator.kernel.recipe(image)
 

@@ -1,4 +1,4 @@
-"""Presets that have a name: in Python, on the command line and in its list."""
+"""Named presets in Python, on the command line and in the output of ``presets``."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def test_command_and_function_agree(photo: Path, name: str) -> None:
 
 
 def test_each_does_what_it_says(photo: Path) -> None:
-    """Grain is looked at in the calmer half of the pixels, contrast in all."""
+    """Grain is measured in the flatter half of the pixels, contrast in all."""
     pixels = read_photograph(photo).pixels
     calm = grain(pixels) <= grain(pixels).median()
     edited = {name: preset.apply(pixels) for name, preset in PRESETS.items()}

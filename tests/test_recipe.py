@@ -1,4 +1,4 @@
-"""Whole edits: what they do to an image, their files, and the verb that applies them."""
+"""Recipes: applying them to an image, their files, and the command ``apply``."""
 
 import json
 from dataclasses import replace
@@ -106,7 +106,7 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
         return mask * inside + (1 - mask) * outside
 
     assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
-    # The same sliders on both sides are those of the whole.
+    # With the same sliders inside and outside, the edit is that of the whole picture.
     same = Recipe((plain.changed(inside=ALPHA),)).apply(pixels)
     whole = Step("detail", alpha=ALPHA, bandwidth=30.0, limits="none", threshold=0.0)
     assert torch.allclose(same, Recipe((whole,)).apply(pixels), atol=1e-5)
@@ -135,14 +135,14 @@ def test_colours(pixels: torch.Tensor) -> None:
 def test_blur_and_painting(pixels: torch.Tensor) -> None:
     blurred = defocus(pixels, mask_of([IN], SIZE), radius=0.04 * 48, generator=seeded())
     assert torch.equal(Recipe((DEFOCUS,)).apply(pixels), blurred)
-    for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines get no thinner than what a pixel can show
+    for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines have a minimum width in pixels
         step = ABSTRACT.changed(edge_width=line)
         wanted = abstract(pixels, power=0.2, edges=0.5, edge_width=width, tones=5, generator=seeded())
         assert torch.equal(Recipe((step,)).apply(pixels), wanted)
 
 
 def test_steps_follow_one_another(pixels: torch.Tensor) -> None:
-    """In their order, and as often as they are there."""
+    """Steps are applied in their order, also several of the same edit."""
     crisp = Step("detail", alpha=INSIDE)
     for steps in ((crisp, DEFOCUS), (DEFOCUS, crisp), (crisp, Step("tone", clarity=2.0), crisp)):
         wanted = pixels
@@ -174,7 +174,7 @@ def test_all_options_of_detail_are_in_files(pixels: torch.Tensor) -> None:
 def test_idle_steps_change_nothing(edit: str, pixels: torch.Tensor) -> None:
     assert not Step.idle(edit).changes()
     assert Recipe((Step.idle(edit),)).apply(pixels) is pixels
-    changed: dict[str, Any] = {"matrix": (0.5,) * 9} if edit == "look" else {}  # a look by default is no change
+    changed: dict[str, Any] = {"matrix": (0.5,) * 9} if edit == "look" else {}  # the default look changes nothing
     assert Step(edit, (BLUE, IN), **changed).changes()
 
 
@@ -192,7 +192,7 @@ def test_files_hold_the_whole_edit() -> None:
 
 
 def test_files_from_before_there_was_a_list_of_steps() -> None:
-    """In the order that was fixed, with the names and units of then, and with what changes nothing left out."""
+    """Old files have a fixed order of steps, old names and units, and omit steps that change nothing."""
     strokes = [BLUE.entries()]
     text = json.dumps(
         {
@@ -220,7 +220,7 @@ def test_presets_are_edits(tmp_path: Path) -> None:
     path = tmp_path / "look.json"
     path.write_text(crisp.to_json())
     assert find_recipe(str(path)) == Recipe((crisp.step,))
-    assert Preset.from_json(find_recipe("crisp").to_json(), "it") == crisp  # so that detail --preset takes it too
+    assert Preset.from_json(find_recipe("crisp").to_json(), "it") == crisp  # so that detail --preset accepts it too
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Files that are read and written by rows: every layout of TIFF, zarr, and everything that they hold."""
+"""Files read and written by rows: all layouts of TIFF, zarr, and their metadata."""
 
 from pathlib import Path
 from typing import Any

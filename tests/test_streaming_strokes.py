@@ -1,4 +1,4 @@
-"""Strokes on pictures that are read by rows: what they make of one in memory, whatever the tiles, and named errors."""
+"""Strokes on pictures read by rows: the result in memory, for any tiles, and errors that name their cause."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples and blocks in proportion to a small picture."""
+    """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 300)
     monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
@@ -165,7 +165,7 @@ def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch
     picture = cat(240, 60)
     painted = paint(240, 60)
     settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
-    source, *paints = (Rows(rows, most=10 + 2 * 40) for rows in (picture, *painted))  # with what masks and borders see
+    source, *paints = (Rows(rows, most=10 + 2 * 40) for rows in (picture, *painted))  # with surroundings
     edited = np.empty_like(picture)
     stream_recolor(source, edited, paints[0], paints[1], keep=paints[2], **settings)
     np.testing.assert_array_equal(edited, recoloured(picture, *painted[:2], keep=painted[2], **settings))
@@ -303,7 +303,7 @@ def test_a_source_that_changes_its_size_is_named() -> None:
 
 # --- the command line
 
-LITTLE = "0.014"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+LITTLE = "0.014"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
 
 
 @pytest.fixture

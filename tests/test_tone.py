@@ -1,4 +1,4 @@
-"""Tone, sharpening and the detail of regions: what they raise, and what they leave alone."""
+"""Tone, sharpening and the detail of regions: what they change, and what they leave unchanged."""
 
 from typing import Any
 

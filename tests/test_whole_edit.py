@@ -1,4 +1,4 @@
-"""Whole edits on pictures that are read by rows: what they make of one in memory, and named errors."""
+"""Recipes on pictures read by rows: the result in memory, and errors that name their cause."""
 
 import errno
 from dataclasses import replace
@@ -89,11 +89,11 @@ def test_strokes_cover_the_same_by_rows(rows: slice) -> None:
 def test_an_edit_by_rows_is_the_one_in_memory(recipe: Recipe, tmp_path: Path) -> None:
     image = cat(5)
     edited = by_rows(recipe, rows_of(image), tmp_path, tile_rows=17)
-    # What differs by 1e-5 before recolouring may choose other landmarks: it takes what the steps before gave by rows.
+    # Differences of 1e-5 before recolouring may change its landmarks, so its input is that of the steps by rows.
     before, last = recipe.steps[:-1], recipe.steps[-1:]
     given = from_rows(by_rows(Recipe(before), rows_of(image), tmp_path, tile_rows=17)) if before else image
     wanted = rows_of(Recipe(last).apply(given))
-    # In memory the balancing ends at 1e-5.
+    # In memory the balancing stops at 1e-5.
     assert np.abs(edited - wanted).max() < (1e-4 if RECOLOR in last else 2e-5)
     assert not list(tmp_path.iterdir())
 
@@ -141,7 +141,7 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     for name, options in zip(names, ([], ["--memory", "0.044", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
-    # The second step's k-means may turn another way by the rounding of the first.
+    # Rounding in the first step may change the k-means of the second.
     assert 0 < difference(whole, rows) < 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
 
