@@ -13,7 +13,7 @@ PLACES: dict[str, Box] = {"astronaut": (60, 300, 20, 20), "rocket": (300, 90, 40
 
 
 def figure_11(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Masks of a region (yellow) on the suit and in the sky; white is similar. Larger t selects more pixels."""
+    """Masks of a region (yellow) on the suit and in the sky; white is similar. Masks extend further with larger t."""
     panels, numbers = {}, {}
     for name, box in PLACES.items():
         image, scale = scene(name, size)

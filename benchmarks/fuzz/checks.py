@@ -117,7 +117,7 @@ def is_sentence(error: Exception) -> bool:
 
 
 def kernels(used: bool) -> AbstractContextManager[None]:
-    """Disable the C kernels unless they are used."""
+    """Disable the C kernels unless ``used``."""
     return nullcontext() if used else definitions_only()
 
 

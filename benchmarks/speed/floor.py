@@ -54,7 +54,7 @@ def floor_summary(timings: Mapping[str, Timing]) -> dict[str, Any]:
 
 
 def _ways(case: Case) -> dict[str, dict[str, Call]]:
-    """All ways to compute every part, on random numbers, in shared memory."""
+    """All ways to compute every part, on the same random tensors."""
     marks, pixels, batch = case.landmarks, case.pixels, case.batch
     numbers = torch.Generator(case.device).manual_seed(0)
 

@@ -36,13 +36,13 @@ class Plan:
         patches: patch sizes.
         crops: number and side of the crops in a batch, and m.
         dense_side: side of the image for the dense filter.
-        pictures: photographs of the series over pictures.
+        pictures: photographs that the main operator is timed on.
         seconds: for which a group of calls takes turns, if longer than ``least`` rounds.
         claimed_seconds: ``seconds`` of the main group, on which claims rest.
         least: minimum number of rounds.
         pair_seconds: for which two compared calls alternate, if longer than ``pairs`` pairs.
         pairs: minimum number of pairs.
-        pause: idle seconds before each call of the suite over pauses.
+        pause: idle seconds before each call in the suite ``pauses``.
         processes: number of processes that measure the time of an import.
         probes: number of cases whose memory is measured.
         threads: numbers of threads; if empty, one and all.

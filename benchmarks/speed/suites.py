@@ -37,7 +37,7 @@ def filter_calls(case: Case, *, backward: bool) -> dict[str, Call]:
 
 
 def backward_call(case: Case) -> Call:
-    """The backward pass of a filtered image to the image, its own guide, and alpha; excludes the forward pass."""
+    """Gradient of a filtered image with respect to alpha and the image, also its guide; excludes the forward pass."""
     image = case.image().requires_grad_()
     layer = NonlocalFilter(ALPHA, **case.options()).to(case.device)
     filtered = layer(image)
