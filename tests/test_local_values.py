@@ -65,7 +65,7 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
     generator = torch.Generator().manual_seed(1)
     image, values, weights = (torch.rand(1, c, 5, 6, generator=generator, dtype=torch.float64) for c in (1, 2, 1))
     places = torch.tensor([3, 7, 20, 29])
-    monkeypatch.setattr(local_values, "FIXED", 2.0)  # differences of what is fixed have no digits left
+    monkeypatch.setattr(local_values, "SCRIBBLE_WEIGHT", 2.0)  # differences of what is fixed have no digits left
 
     def found(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         return local(0.1 * image, places, weights, values)

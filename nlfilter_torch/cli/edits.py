@@ -98,7 +98,7 @@ def option(parameter: Parameter, panel: str | None = None) -> Any:
         limits = {"min": kind(parameter.low), "max": kind(parameter.high)}
     elif parameter.kind == "odd":
         limits = {"max": int(parameter.high)}
-    names = [parameter.name, *(name for name, factor in parameter.former if factor == 1)]
+    names = [parameter.name, *(name for name, factor in parameter.former_names if factor == 1)]
     decorated = typer.Option(
         *(f"--{name.replace('_', '-')}" for name in names),
         metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],

@@ -55,7 +55,7 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
-SHARE = 0.5  # weight of the local values on a stroke
+LOCAL_WEIGHT = 0.5  # weight of the local values on a stroke
 
 
 @full_precision
@@ -203,6 +203,6 @@ def fit_colorize(
     def coloured(some: Any) -> Tensor:
         grey, alike = luminance(some), far(some) + near(some)
         connected, influence = local(grey, some.first)
-        return merge_luminance(grey, alike + SHARE * (with_green(connected) - influence * alike))
+        return merge_luminance(grey, alike + LOCAL_WEIGHT * (with_green(connected) - influence * alike))
 
     return Fitted(coloured)

@@ -195,7 +195,7 @@ class Tiled:
         rows = np.concatenate([values for _, values in self.rows(fitted, plain=True)])
         return torch.from_numpy(rows).permute(2, 0, 1)[None]
 
-    def held(self, fitted: Fitted) -> Fitted:
+    def cached(self, fitted: Fitted) -> Fitted:
         """Compute the planes of an edit and keep them in memory, if small; else they are recomputed on every use."""
         if self.picture.pixels * self.channels * self.dtype.itemsize > HELD * self.passes.memory:
             return fitted
