@@ -12,8 +12,8 @@ from nlfilter_torch.edits import local_values
 from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.source import InMemory, luminance
 from nlfilter_torch.tiled import stream_colorize
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import box, colour
 from tests.problems import luminance as grey_of
@@ -76,7 +76,7 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
 
 @pytest.mark.parametrize("step", [1, 3, 7])
 def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 500)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 500)
     picture = np.random.default_rng(0).random((83, 61, 3), np.float32)
     tiled = Tiled(Picture(picture), Passes("float32"))
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]

@@ -209,8 +209,8 @@ def edit_photograph(
     from nlfilter_torch.edits.source import InMemory, Source
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.io.rows import StoredPicture, open_picture
+    from nlfilter_torch.tiled.pictures import Picture, Rows
     from nlfilter_torch.tiled.source import Tiled
-    from nlfilter_torch.tiled.sources import Picture, Rows
     from nlfilter_torch.tiled.workers import undivided
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:

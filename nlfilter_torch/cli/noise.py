@@ -13,7 +13,7 @@ from nlfilter_torch.cli.options import LEVELS
 from nlfilter_torch.edits.denoise import NEGLIGIBLE_NOISE
 from nlfilter_torch.edits.noise import Noise
 from nlfilter_torch.io.photographs import Photograph, write_photograph
-from nlfilter_torch.tiled.sources import WHITE, Rows, RowSource
+from nlfilter_torch.tiled.pictures import WHITE, Rows, RowSource
 
 VISIBLE = 0.5  # grey levels; the rounding error of eight bits
 LARGEST = 64  # grey levels; white in a map

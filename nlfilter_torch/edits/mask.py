@@ -18,11 +18,11 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import LIGHTNESS, colour_guide, nearby
-from nlfilter_torch.edits.components import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import enlarged
+from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border

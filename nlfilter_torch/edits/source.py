@@ -18,11 +18,11 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.pixels import Fitted as Fitted
 from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
 from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator

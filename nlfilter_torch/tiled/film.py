@@ -26,9 +26,9 @@ from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.operator import TiledOperator, first_plane
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture
 from nlfilter_torch.tiled.sampling import CHUNK, KeptColumns, Pilot
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import Block, Sums
 from nlfilter_torch.tiled.tiles import Passes
 
