@@ -30,8 +30,8 @@ from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])

@@ -20,7 +20,7 @@ from benchmarks.streaming_strokes import Boxes
 from nlfilter_torch import recolor
 from nlfilter_torch.edits.detail import enhance
 from nlfilter_torch.tiled import stream_detail, stream_recolor
-from nlfilter_torch.tiled.sources import stored_as
+from nlfilter_torch.tiled.pictures import stored_as
 
 Edit = Callable[[], NDArray[Any]]
 

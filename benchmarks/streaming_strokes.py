@@ -26,8 +26,8 @@ from nlfilter_torch.edits.colour import colour_guide, split_luminance
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_colorize, stream_recolor
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 
 VERBS: dict[str, Any] = {"recolor": fit_recolor, "colorize": fit_colorize}

@@ -30,7 +30,7 @@ LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to small pictures."""
     monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
 
 
 @pytest.fixture
@@ -243,7 +243,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "import signal, sys, time\n"
         # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from nlfilter_torch.tiled import sources as rows, tiles\n"
+        "from nlfilter_torch.tiled import pictures, tiles\n"
         "from nlfilter_torch.tiled.source import Tiled\n"
         "def slow(original):\n"
         "    def edit(*arguments):\n"
@@ -251,7 +251,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "        return original(*arguments)\n"
         "    return edit\n"
         "Tiled.edited, tiles.TILE_PIXELS = slow(Tiled.edited), 300\n"
-        "tiles.sampling.PILOT = rows.STATISTICS_PIXELS = 8000\n"
+        "tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000\n"
         "from nlfilter_torch.cli import main\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )

@@ -18,9 +18,9 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture
 from nlfilter_torch.tiled.sampling import Draws, KeptColumns, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes
 
@@ -80,7 +80,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 1500)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -244,7 +244,7 @@ def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
 
 
 def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
     options = PLAIN | {"num_landmarks": 30}

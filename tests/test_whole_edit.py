@@ -19,8 +19,8 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled import recipe as whole_edit
 from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import cat, difference
 from tests.test_streaming import cat as photograph
@@ -133,7 +133,7 @@ def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
 
 def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 4000)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
     photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
     write_photograph(Photograph(cat().repeat(1, 1, 2, 2), "uint16"), photo)  # more than tiles need
     preset.write_text(Recipe((DETAIL, RECOLOR)).to_json())

@@ -26,7 +26,7 @@ def figure_20(size: int = SIZE) -> tuple[Figure, Numbers]:
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (method, options) in zip(axes, tables.METHODS.items(), strict=True):
         for colour, name in zip(colours, PICTURES, strict=False):
-            missed = [held.relative_rmse for held in tables.figure_20(name, size, options)]
+            missed = [captured.relative_rmse for captured in tables.figure_20(name, size, options)]
             axis.plot(tables.COUNTS, missed, marker="o", markersize=4, color=colour, label=name)
             numbers.setdefault(method, {})[name] = dict(
                 zip((f"m = {count}" for count in tables.COUNTS), (rounded(value, 2) for value in missed), strict=True)
@@ -52,9 +52,9 @@ def table_1(size: int = SIZE) -> tuple[Figure, Numbers]:
             image = tables.picture(name, size)
             auto = float(estimate_bandwidth(image))
             widths = [level * OWN_UNIT / 255 for level in LEVELS] + [auto]
-            held = [tables.measure(image, width, tables.LANDMARKS, options) for width in widths]
+            measured = [tables.measure(image, width, tables.LANDMARKS, options) for width in widths]
             gradient = f"{255 * auto / 2.5:.1f}"
-            cells = ["–" if one.broke else f"{100 * one.beta:.2f}" for one in held]
+            cells = ["–" if one.failed else f"{100 * one.beta:.2f}" for one in measured]
             kind = "paper's method" if method == PAPER else "defaults"
             labels.append(f"{name}, {kind}")
             rows.append([gradient, f"{255 * auto:.0f}", *cells])

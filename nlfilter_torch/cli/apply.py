@@ -40,8 +40,8 @@ def apply(
     from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.tiled.pictures import Rows
     from nlfilter_torch.tiled.recipe import edit_rows
-    from nlfilter_torch.tiled.sources import Rows
 
     def work(photograph: Photograph) -> Tensor:
         return recipe.apply(photograph.pixels)

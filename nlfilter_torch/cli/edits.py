@@ -98,7 +98,7 @@ def option(parameter: Parameter, panel: str | None = None) -> Any:
         limits = {"min": kind(parameter.low), "max": kind(parameter.high)}
     elif parameter.kind == "odd":
         limits = {"max": int(parameter.high)}
-    names = [parameter.name, *(name for name, factor in parameter.former if factor == 1)]
+    names = [parameter.name, *(name for name, factor in parameter.former_names if factor == 1)]
     decorated = typer.Option(
         *(f"--{name.replace('_', '-')}" for name in names),
         metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
@@ -209,8 +209,8 @@ def edit_photograph(
     from nlfilter_torch.edits.source import InMemory, Source
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.io.rows import StoredPicture, open_picture
+    from nlfilter_torch.tiled.pictures import Picture, Rows
     from nlfilter_torch.tiled.source import Tiled
-    from nlfilter_torch.tiled.sources import Picture, Rows
     from nlfilter_torch.tiled.workers import undivided
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:

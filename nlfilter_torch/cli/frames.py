@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.tiled.film import FilmEdit
 
 #: Edits without scribbles.
-UNPAINTED = tuple(edit for edit in EDITS.values() if not edit.needs)
+UNPAINTED = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
 OWN = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
 PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
 

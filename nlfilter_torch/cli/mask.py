@@ -11,7 +11,7 @@ from nlfilter_torch.cli.edits import signature
 from nlfilter_torch.edits.parameters import MASK
 
 if TYPE_CHECKING:
-    from nlfilter_torch.tiled.sources import Rows
+    from nlfilter_torch.tiled.pictures import Rows
 
 GIVE = "give --region X,Y,W,H or --mask FILE: some of what is to be selected, such as --region 190,60,60,60"
 
@@ -40,9 +40,9 @@ def mask(
     from nlfilter_torch.io.pfm import PFM, write_pfm
     from nlfilter_torch.io.photographs import Photograph, check_file, check_output, write_photograph
     from nlfilter_torch.io.rows import check_place, open_picture, write_picture
+    from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.scribbles import RegionRows
     from nlfilter_torch.tiled.source import Tiled
-    from nlfilter_torch.tiled.sources import Picture
     from nlfilter_torch.tiled.workers import undivided
 
     if mask is None and not region:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.cli.options import LEVELS
-from nlfilter_torch.edits.denoise import QUIET
+from nlfilter_torch.edits.denoise import NEGLIGIBLE_NOISE
 from nlfilter_torch.edits.noise import Noise
 from nlfilter_torch.io.photographs import Photograph, write_photograph
-from nlfilter_torch.tiled.sources import WHITE, Rows, RowSource
+from nlfilter_torch.tiled.pictures import WHITE, Rows, RowSource
 
 VISIBLE = 0.5  # grey levels; the rounding error of eight bits
 LARGEST = 64  # grey levels; white in a map
@@ -53,8 +53,10 @@ class NoiseReport:
         """Print the report."""
         level, change = LEVELS * self._level, LEVELS * (self._squares / max(self._count, 1)) ** 0.5
         found = f"denoise: noise of {level:.2f} grey levels {'given' if self._given else 'found'}{self._ends}"
-        if self._level < QUIET:
-            typer.echo(f"{found}, less than {LEVELS * QUIET:.1f}: nothing to do, all pixels are as they were")
+        if self._level < NEGLIGIBLE_NOISE:
+            typer.echo(
+                f"{found}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}: nothing to do, all pixels are as they were"
+            )
             return
         weak = "" if change >= VISIBLE else ", which is hardly visible"
         remedy = "" if self._given or not weak else "; --strength 2 takes more away"

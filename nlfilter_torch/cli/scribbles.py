@@ -16,7 +16,7 @@ from torch import Tensor
 from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.rows import StoredPicture
-from nlfilter_torch.tiled.sources import Picture, transparency
+from nlfilter_torch.tiled.pictures import Picture, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
 Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask

@@ -72,7 +72,7 @@ DETAIL = Edit(
             ("luminance", "all"),
             "Edit brightness and keep the colours, or edit red, green and blue alike, colours too.",
         ),
-        replace(REACH, former=(("time", reach_of_time), ("spread", reach_of_time)), slider=REACH_SLIDER),
+        replace(REACH, former_names=(("time", reach_of_time), ("spread", reach_of_time)), slider=REACH_SLIDER),
         replace(TOLERANCE, argument="mask_bandwidth"),
         Parameter(
             "threshold",
@@ -84,7 +84,7 @@ DETAIL = Edit(
             255,
             "levels",
             domain="not negative",
-            zero="0 strengthens all detail alike",
+            zero_meaning="0 strengthens all detail alike",
         ),
         LIMITS,
         VIEWING_SIZE,
@@ -117,7 +117,7 @@ SHARPEN = Edit(
             1e4,
             "px",
             domain="not negative",
-            zero="0 leaves the guide as it is",
+            zero_meaning="0 leaves the guide as it is",
             slider=Slider("Grain overlooked", 0, 4, 0.1, live=False),
         ),
         LIMITS,
@@ -174,7 +174,7 @@ DENOISE = Edit(
             0,
             4,
             domain="not negative",
-            zero="0 changes nothing",
+            zero_meaning="0 changes nothing",
             idle=0.0,
             slider=Slider("Strength", 0, 2, 0.05, live=False),
         ),
@@ -187,7 +187,7 @@ DENOISE = Edit(
             255,
             "levels",
             domain="not negative",
-            zero="0 changes nothing",
+            zero_meaning="0 changes nothing",
             optional=True,
         ),
         choice(
@@ -223,12 +223,12 @@ RECOLOR = Edit(
             metavar="0...1",
             slider=Slider("Reach", 0, 0.95, 0.05),
         ),
-        replace(TOLERANCE, former=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
+        replace(TOLERANCE, former_names=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
         *filter_parameters(share=1.2, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint a little of it on a thing; its likes take it.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
-    needs=True,
+    requires_strokes=True,
 )
 
 COLORIZE = Edit(
@@ -263,7 +263,7 @@ COLORIZE = Edit(
     ),
     hint="For grey photographs: paint some colours, and they spread over what looks alike nearby.",
     brushes=(("colour", "Paint"),),
-    needs=True,
+    requires_strokes=True,
     coloured=True,
 )
 
@@ -292,12 +292,12 @@ DEFOCUS = Edit(
             ("disc", "gaussian"),
             "Turn dots into discs, as a lens does, or into soft spots.",
         ),
-        replace(TOLERANCE, former=(("bandwidth", 100 / 255),)),
+        replace(TOLERANCE, former_names=(("bandwidth", 100 / 255),)),
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
     hint="Paint some of what is to stay sharp; the rest of it is found, and what is around is blurred.",
     brushes=(("in", "Keep sharp"),),
-    needs=True,
+    requires_strokes=True,
 )
 
 MASK = Edit(
@@ -336,7 +336,7 @@ ABSTRACT = Edit(
             0,
             10,
             domain="not negative",
-            zero="0 leaves the image as it is",
+            zero_meaning="0 leaves the image as it is",
             idle=0.0,
             metavar="K",
             slider=Slider("Flatten", 0, 1, 0.01),
@@ -362,8 +362,8 @@ ABSTRACT = Edit(
             2,
             "%",
             domain="positive",
-            least=0.3,  # thinnest line that pixels can show
-            former=(("width", 0.1),),
+            min_pixels=0.3,  # thinnest line that pixels can show
+            former_names=(("width", 0.1),),
             slider=Slider("Width of lines", 0.05, 0.6, 0.01),
         ),
         Parameter(

@@ -132,14 +132,14 @@ class Recipe:
         """
         entries = parse_json(text, name, remedy)
         if isinstance(entries, dict) and "alpha" in entries:
-            return Recipe((Step.from_entries("detail", entries, name, bare=True, before=True),))
+            return Recipe((Step.from_entries("detail", entries, name, whole_file=True, former_format=True),))
         if isinstance(entries, dict) and "steps" in entries:
             return Recipe(tuple(_read_steps(entries, name)))
         if not isinstance(entries, dict) or not set(entries) <= set(FORMER_ORDER):
             raise ValueError(f"{name} is no preset: it must hold a list of steps; {remedy}")
         former = [edit for edit in FORMER_ORDER if edit in entries]
         return Recipe(
-            tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", before=True) for edit in former)
+            tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", former_format=True) for edit in former)
         )
 
 

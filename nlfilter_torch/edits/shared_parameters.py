@@ -120,7 +120,7 @@ VIEWING_SIZE = Parameter(
     0,
     1e6,
     domain="not negative",
-    zero="0 is the size of the image",
+    zero_meaning="0 is the size of the image",
     metavar="MEGAPIXELS",
 )
 #: For all edits that select objects.

@@ -26,7 +26,7 @@ from nlfilter_torch.io import cameras, tiff
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io.by_pillow import read_by_pillow
 from nlfilter_torch.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
-from nlfilter_torch.tiled.sources import Picture, stored_as
+from nlfilter_torch.tiled.pictures import Picture, stored_as
 
 if sys.platform != "win32":
     import fcntl

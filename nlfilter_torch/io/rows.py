@@ -32,7 +32,7 @@ from nlfilter_torch.io.photographs import (
     read_channels,
 )
 from nlfilter_torch.io.tiff import TiffRows
-from nlfilter_torch.tiled.sources import Rows, RowSource
+from nlfilter_torch.tiled.pictures import Rows, RowSource
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array

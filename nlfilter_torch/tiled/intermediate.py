@@ -7,7 +7,7 @@ from tempfile import TemporaryFile
 
 import numpy as np
 
-from nlfilter_torch.tiled.sources import Rows, RowSource
+from nlfilter_torch.tiled.pictures import Rows, RowSource
 
 
 @contextmanager

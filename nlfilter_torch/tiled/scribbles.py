@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.edits.components import Scribbles
-from nlfilter_torch.tiled.sources import Picture, RowSource, transparency
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
+from nlfilter_torch.tiled.pictures import Picture, RowSource, transparency
 
 Rows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.pictures import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.tiled.sampling import Report
-from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
