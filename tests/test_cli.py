@@ -180,7 +180,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     ("options", "sentence"),
     [
         (["--alpha", "3"], "--alpha must have at least two numbers, such as 3,3,4,1.05, got '3'"),
-        (["--alpha", "3,x"], "--alpha must be numbers with commas between, such as 3,3,4,1.05, got '3,x'"),
+        (["--alpha", "3,x"], "--alpha must be numbers separated by commas, such as 3,3,4,1.05, got '3,x'"),
         (["--alpha", "3,nan"], "--alpha must be finite numbers, such as 3,3,4,1.05, got '3,nan'"),
         (["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels, such as 20, or auto, got '0'"),
         (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),

@@ -328,7 +328,7 @@ def test_films_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "holds no film stream that can be decoded" in refused(capsys, tmp_path / "sound.mp4", out)
     assert "must have an even width and height to be stored as yuv420p, got 63x49" in refused(capsys, odd, out)
     assert "must end in .mp4 or .mov, as films do, got '.avi'" in refused(capsys, film, tmp_path / "out.avi")
-    assert "must be a film that ends in .mp4 or .mov, or a folder" in refused(capsys, Path(__file__), out)
+    assert "must be a film (.mp4 or .mov) or a folder" in refused(capsys, Path(__file__), out)
     assert not out.exists()
     assert not list(tmp_path.glob(".*.part"))
 
@@ -393,17 +393,17 @@ def _grey(rows: np.ndarray) -> np.ndarray:
 def test_options_of_other_edits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film, out = tmp_path / "film.mp4", tmp_path / "out.mp4"
     (tmp_path / "tone.json").write_text('{"version": 1, "steps": [{"edit": "tone"}]}')
-    assert "--contrast must come with --edit tone, got it with detail" in refused(capsys, film, out, "--contrast", 2)
-    assert "--alpha must come with --edit detail or look, got it with tone" in refused(
+    assert "--contrast must be used with --edit tone, got --edit detail" in refused(capsys, film, out, "--contrast", 2)
+    assert "--alpha must be used with --edit detail or look, got --edit tone" in refused(
         capsys, film, out, "--edit", "tone", "--alpha", "2,1"
     )
     assert "--edit must be one of denoise, detail, tone, sharpen, abstract, look, got 'recolor'" in refused(
         capsys, film, out, "--edit", "recolor"
     )
-    assert "--edit must be left out where there is a preset, got tone with crisp" in refused(
+    assert "--edit must not be given together with --preset, got tone and crisp" in refused(
         capsys, film, out, "--edit", "tone", "--preset", "crisp"
     )
-    assert "--landmarks must be left out where --preset holds another edit than detail" in refused(
+    assert "--landmarks must not be given with a --preset of edits other than detail" in refused(
         capsys, film, out, "--preset", tmp_path / "tone.json", "--landmarks", 9
     )
     painted = Recipe((Step("defocus", (Stroke(((0.5, 0.5),), 0.1, "in"),)),))

@@ -102,7 +102,7 @@ def test_preset_keeps_every_entry() -> None:
         ("alpha = 1", "look.json is no preset: it is not JSON"),
         ("[1, 2]", "look.json is no preset: it must hold a list of steps"),
         ('{"bandwidth": 3}', "look.json is no preset: it must hold a list of steps"),
-        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must be a file with one step, of detail and without"),
+        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step without"),
         ('{"alpha": [1]}', "alpha in look.json must be a list of 2 to 100 numbers, none beyond 1000000, got [1]"),
         ('{"alpha": [1, NaN]}', "alpha in look.json must be a list of 2 to 100 numbers"),
         ('{"alpha": [1, 1], "bandwidth": 0}', "bandwidth in look.json must be a positive number of grey levels"),
