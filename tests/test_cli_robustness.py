@@ -86,8 +86,8 @@ def test_numbers_without_sense(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("[" * 100_000, "is no preset: it is nested too deeply"),
-        ('{"alpha": ' * 100_000, "is no preset: it is nested too deeply"),
+        ("[" * 100_000, "is not a preset: it is nested too deeply"),
+        ('{"alpha": ' * 100_000, "is not a preset: it is nested too deeply"),
         ('{"alpha": ' + "[" * 900 + "]" * 900 + "}", "must be a list of 2 to 100 numbers"),
         (f'{{"alpha": [1, {LONG}]}}', "must be a list of 2 to 100 numbers"),
         (f'{{"alpha": [1, 1], "bandwidth": {LONG}}}', "must be a positive number of grey levels, from 0.01 to"),

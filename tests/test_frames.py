@@ -160,7 +160,7 @@ def test_frames_are_read_one_at_a_time() -> None:
     ("arguments", "sentence"),
     [
         ({"references": []}, "references must hold at least one frame, got none"),
-        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must be a single frame where"),
+        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must hold a single frame if"),
         (
             {"references": [*pan(1, 1, 20, 20), *pan(1, 1, 20, 21)]},
             "references must have the height and width of the first",

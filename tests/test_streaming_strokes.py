@@ -285,7 +285,7 @@ def test_what_only_one_of_them_takes_is_named() -> None:
         stream_recolor(picture, grey(picture), strokes, mask)
     with pytest.raises(ValueError, match=r"strength must be in \[0, 1\]"):
         coloured(picture, strokes, mask, strength=2.0)
-    with pytest.raises(ValueError, match="method must be regression where a picture is worked out by rows, got kmeans"):
+    with pytest.raises(ValueError, match="method must be regression for a picture processed in tiles, got kmeans"):
         coloured(picture, strokes, mask, method="kmeans")
     with pytest.raises(ValueError, match="target must have the height and width of the source, three colours"):
         stream_colorize(picture, grey(picture), strokes, mask)

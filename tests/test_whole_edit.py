@@ -168,7 +168,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
 def test_negative_regions_come_with_regions_of_their_number() -> None:
     source = rows_of(cat())
     edited, two, three = np.empty_like(source), np.ones((100, 150, 2), np.float32), np.ones((100, 150, 3), np.float32)
-    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+    with pytest.raises(ValueError, match="negative must be given together with regions, got no regions"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), negative=two)
     with pytest.raises(ValueError, match="negative must have 1 channel or one for each of the 2 regions, got 3"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=three)
