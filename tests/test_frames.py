@@ -176,7 +176,7 @@ def test_bad_references(arguments: dict, sentence: str) -> None:
 def test_bad_fits_and_frames() -> None:
     image = noise(1, 1, 12, 13)
     operator = build(image, num_landmarks=20)
-    with pytest.raises(ValueError, match=r"image must be one image, as the operator's must, got 2 and 1"):
+    with pytest.raises(ValueError, match=r"image and operator must have batch size 1, got 2 and 1"):
         fit_filter(operator, image.expand(2, -1, -1, -1))
     with pytest.raises(ValueError, match="order must be at least 1, got 0"):
         fit_filter(operator, image, order=0)

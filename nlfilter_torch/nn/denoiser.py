@@ -116,7 +116,7 @@ class NonlocalDenoiser(nn.Module):
     def removed(self, image: Tensor, noise: Tensor, turns: int) -> Tensor:
         """What is subtracted from an image (B, C, H, W), of noise (B, 1 or C, H, W), in the dtype of the weights."""
         if turns not in (1, 2, 4):
-            raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is quickest")
+            raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
         quarters = range(0, 4, 4 // turns)
 
         def mean(tile: Tensor, levels: Tensor) -> Tensor:
@@ -183,7 +183,7 @@ def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tens
         check_same_size(noise, (image.shape[-2], image.shape[-1]), name, "image")
         if noise.shape[1] not in (1, image.shape[1]):
             raise ValueError(
-                f"{name} must have 1 channel or those of the image, {image.shape[1]}, got {noise.shape[1]}; select one"
+                f"{name} must have 1 channel or as many as the image, {image.shape[1]}, got {noise.shape[1]}; select 1"
             )
         check_values(noise.flatten(), name, "not negative", noise.numel())
         return noise.to(image).expand(image.shape[0], -1, -1, -1)
