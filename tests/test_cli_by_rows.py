@@ -112,7 +112,7 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     zarr.create_array(store=tmp_path / "deep.zarr", data=np.zeros((5, 5), np.uint32))
     for depth in ((), ("--depth", "8")):
         assert detail(tmp_path / "deep.zarr", tmp_path / "new.zarr", *depth) == 2
-        assert "deep.zarr stores its channels as uint32, which is not handled" in capsys.readouterr().err
+        assert "deep.zarr stores its channels as uint32, which is not supported" in capsys.readouterr().err
 
 
 def test_zarr_is_needed_for_zarr(

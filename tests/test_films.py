@@ -337,7 +337,7 @@ def test_transparency_is_refused(tmp_path: Path) -> None:
     path = write(
         tmp_path / "film.mov", codec="prores_ks", pix_fmt="yuva444p10le", sound=None, options={"profile": "4444"}
     )
-    with pytest.raises(ValueError, match="has transparency or a palette, which are not handled"), open_film(path):
+    with pytest.raises(ValueError, match="has transparency or a palette, which are not supported"), open_film(path):
         pass
 
 

@@ -111,7 +111,7 @@ class Film:
             ) from error
         for frame in frames:
             if frame.interlaced_frame:
-                raise ValueError(f"{self.path} is interlaced, which is not handled; deinterlace it first")
+                raise ValueError(f"{self.path} is interlaced, which is not supported; deinterlace it first")
             if (frame.width, frame.height) != (self.stream.codec_context.width, self.stream.codec_context.height):
                 raise ValueError(
                     f"{self.path} changes its frame size after frame {number}; split it into films of one size"
@@ -190,7 +190,7 @@ def open_film(path: Path) -> Iterator[Film]:
         stream = streams[0]
         stream.thread_type = "AUTO"
         if stream.codec_context.format.has_palette or _has_alpha(stream.codec_context.pix_fmt):
-            raise ValueError(f"{path} has transparency or a palette, which are not handled; convert it to yuv420p")
+            raise ValueError(f"{path} has transparency or a palette, which are not supported; convert it to yuv420p")
         yield Film(path, container, stream)
 
 

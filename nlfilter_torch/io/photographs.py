@@ -124,7 +124,7 @@ def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
     """Return the depth of a file whose channels have that dtype; raises ValueError if it is not supported."""
     if dtype.name not in BITS:
         raise ValueError(
-            f"{path} stores its channels as {dtype.name}, which is not handled; convert it to 8 or 16 bits or floats"
+            f"{path} stores its channels as {dtype.name}, which is not supported; convert it to 8 or 16 bits or floats"
         )
     return dtype.name
 
