@@ -182,11 +182,13 @@ class Setup:
 def setup(description: str, arguments: list[str] | None) -> Setup:
     """Read the options of the command line."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
+    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
     parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
-    parser.add_argument("--first-seed", type=int, help="of composites and scribbles; without it, that of the set")
-    parser.add_argument("--composites", type=int, default=COMPOSITES, help="how many")
-    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to see that it runs")
+    parser.add_argument(
+        "--first-seed", type=int, help="first seed of composites and scribbles; default: that of the set"
+    )
+    parser.add_argument("--composites", type=int, default=COMPOSITES, help="number of composites")
+    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to check that it runs")
     options = parser.parse_args(arguments)
     count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
     first = FIRST_SEED[options.set] if options.first_seed is None else options.first_seed

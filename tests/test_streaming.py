@@ -264,9 +264,11 @@ def test_memory_gives_the_size_of_tiles() -> None:
     assert 200 * 85 * 4 * rows[0] < 5 * 10**7 < 200 * 85 * 4 * 4 * rows[0]
     assert rows[0] < rows[1] == rows[2]  # longer tiles are no faster
     assert rows_within(13 * 10**7, masked=True) < rows[1]
-    with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least, but 10 MB may be used; allow more"):
+    with pytest.raises(
+        MemoryError, match=r"source needs at least \d+ MB of memory, but only 10 MB may be used; allow more"
+    ):
         rows_within(10**7)
-    with pytest.raises(MemoryError, match="source needs 7 MB of memory at least, but 0 MB may be used"):
+    with pytest.raises(MemoryError, match="source needs at least 7 MB of memory, but only 0 MB may be used"):
         streamed(cat(60, 80), memory=1000)
 
 

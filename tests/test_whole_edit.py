@@ -112,7 +112,7 @@ def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pyt
     few = by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)  # and so two tiles or more
     assert np.abs(few - by_rows(recipe, rows_of(image), tmp_path)).max() < 1e-5
     monkeypatch.setattr("nlfilter_torch.tiled.source.FINISHED", 20_000)
-    with pytest.raises(MemoryError, match=r"scan.tif needs \d+ MB of memory at least, but 60 MB may be used"):
+    with pytest.raises(MemoryError, match=r"scan.tif needs at least \d+ MB of memory, but only 60 MB may be used"):
         by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)
 
 
@@ -159,7 +159,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("nlfilter_torch.tiled.intermediate.TemporaryFile", lambda **_: Full())
-    sentence = "No space left on device, where one step of the edit leaves 0.0 GB to the next"
+    sentence = "No space left on device, for a temporary file of 0.0 GB between two steps of the edit"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)
     assert raised.value.filename == str(tmp_path)
@@ -168,7 +168,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
 def test_negative_regions_come_with_regions_of_their_number() -> None:
     source = rows_of(cat())
     edited, two, three = np.empty_like(source), np.ones((100, 150, 2), np.float32), np.ones((100, 150, 3), np.float32)
-    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+    with pytest.raises(ValueError, match="negative must be given together with regions, got no regions"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), negative=two)
     with pytest.raises(ValueError, match="negative must have 1 channel or one for each of the 2 regions, got 3"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=three)

@@ -18,9 +18,9 @@ QUICK = 72  # longer side of a photograph, in pixels
 def main(arguments: list[str] | None = None) -> None:
     """Draw the figures, and print and save their captions and numbers."""
     parser = argparse.ArgumentParser(description="Counterparts of the paper's figures.")
-    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, with commas between")
-    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="the folder for them")
-    parser.add_argument("--quick", action="store_true", help=f"photographs of {QUICK} pixels, to see that it runs")
+    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, separated by commas")
+    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="folder for the figures")
+    parser.add_argument("--quick", action="store_true", help=f"photographs of {QUICK} pixels, to check that it runs")
     options = parser.parse_args(arguments)
     chosen = options.only.split(",") if options.only else list(FIGURES)
     unknown = [name for name in chosen if name not in FIGURES]

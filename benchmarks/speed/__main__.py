@@ -35,7 +35,7 @@ def run(plan: Plan, names: Sequence[str], minutes: float) -> dict[str, Any]:
         taken[name] = time.perf_counter() - begun
         if not is_time_left(start, minutes):
             cut.append(name)
-            print(f"{name}: {minutes:g} minutes were over during or before it", flush=True)
+            print(f"{name}: stopped or skipped after {minutes:g} minutes", flush=True)
     return {
         "quick": plan == QUICK,
         "machine": machine,
@@ -84,11 +84,13 @@ def show(result: Record) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that everything runs, not how fast")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that everything runs")
     parser.add_argument("--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"some of {', '.join(SUITES)}")
     parser.add_argument("--out", type=Path, default=Path("out/speed.json"), help="JSON file (default: %(default)s)")
-    parser.add_argument("--device", default="cpu", help="of torch (default: %(default)s)")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="start no case later (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="torch device (default: %(default)s)")
+    parser.add_argument(
+        "--minutes", type=float, default=MINUTES, help="start no case later than this (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     plan = QUICK if options.quick else Plan(device=options.device)
     results = run(plan, options.only or list(SUITES), options.minutes)

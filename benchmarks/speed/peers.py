@@ -126,5 +126,5 @@ def prepare_all(peers: tuple[Peer, ...], case: Case) -> tuple[dict[str, Call], d
             calls[peer.name] = peer.prepare(case)
         except ImportError as error:
             remedy = f"pip install '{PACKAGE}[{peer.extra}]'" if peer.extra else f"pip install {PACKAGE}"
-            missing[peer.name] = f"{peer.name} is left out, {error.name or error} is not installed: {remedy}"
+            missing[peer.name] = f"{peer.name} is skipped: {error.name or error} is not installed; {remedy}"
     return calls, missing
