@@ -229,7 +229,7 @@ def curve(losses: Sequence[float]) -> Figure:
 def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read and check the arguments."""
     parser = argparse.ArgumentParser(description="Train the denoiser.")
-    parser.add_argument("--steps", type=int, default=11500, help=f"of {BATCH} crops each; default %(default)s")
+    parser.add_argument("--steps", type=int, default=26000, help=f"of {BATCH} crops each; default %(default)s")
     parser.add_argument("--side", type=int, default=SIDE, help="of crops, in pixels; default %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of weights, crops and noise; default %(default)s")
     parser.add_argument("--rate", type=float, default=RATE, help="of Muon, for convolutions; default %(default)s")
