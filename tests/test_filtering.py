@@ -291,7 +291,7 @@ def test_coefficients_of_another_image_are_refused() -> None:
     spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=10).spectrum()
     held = spectrum.coefficients(image.expand(1, 3, -1, -1))
     with pytest.raises(
-        ValueError, match=r"coefficients must have shape \(1, 1, 10\), got \(1, 3, 10\); take spectrum.coe"
+        ValueError, match=r"coefficients must have shape \(1, 1, 10\), got \(1, 3, 10\); use spectrum.coe"
     ):
         spectral_filter(spectrum, image, torch.sqrt, coefficients=held)
     with pytest.raises(TypeError, match=r"coefficients must be a torch\.Tensor, got list; use"):

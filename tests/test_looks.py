@@ -146,7 +146,7 @@ def test_the_layer_learns_what_it_is_told_to() -> None:
         optimizer.step()
     assert float(loss.detach()) < first / 20
     assert torch.equal(layer.matrix, torch.eye(3))
-    with pytest.raises(ValueError, match="learn must name"):
+    with pytest.raises(ValueError, match="learn must hold only names from"):
         Look(learn=("colour",))
 
 

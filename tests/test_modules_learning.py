@@ -119,11 +119,19 @@ def test_held_layers_take_sliders_of_a_call() -> None:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: NonlocalFilter(learn=("alpha", "gamma")), ValueError, r"learn must name 'alpha', .*, got 'gamma'"),
+        (
+            lambda: NonlocalFilter(learn=("alpha", "gamma")),
+            ValueError,
+            r"learn must hold only names from 'alpha', .*, got 'gamma'",
+        ),
         (lambda: NonlocalFilter(learn="bandwidth"), ValueError, "got 'bandwidth'"),
-        (lambda: NonlocalAffinity(learn=("alpha",)), ValueError, "learn must name 'photometric_bandwidth'"),
-        (lambda: PolynomialSliders(learn=("time",)), ValueError, "learn must name 'alpha', 'residual'"),
-        (lambda: DiffusionMask(learn=("alpha",)), ValueError, "learn must name 'time', 'width'"),
+        (
+            lambda: NonlocalAffinity(learn=("alpha",)),
+            ValueError,
+            "learn must hold only names from 'photometric_bandwidth'",
+        ),
+        (lambda: PolynomialSliders(learn=("time",)), ValueError, "learn must hold only names from 'alpha', 'residual'"),
+        (lambda: DiffusionMask(learn=("alpha",)), ValueError, "learn must hold only names from 'time', 'width'"),
         (lambda: NonlocalFilter(photometric_bandwidth=0.0), ValueError, "photometric_bandwidth must be positive"),
         (
             lambda: NonlocalFilter(photometric_bandwidth=-1.0, learn="photometric_bandwidth"),

@@ -206,7 +206,7 @@ def test_an_operator_of_features_has_no_guide() -> None:
         ({"size": 12}, TypeError, r"size must be integers \(H, W\) or \(N,\), got 12; pass \(12,\)"),
         ({"size": (3, 2, 2)}, TypeError, r"size must be integers \(H, W\) or \(N,\), got \(3, 2, 2\)"),
         ({"size": (3, 5)}, ValueError, r"size must have one pixel for each of the 12 points, got 3x5"),
-        ({"size": (-3, -4)}, ValueError, r"size must have as many pixels"),
+        ({"size": (-3, -4)}, ValueError, r"size must have one pixel for each"),
         ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
         ({"weights": torch.zeros(12)}, ValueError, r"weights must be from 1e-06 to 1e\+06, got 0 to 0"),
         ({"weights": torch.full((12,), 1e7)}, ValueError, r"weights must be from 1e-06 to 1e\+06"),

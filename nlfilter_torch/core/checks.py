@@ -61,7 +61,9 @@ def check_image(
 ) -> None:
     """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with pixels; B may be 0 if ``empty``."""
     check_tensor(image, name, "convert it with torch.as_tensor")
-    check_dtype(image, name, "convert integer pixels and divide by white, such as 255", values=" with values in [0, 1]")
+    check_dtype(
+        image, name, "divide integer pixels by the value of white, such as 255", values=" with values in [0, 1]"
+    )
     if image.ndim != 4:
         raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
     if 0 in image.shape[empty:]:
