@@ -21,7 +21,7 @@ from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.films import display_matrix, open_film, write_film
-from nlfilter_torch.tiled.film import FAR, FilmEdit
+from nlfilter_torch.tiled.film import UNLIMITED_BANDWIDTH, FilmEdit
 from nlfilter_torch.tiled.tiles import Passes
 
 PASSES = Passes("float32")
@@ -34,8 +34,8 @@ STEPS = [
     Step("detail", spatial_bandwidth=20.0, viewing_size=0.002, **FEW),
     Step("tone", contrast=1.3, clarity=2.0, spatial_bandwidth="none", **FEW),
     Step("sharpen", bandwidth="auto", **FEW),
-    Step("denoise", spatial_bandwidth=FAR, **FEW),
-    Step("abstract", edges=0.5, tones=8, spatial_bandwidth=FAR, **FEW),
+    Step("denoise", spatial_bandwidth=UNLIMITED_BANDWIDTH, **FEW),
+    Step("abstract", edges=0.5, tones=8, spatial_bandwidth=UNLIMITED_BANDWIDTH, **FEW),
     Step("look", alpha=(2.0, 1.5, 1.0), bands=(1.0, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0), spatial_bandwidth="none", **FEW),
 ]
 
@@ -62,7 +62,7 @@ def test_fitted_to_one_frame_it_is_the_edit_of_that_frame(step: Step) -> None:
 
 def test_distance_does_not_count_unless_asked_for() -> None:
     frame = crop(90, 190)
-    for edit, far in (("tone", "none"), ("denoise", FAR)):
+    for edit, far in (("tone", "none"), ("denoise", UNLIMITED_BANDWIDTH)):
         values: dict[str, Any] = {"noise_level": 12.0} if edit == "denoise" else {}
         found = FilmEdit(Recipe((Step(edit, **values, **FEW),)), [frame], PASSES)(frame)
         np.testing.assert_allclose(found, edited(Step(edit, spatial_bandwidth=far, **values, **FEW), frame), atol=1e-4)

@@ -59,7 +59,7 @@ def test_a_part_is_that_of_the_whole(
     if "sample" in options:  # and in blocks, like a large picture
         monkeypatch.setattr("nlfilter_torch.edits.mask.SOLVED", 2000)
         monkeypatch.setattr("nlfilter_torch.edits.local_values.SOLVED", 2000)
-        monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP", 1000)
+        monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP_PIXELS", 1000)
     source, passes = rows_of(cat(5)), Passes("float32", folder=tmp_path, **options)
     wanted = whole(EDITS[name], source, passes)
     parts = Parts(source, "scan.tif")

@@ -19,7 +19,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture
-from nlfilter_torch.tiled.sampling import Draws, KeptColumns, draw, over_all
+from nlfilter_torch.tiled.sampling import ColumnCache, Draws, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes
@@ -184,15 +184,15 @@ def silent(stage: str, done: int, total: int) -> None:
 def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(completion: Any) -> None:
     picture = GuidePicture(Picture(cat(90, 120)), Guide({}))
     pilot = sampling.take_pilot(picture, silent, num_landmarks=30, completion=completion)
-    guess = Guess(pilot.balancing, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
+    guess = Guess(pilot.moment, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
     draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
     drawn = []
-    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2, KeptColumns(2400, 5000))(lambda block: block):
+    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2, ColumnCache(2400, 5000))(lambda block: block):
         columns, totals = guess.totals(block)
         drawn.append(draw_from(block, columns))
         moment, grams = moment + totals.moment, grams + totals.grams
     assert len(drawn) > 1
-    sample = Block.together(drawn)
+    sample = Block.concatenate(drawn)
     assert 2500 < sample.weights.numel() < 3500
     assert abs(float(sample.weights.sum()) / picture.pixels - 1) < 0.1
     estimate = guess.totals(sample)[1]
@@ -258,7 +258,7 @@ def test_memory_gives_the_size_of_tiles() -> None:
 
     def rows_within(memory: int, masked: bool = False) -> int:
         tiled = Tiled(picture, Passes("uint8", sample=1 << 16, memory=memory))
-        return tiled.room(75 if masked else 25, num_landmarks=5)
+        return tiled.fitting_rows(75 if masked else 25, num_landmarks=5)
 
     rows = [rows_within(memory) for memory in (5 * 10**7, 2 * 10**8, 10**10)]
     assert 200 * 85 * 4 * rows[0] < 5 * 10**7 < 200 * 85 * 4 * 4 * rows[0]
@@ -332,7 +332,7 @@ def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -
     picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
     pilot = sampling.take_pilot(picture, silent, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
-        balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.balancing, completed=True)
+        balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.moment, completed=True)
 
 
 class Shrinking(Rows):

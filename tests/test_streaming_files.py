@@ -139,7 +139,7 @@ def test_writing_rows_keeps_everything(tmp_path: Path, suffix: str, channels: in
 
 
 def test_a_large_file_becomes_a_bigtiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiff, "CLASSIC", 1000)
+    monkeypatch.setattr(tiff, "MAX_CLASSIC_BYTES", 1000)
     picture = cat()
     write_picture(tmp_path / "out.tif", iter([(slice(0, 200), picture)]), "uint8", StoredPicture(picture, False, 0))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:

@@ -155,7 +155,7 @@ def test_a_guide_that_is_kept_changes_nothing() -> None:
     picture, (strokes, mask, _) = cat(90, 60), paint(90, 60)
     kept, made_again = (
         recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16),
-        recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16, memory=tiles.AMPLE - 1),
+        recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16, memory=tiles.LARGE_MEMORY - 1),
     )
     np.testing.assert_allclose(kept, made_again, atol=1e-4)
 

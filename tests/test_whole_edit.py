@@ -108,10 +108,10 @@ def test_a_mask_by_a_pyramid_is_the_same_by_rows(tmp_path: Path) -> None:
 
 def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image, recipe = cat(), Recipe((Step("abstract", landmarks=20, edges=1.0),))
-    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISHED", 4000)  # 2.4 MB a row
+    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISH_FLOATS", 4000)  # 2.4 MB a row
     few = by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)  # and so two tiles or more
     assert np.abs(few - by_rows(recipe, rows_of(image), tmp_path)).max() < 1e-5
-    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISHED", 20_000)
+    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISH_FLOATS", 20_000)
     with pytest.raises(MemoryError, match=r"scan.tif needs at least \d+ MB of memory, but only 60 MB may be used"):
         by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)
 

@@ -10,7 +10,7 @@ import torch
 
 from nlfilter_torch.core.kernels import library
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.tiled.workers import in_order, undivided
+from nlfilter_torch.tiled.workers import in_order, single_threaded
 
 
 @pytest.fixture(autouse=True)
@@ -35,13 +35,13 @@ def test_workers_share_the_threads_and_leave_those_of_others(workers: int, each:
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
 
 
-def test_undivided_holds_for_the_calling_thread_and_its_workers() -> None:
-    with undivided(2):
+def test_single_threaded_holds_for_the_calling_thread_and_its_workers() -> None:
+    with single_threaded(2):
         assert (torch.get_num_threads(), of_new_thread()) == (1, 6)
         assert list(in_order(lambda _: torch.get_num_threads(), range(3), 2)) == [3, 3, 3]
         assert (torch.get_num_threads(), of_new_thread()) == (1, 6)
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
-    with undivided(1):  # no other work runs then
+    with single_threaded(1):  # no other work runs then
         assert torch.get_num_threads() == 6
 
 

@@ -213,7 +213,7 @@ def edit_photograph(
     from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.pictures import Picture, Rows
     from nlfilter_torch.tiled.source import Tiled
-    from nlfilter_torch.tiled.workers import undivided
+    from nlfilter_torch.tiled.workers import single_threaded
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
         """Print the colours that scribbles cover, and write the picture of ``--show``."""
@@ -266,7 +266,7 @@ def edit_photograph(
 
         tell(drawn, job.size, rows_of)
         noise = measured(drawn[1], tiled, rows_of) if name == "denoise" else None
-        with undivided(tiled.passes.workers(1)):
+        with single_threaded(tiled.passes.workers(1)):
             fitted = fit_step(step, tiled, *drawn, generator=seeded(seed))
         rows = tiled.rows(fitted)
         yield from rows if noise is None else noise.watched(rows, job.picture.rows)

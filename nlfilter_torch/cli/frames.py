@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from nlfilter_torch.tiled.film import FilmEdit
 
 #: Edits without scribbles.
-UNPAINTED = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
-OWN = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
-PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
+EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
+DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
+BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
 
 Frames = Annotated[
     Path,
@@ -45,7 +45,7 @@ EditName = Annotated[
     str,
     typer.Option(
         "--edit",
-        metavar="|".join(edit.name for edit in UNPAINTED),
+        metavar="|".join(edit.name for edit in EDITS_WITHOUT_STROKES),
         help="The edit to apply, with the name of its command.",
     ),
 ]
@@ -59,7 +59,7 @@ Preset = Annotated[
 ]
 
 
-@with_options(*OWN, more=UNPAINTED)
+@with_options(*DETAIL_OPTIONS, more=EDITS_WITHOUT_STROKES)
 def frames(
     context: typer.Context,
     source: Frames,
@@ -117,15 +117,15 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: 
                 f"{preset}; set it in that file instead"
             )
         return recipe
-    if name not in {edit.name for edit in UNPAINTED}:
-        names = ", ".join(edit.name for edit in UNPAINTED)
+    if name not in {edit.name for edit in EDITS_WITHOUT_STROKES}:
+        names = ", ".join(edit.name for edit in EDITS_WITHOUT_STROKES)
         raise ValueError(f"--edit must be one of {names}, got {name!r}; choose one of these")
     if preset is not None and name != "detail":
         raise ValueError(f"--edit must not be given together with --preset, got {name} and {preset}; drop one of them")
     declared = {parameter.name for parameter in EDITS[name]}
     other = next((option for option in typed if option not in declared and option != "edit"), None)
     if other is not None:
-        edits = " or ".join(edit.name for edit in UNPAINTED if other in {p.name for p in edit})
+        edits = " or ".join(edit.name for edit in EDITS_WITHOUT_STROKES if other in {p.name for p in edit})
         raise ValueError(
             f"--{other.replace('_', '-')} must be used with --edit {edits}, got --edit {name}; drop it or change --edit"
         )
@@ -163,7 +163,7 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
 
     def read(path: Path) -> tuple[Any, Any]:
         nonlocal first
-        photograph = read_photograph(path, bytes_per_pixel=PIXEL)
+        photograph = read_photograph(path, bytes_per_pixel=BYTES_PER_PIXEL)
         rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
         first = first or rows.shape
         if rows.shape != first:

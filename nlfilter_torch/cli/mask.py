@@ -43,7 +43,7 @@ def mask(
     from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.scribbles import RegionRows
     from nlfilter_torch.tiled.source import Tiled
-    from nlfilter_torch.tiled.workers import undivided
+    from nlfilter_torch.tiled.workers import single_threaded
 
     if mask is None and not region:
         raise ValueError(GIVE)
@@ -100,7 +100,7 @@ def mask(
             tiled = Tiled(Picture(picture.rows, source), job.passes(full, place.parent), "--region")
             drawn = selected_by(job.size, job.open)
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
-            with undivided(tiled.passes.workers(1)):
+            with single_threaded(tiled.passes.workers(1)):
                 fitted = fit_mask(tiled, *drawn, **arguments(job.size))
             write_picture(place, _first_channel(tiled.rows(fitted)), kind, plain)
 

@@ -15,8 +15,8 @@ from nlfilter_torch.edits.noise import Noise
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 from nlfilter_torch.tiled.pictures import WHITE, Rows, RowSource
 
-VISIBLE = 0.5  # grey levels; the rounding error of eight bits
-LARGEST = 64  # grey levels; white in a map
+VISIBLE_LEVELS = 0.5  # grey levels; the rounding error of eight bits
+WHITE_LEVELS = 64  # grey levels; white in a map
 ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides
 
 
@@ -56,7 +56,7 @@ class NoiseReport:
         if self._level < NEGLIGIBLE_NOISE:
             typer.echo(f"{found}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed")
             return
-        weak = "" if change >= VISIBLE else ", which is barely visible"
+        weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
         remedy = "" if self._given or not weak else "; --strength 2 removes more"
         typer.echo(f"{found}; pixels changed by {change:.2f} grey levels (RMS){weak}{remedy}")
 
@@ -76,7 +76,7 @@ def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tenso
         first, last = max(start - AROUND, 0), min(stop + AROUND, size[0])
         levels = noise.at(read(slice(first, last)).float())
         parts.append(levels.square().mean(1, keepdim=True).sqrt()[..., start - first : stop - first, :])
-    levels = torch.cat(parts, dim=2) * (LEVELS / LARGEST)
+    levels = torch.cat(parts, dim=2) * (LEVELS / WHITE_LEVELS)
     write_photograph(Photograph(levels.clamp(0, 1), "uint16"), path)
 
 

@@ -21,7 +21,7 @@ from nlfilter_torch.tiled.pictures import Picture, transparency
 Size = tuple[int, int]  # (height, width) of the photograph
 Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask
 Floats = NDArray[np.float32]
-DOT = 0.03  # side of the square around a point, as a share of the short side
+DOT_SIZE = 0.03  # side of the square around a point, as a share of the short side
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Rectangle:
             parts = numbers.split(",")
             found = [_pixels(part, length) for part, length in zip(parts, lengths[: len(parts)], strict=True)]
             if len(found) == 2:
-                side = max(1, round(DOT * min(size)))
+                side = max(1, round(DOT_SIZE * min(size)))
                 found = [min(max(int(at) - side // 2, 0), n - side) for at, n in zip(found, lengths, strict=False)]
                 found += [side, side]
             x, y, width, height = (math.floor(number) for number in found)

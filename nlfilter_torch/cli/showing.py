@@ -18,11 +18,11 @@ from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
-PIXELS = 500_000  # largest size of the picture that shows scribbles
-UNLIKE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
-FEW = 0.15  # share of such pixels above which a note is printed
-ROWS = 64
-DIM = 0.4  # brightness outside the mask, where the picture is shown in grey
+MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
+LARGE_DISTANCE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
+NOTE_SHARE = 0.15  # share of such pixels above which a note is printed
+CHUNK_ROWS = 64
+OUTSIDE_BRIGHTNESS = 0.4  # brightness outside the mask, where the picture is shown in grey
 
 
 def overlays(drawn: tuple[tuple[Any, ...], dict[str, Any]]) -> Iterator[tuple[str, Overlay]]:
@@ -43,7 +43,7 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
             place = f"{option} {rectangle}"
             typer.echo(f"{place}: {pixels.shape[2]} pixels, median colour #{red:02x}{green:02x}{blue:02x}")
             share = unlike(pixels, middle)
-            if share > FEW:
+            if share > NOTE_SHARE:
                 typer.echo(
                     f"nlfilter-torch: note: {place} covers very different colours: {100 * share:.0f} % of its pixels "
                     "differ strongly from the median; make it smaller or move it, and check it with --show FILE",
@@ -54,7 +54,7 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
 def unlike(pixels: Tensor, middle: Tensor) -> float:
     """The share of pixels (1, C, n) whose colour is very different from a colour (1, C)."""
     lab = lab_of(pixels.expand(-1, 3, -1).unsqueeze(2)) - lab_of(middle.expand(-1, 3)[..., None, None])
-    return float((lab.norm(dim=1) > UNLIKE).float().mean())
+    return float((lab.norm(dim=1) > LARGE_DISTANCE).float().mean())
 
 
 def show(
@@ -75,7 +75,7 @@ def show(
         read: reads its rows.
         drawn: the scribbles, as of :func:`~nlfilter_torch.cli.scribbles.of_edit`.
     """
-    stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / PIXELS)))
+    stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / MAX_PIXELS)))
     image = _reduced(read, size, stride, F.avg_pool2d).float().clamp(0, 1).expand(-1, 3, -1, -1)
     laid = {option: _planes(overlay, size, stride) for option, overlay in overlays(drawn)}
     region, kept = laid["--region"], laid.get("--keep")
@@ -92,7 +92,7 @@ def show(
         if edit == "defocus":
             taken["reach"] = REACH
         mask = region_mask(image, painted, kept, **taken, generator=seeded())
-    outside = DIM * image.mean(1, keepdim=True)  # grey, since any tint may occur in the picture
+    outside = OUTSIDE_BRIGHTNESS * image.mean(1, keepdim=True)  # grey, since any tint may occur in the picture
     shown = torch.lerp(outside.expand_as(image), image, mask)
     colours = region[:, :3] if is_strokes else shown.new_tensor((0.1, 0.8, 0.3)).view(1, 3, 1, 1).expand_as(shown)
     shown = torch.lerp(shown, colours, 0.75 * painted)
@@ -115,5 +115,5 @@ def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
 def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[[Tensor, int], Tensor]) -> Tensor:
     """Pool blocks of ``stride`` pixels along each axis, with only some rows in memory at once."""
     height = size[0] // stride * stride
-    starts = range(0, height, ROWS * stride)
-    return torch.cat([pool(read(slice(a, min(a + ROWS * stride, height))), stride) for a in starts], dim=2)
+    starts = range(0, height, CHUNK_ROWS * stride)
+    return torch.cat([pool(read(slice(a, min(a + CHUNK_ROWS * stride, height))), stride) for a in starts], dim=2)

@@ -24,7 +24,7 @@ from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 
 VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
-TINY = 1e-12
+EPSILON = 1e-12
 
 
 @full_precision
@@ -255,7 +255,7 @@ def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> T
         return sum_of(changes)
     added, rest = changes.chunk(2, dim=1)
     least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
-    return added * (activity / (activity + least).clamp(min=TINY)) + rest
+    return added * (activity / (activity + least).clamp(min=EPSILON)) + rest
 
 
 def activity(image: Tensor) -> Tensor:

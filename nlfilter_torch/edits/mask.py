@@ -40,7 +40,7 @@ CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
 SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
-TINY = 1e-6
+EPSILON = 1e-6
 
 
 MARGIN = max(blur_margin(SURROUND_SIGMA), blur_margin(GRAIN_SIGMA) + blur_margin(TEXTURE_SIGMA))
@@ -330,7 +330,7 @@ def _regression(
     """
     columns, weights = operator.at(marked.places), marked.weights
     total = weights.sum(1, keepdim=True).clamp(max=1.0)
-    values = weights[:, :1] / weights.sum(1, keepdim=True).clamp(min=TINY)
+    values = weights[:, :1] / weights.sum(1, keepdim=True).clamp(min=EPSILON)
     pixels = source.size[0] * source.size[1]
     fit = partial(fit_strokes, pairs=operator.pairs, pixels=pixels, reach=reach, smoothness=SMOOTHNESS)
     known = [(columns, total, values)]

@@ -21,10 +21,10 @@ COARSEST = 48  # minimum short side of the coarsest level, in pixels
 LEVELS = 4  # maximum number of reduced levels
 STEEPNESS = 300.0  # decay of the weights with the mean squared difference of the channels
 MIN_WEIGHT = 1e-4
-REFINEMENT_ROUNDS, CONTRAST = 2, 0.03  # rounds of refinement; colour difference at which it is half trusted
+REFINEMENT_ROUNDS, HALF_TRUST_CONTRAST = 2, 0.03  # rounds of refinement; colour difference at which it is half trusted
 SIDE_RADIUS = 4  # radius over which the colours on each side of a border are averaged, in pixels of the coarsest level
-KNOWN = 0.02  # share of nearby pixels on one side at which the colour of that side is half trusted
-TINY = 1e-4  # smallest weight of a pixel on either side
+HALF_TRUST_SHARE = 0.02  # share of nearby pixels on one side at which the colour of that side is half trusted
+MIN_SIDE_WEIGHT = 1e-4  # smallest weight of a pixel on either side
 REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
 WINDOW_RADIUS, NOISE = 2, 1e-5  # radius of the windows in which masks are linear in colour; variance of noise
 LINEAR_LEVELS, LINEAR_STEPS = 2, 8  # of the second solve: levels of the pyramid, steps on each
@@ -242,15 +242,19 @@ class Sides:
         """
         across = self.inside - self.outside
         contrast = across.square().mean(1, keepdim=True)
-        share = ((image - self.outside) * across).mean(1, keepdim=True) / (contrast + TINY * CONTRAST)
-        trust = self.known * contrast / (contrast + CONTRAST**2) * (1 - (2 * mask - 1).pow(8))  # 0 and 1 are certain
+        share = ((image - self.outside) * across).mean(1, keepdim=True) / (
+            contrast + MIN_SIDE_WEIGHT * HALF_TRUST_CONTRAST
+        )
+        trust = (
+            self.known * contrast / (contrast + HALF_TRUST_CONTRAST**2) * (1 - (2 * mask - 1).pow(8))
+        )  # 0 and 1 are certain
         return torch.lerp(mask, share.clamp(0.0, 1.0), trust)
 
 
 def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     """Colours on both sides of the borders of a mask (B, 1, H, W) of an image (B, C, H, W)."""
     (height, width), step = image.shape[-2:], 1 << pyramid_levels(min(image.shape[-2:]))
-    weights = torch.cat([mask, 1 - mask], dim=1).pow(4) + TINY  # (B, 2, H, W)
+    weights = torch.cat([mask, 1 - mask], dim=1).pow(4) + MIN_SIDE_WEIGHT  # (B, 2, H, W)
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
     planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
     coarse = F.avg_pool2d(planes, step)
@@ -260,7 +264,7 @@ def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     sums = F.avg_pool2d(sums, (1, size), 1, (0, SIDE_RADIUS))
     means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
     least = sums[:, :2].amin(1, keepdim=True)
-    found = torch.cat([means.flatten(1, 2), least / (least + KNOWN)], dim=1)
+    found = torch.cat([means.flatten(1, 2), least / (least + HALF_TRUST_SHARE)], dim=1)
     if step > 1:
         found = F.interpolate(found, scale_factor=step, mode="bilinear", align_corners=False)
     channels = image.shape[1]

@@ -15,9 +15,9 @@ from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import Fitted, Source, edited
 
-TINY = 1e-12  # keeps the derivative of a root finite
-DOUBTFUL = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
-SATURATION = 0.05  # chroma below this counts as grey, without variations to keep
+EPSILON = 1e-12  # keeps the derivative of a root finite
+END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
+GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to keep
 
 
 @full_precision
@@ -98,13 +98,13 @@ def fit_recolor(
     scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
     kept = None if keep is None else source.scribbles(keep, None, "keep", needed=False)
 
-    colours, regions, counts = _grouped(scribbles)
+    colours, regions, valid = _grouped(scribbles)
     old = region_means(split_luminance(scribbles.image.unsqueeze(2))[1], regions.unsqueeze(2))
     inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
     options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
     options["spatial_bandwidth"] = nearby(spatial_bandwidth, RECOLOR["spatial_bandwidth"].share, source.size)
     found = fit_regions(source, inside, [] if kept is None else [kept], reach=reach, **options)
-    change = Recoloring(colours, old, counts)
+    change = Recoloring(colours, old, valid)
     reduced = split_luminance(found.reduced)[1]
     beside = []
     for share in change.shares(found.reduced_masks()).split(1, dim=1):
@@ -122,8 +122,8 @@ def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
     """Return the chroma (B, K, 3) of scribbles, their regions (B, K, n), and which of them are valid, (B, K)."""
     assert scribbles.colours is not None  # for mypy
     chroma = split_luminance(scribbles.colours.unsqueeze(2))[1]
-    regions, colours, counts = group_colours(chroma, scribbles.weights.unsqueeze(2))
-    return colours, regions.squeeze(2), counts
+    regions, colours, valid = group_colours(chroma, scribbles.weights.unsqueeze(2))
+    return colours, regions.squeeze(2), valid
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,17 +136,17 @@ class Recoloring:
     Attributes:
         colours: chroma of the strokes, (B, K, 3).
         old: mean chroma of the image under the strokes, (B, K, 3).
-        counts: which of the K colours each image has, (B, K).
+        valid: which of the K colours each image has, (B, K).
     """
 
     colours: Tensor
     old: Tensor
-    counts: Tensor
+    valid: Tensor
 
     def shares(self, masks: Tensor) -> Tensor:
         """Return the fraction of each pixel that takes each colour, (B, K, H, W), from masks (B, K, H, W)."""
-        certain = ((masks - DOUBTFUL) / (1 - 2 * DOUBTFUL)).clamp(0.0, 1.0)
-        shares = certain * self.counts[..., None, None]
+        certain = ((masks - END_MARGIN) / (1 - 2 * END_MARGIN)).clamp(0.0, 1.0)
+        shares = certain * self.valid[..., None, None]
         return shares / shares.sum(1, keepdim=True).clamp(min=1.0)
 
     def __call__(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
@@ -158,12 +158,12 @@ class Recoloring:
             sides = beside[k]
             share = sides.refine(chroma, shares[:, k : k + 1])
             # Chroma of the object's part of a mixed pixel; inside the object, that of the pixel.
-            thing = chroma + sides.known * (1 - share) * (sides.inside - sides.outside)
+            object_chroma = chroma + sides.known * (1 - share) * (sides.inside - sides.outside)
             # The new colour takes the relative saturation of the old one, so that a white highlight stays white.
-            usual = self.old[:, k].square().sum(1)[:, None, None, None]  # squared saturation
-            product = (usual * thing.square().sum(1, keepdim=True)).clamp(min=TINY).sqrt()
-            relative = (product + SATURATION**2) / (usual + SATURATION**2)
-            change = change + share * (relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None] - thing)
+            squared_saturation = self.old[:, k].square().sum(1)[:, None, None, None]
+            product = (squared_saturation * object_chroma.square().sum(1, keepdim=True)).clamp(min=EPSILON).sqrt()
+            relative = (product + GREY_CHROMA**2) / (squared_saturation + GREY_CHROMA**2)
+            change = change + share * (relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None] - object_chroma)
             total = total + share
         untouched = (total == 0).expand_as(pixels)
         return torch.where(untouched, pixels, merge_luminance(luminance, chroma + change))

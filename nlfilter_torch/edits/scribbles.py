@@ -16,7 +16,7 @@ from torch import Tensor
 from nlfilter_torch.edits.declaration import is_within, shown
 
 COLOUR = re.compile(r"#[0-9a-f]{6}")
-SMALLEST = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
+MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
             [0, 0, 0, 0, 0]], dtype=torch.int32)
     """
     height, width = size
-    radius = max(stroke.radius * min(size), SMALLEST)
+    radius = max(stroke.radius * min(size), MIN_RADIUS)
     first = 0 if rows is None else rows.start
     covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
     # The origin is the centre of the first pixel.

@@ -43,7 +43,7 @@ class Guide:
         options: of :func:`nonlocal_operator`.
         transform: function that computes the guide from an image (B, C, H, W); None uses the image itself.
         radius: radius in pixels of the neighbourhood that ``transform`` depends on.
-        planes: number of channels of the guide; None is that of the image.
+        channels: number of channels of the guide; None is that of the image.
         blur: standard deviation in pixels of the Gaussian blur of the guide.
         spectral: whether the edit uses the spectrum.
         sampled: whether the spectrum may be estimated from a sample of the pixels.
@@ -54,7 +54,7 @@ class Guide:
     options: Mapping[str, Any]
     transform: Callable[[Tensor], Tensor] | None = None
     radius: int = 0
-    planes: int | None = None
+    channels: int | None = None
     blur: float = 0.0
     spectral: bool = False
     sampled: bool = False

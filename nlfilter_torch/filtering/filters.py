@@ -30,7 +30,7 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
 
     Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Given the layers, any sliders
     can be applied without further products with the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, as
-    :meth:`PolynomialSliders.combine` does.
+    ``PolynomialSliders.combine`` does.
 
     Args:
         operator: W.

@@ -33,9 +33,9 @@ ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
 BT601, BT709 = 5, 1  # colour matrices, numbered as in swscale
 MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}  # from numbers of H.273 to those of swscale
 LIMITED, FULL = 1, 2  # colour ranges
-HD = 720  # rows from which on players assume BT.709 for untagged films
-OF_THE_FILE = ("major_brand", "minor_version", "compatible_brands", "encoder")  # metadata of the file itself
-COPIED = ("audio", "subtitle")
+HD_ROWS = 720  # rows from which on players assume BT.709 for untagged films
+CONTAINER_METADATA = ("major_brand", "minor_version", "compatible_brands", "encoder")  # metadata of the file itself
+COPIED_STREAMS = ("audio", "subtitle")
 PLANES = [2, 0, 1]  # order of red, green and blue in the planes green, blue, red
 
 
@@ -83,7 +83,7 @@ class Film:
     @property
     def matrix(self) -> int:
         """The colour matrix between RGB and the stored planes, numbered as in swscale."""
-        untagged = BT709 if self.stream.codec_context.height >= HD else BT601
+        untagged = BT709 if self.stream.codec_context.height >= HD_ROWS else BT601
         return MATRICES.get(self.stream.codec_context.colorspace, untagged)
 
     @property
@@ -241,7 +241,7 @@ def _transcode(
     target = _encoder(film, output)
     copied: dict[int, Any] = {}
     for stream in film.container.streams:
-        if stream.type not in COPIED or stream.codec_context is None:
+        if stream.type not in COPIED_STREAMS or stream.codec_context is None:
             continue
         try:
             copied[stream.index] = output.add_stream_from_template(stream)
@@ -251,7 +251,9 @@ def _transcode(
                 "use the file type of that film, or convert it"
             ) from error
         copied[stream.index].metadata.update(stream.metadata)
-    output.metadata.update({key: text for key, text in film.container.metadata.items() if key not in OF_THE_FILE})
+    output.metadata.update(
+        {key: text for key, text in film.container.metadata.items() if key not in CONTAINER_METADATA}
+    )
     film.container.seek(0)  # the header is written with the first packet, which may be a sound packet
     target.set_display_matrix(next(map(display_matrix, film.frames()), None))
     film.container.seek(0)

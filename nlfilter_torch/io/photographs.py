@@ -114,7 +114,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
 
     depth = check_depth(path, channels.dtype)
-    planes = Picture(channels, str(path), planes=channels.shape[2]).tile(0, len(channels), 0).pixels  # (1, S, H, W)
+    planes = Picture(channels, str(path), channels=channels.shape[2]).tile(0, len(channels), 0).pixels  # (1, S, H, W)
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
     return Photograph(planes[:, :colours], depth, alpha, icc, exif, read_extras(path))  # type: ignore[arg-type]

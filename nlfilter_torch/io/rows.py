@@ -37,7 +37,7 @@ from nlfilter_torch.tiled.pictures import Rows, RowSource
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
 FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is tiled
-CODED = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
+CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
         elif tiff.is_tiff(first_bytes(path)):
             stored = _open_tiff(path, stack)
         else:
-            channels, icc, exif = read_channels(path, bytes_per_pixel=CODED, memory=memory)
+            channels, icc, exif = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=memory)
             stored = StoredPicture(
                 channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif, extras=read_extras(path)
             )
@@ -124,7 +124,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
             raise ValueError(f"{path} is a folder, not a zarr array that can be replaced; choose another name")
         return
     kind = check_type(path, depth, picture.alpha)
-    needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODED
+    needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
     if needed > memory:
         raise MemoryError(
             f"{path} needs {needed / 1e6:.0f} MB of memory to be encoded, but only {memory / 1e6:.0f} MB may be used; "

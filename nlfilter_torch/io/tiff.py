@@ -21,10 +21,10 @@ _ORIENTATION = int(ExifTags.Base.Orientation)
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 XMP = 700  # tag
-TILE = 256  # side of the tiles that are written
-CLASSIC = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
+TILE_SIZE = 256  # side of the tiles that are written
+MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
-KEPT = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
+CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
 
 
 class UnhandledImage(ValueError):
@@ -119,16 +119,20 @@ def write_rows(
     plain_shape = (height, width) if samples == 1 else shape
 
     def tiles() -> Iterator[NDArray[Any]]:
-        for band in bands(rows, TILE):
-            for left in range(0, width, TILE):
-                tile = band[:, left : left + TILE]
-                padding = ((0, TILE - tile.shape[0]), (0, TILE - tile.shape[1]), (0, 0))
+        for band in bands(rows, TILE_SIZE):
+            for left in range(0, width, TILE_SIZE):
+                tile = band[:, left : left + TILE_SIZE]
+                padding = ((0, TILE_SIZE - tile.shape[0]), (0, TILE_SIZE - tile.shape[1]), (0, 0))
                 whole = np.pad(tile, padding)
                 yield whole[..., 0] if samples == 1 else whole
 
-    big = height * width * samples * dtype.itemsize > CLASSIC
+    big = height * width * samples * dtype.itemsize > MAX_CLASSIC_BYTES
     # Compressing ahead in threads would queue hundreds of megabytes.
-    options = {"tile": (TILE, TILE), "maxworkers": 1, "buffersize": TILE * TILE * samples * dtype.itemsize}
+    options = {
+        "tile": (TILE_SIZE, TILE_SIZE),
+        "maxworkers": 1,
+        "buffersize": TILE_SIZE * TILE_SIZE * samples * dtype.itemsize,
+    }
     write(
         stream,
         tiles(),
@@ -299,7 +303,11 @@ class TiffRows:
     @property
     def cached(self) -> int:
         """Bytes of decoded strips or tiles that are cached while rows are read."""
-        return 0 if self._raw else (KEPT + 1) * self.segment[0] * self.shape[1] * self.shape[2] * self.dtype.itemsize
+        return (
+            0
+            if self._raw
+            else (CACHED_BANDS + 1) * self.segment[0] * self.shape[1] * self.shape[2] * self.dtype.itemsize
+        )
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         """Read the rows from ``rows.start`` to ``rows.stop``.
@@ -337,7 +345,7 @@ class TiffRows:
             if band not in self.bands:
                 self.bands[band] = self._band(band)
         whole = np.concatenate([self.bands[band] for band in wanted])
-        for band in sorted(self.bands)[: -KEPT or None]:
+        for band in sorted(self.bands)[: -CACHED_BANDS or None]:
             del self.bands[band]
         return whole[first - wanted.start * height : last - wanted.start * height]
 

@@ -107,7 +107,7 @@ class NonlocalFilter(nn.Module):
     """Layer that filters an image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` combined.
 
     Paper: eq. (12), (13). Every call builds the operator from its guide. To try several sliders on one image, keep the
-    operator or the detail layers, and call :attr:`affinity` and :attr:`sliders` separately.
+    operator or the detail layers, and call ``affinity`` and ``sliders`` separately.
 
     Args:
         alpha: initial sliders, fine to coarse; ones leave the image unchanged. For K regions, K rows of sliders, one

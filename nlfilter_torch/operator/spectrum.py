@@ -136,7 +136,7 @@ class Spectrum(RitzPairs):
 
     @property
     def mass(self) -> Tensor:
-        """Scaling d times the weights of the points, (B, N): the coefficients of sums over points."""
+        """Coefficients (B, N) of sums over points, the scaling d times the weights of the points."""
         return weighted(self.scaling, self.weights)
 
     @property

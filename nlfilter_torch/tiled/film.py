@@ -27,15 +27,16 @@ from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.operator import TiledOperator, first_plane
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture
-from nlfilter_torch.tiled.sampling import CHUNK, KeptColumns, Pilot
+from nlfilter_torch.tiled.sampling import CHUNK, ColumnCache, Pilot
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.statistics import Block, Sums
 from nlfilter_torch.tiled.tiles import Passes
 
-LEARNT_FROM = 1 << 16  # pixels of all references together; twice or half as many approximate all pixels equally well
-FAR = 1e6  # spatial bandwidth in pixels at which distance has no effect
-Answer = TypeVar("Answer")
-Rows = NDArray[np.float32]
+# Pixels of all references together; twice or half as many approximate all pixels equally well.
+REFERENCE_PIXELS = 1 << 16
+UNLIMITED_BANDWIDTH = 1e6  # spatial bandwidth in pixels at which distance has no effect
+Cached = TypeVar("Cached")
+FrameArray = NDArray[np.float32]
 
 
 @dataclass(eq=False)
@@ -43,16 +44,16 @@ class References:
     """Frames that an edit is fitted to, and the results computed from them so far, in order."""
 
     pictures: list[Picture]
-    answers: list[Any] = field(default_factory=list)
+    results: list[Any] = field(default_factory=list)
 
     def forget_pixels(self) -> None:
         """Free the frames and keep only the results, once all of them are known."""
         self.pictures = []
-        for answer in self.answers:
-            if isinstance(answer, References):
-                answer.forget_pixels()
-            elif isinstance(answer, LearntFilter):
-                answer.blocks = []
+        for result in self.results:
+            if isinstance(result, References):
+                result.forget_pixels()
+            elif isinstance(result, LearntFilter):
+                result.blocks = []
 
 
 @dataclass(eq=False)
@@ -60,7 +61,7 @@ class LearntFilter:
     """The filter of all references: its kernel and balancing, and blocks of the pixels that it was fitted to."""
 
     pilot: Pilot
-    balancing: PixelScaling
+    pixel_scaling: PixelScaling
     blocks: list[Block]
 
 
@@ -77,15 +78,15 @@ class FrameOperator(TiledOperator):
             sums = self._summed_up(first_plane, 1, self.over("Summing up"))
             return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
 
-        return self.frame.answer(found)
+        return self.frame.cached_result(found)
 
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums over the references for the first ``order`` powers of W."""
-        return self.frame.answer(lambda: self._summed_up(planes, order, self.over("Summing up")))
+        return self.frame.cached_result(lambda: self._summed_up(planes, order, self.over("Summing up")))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over the references."""
-        return self.frame.answer(lambda: TiledOperator.mean(self, planes))
+        return self.frame.cached_result(lambda: TiledOperator.mean(self, planes))
 
 
 class Frame(Tiled):
@@ -99,41 +100,41 @@ class Frame(Tiled):
 
     def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
         super().__init__(picture, passes)
-        self.references, self.asked = references, 0
+        self.references, self.num_requested = references, 0
 
-    def answer(self, work: Callable[[], Answer]) -> Answer:
+    def cached_result(self, compute: Callable[[], Cached]) -> Cached:
         """Return the next cached result for the references, or compute and cache it."""
-        if self.asked == len(self.references.answers):
+        if self.num_requested == len(self.references.results):
             with torch.no_grad():
-                self.references.answers.append(work())
-        self.asked += 1
-        return cast(Answer, self.references.answers[self.asked - 1])
+                self.references.results.append(compute())
+        self.num_requested += 1
+        return cast(Cached, self.references.results[self.num_requested - 1])
 
     def each_reference(self) -> Iterator["Frame"]:
         """Yield the references, as frames that share the operators of this one."""
         for picture in self.references.pictures:
             other = Frame(picture, self.passes, self.references)
-            other.operators, other.floats = self.operators, self.floats
+            other.operators, other.tile_floats = self.operators, self.tile_floats
             yield other
 
     @full_precision
     def operator(self, guide: Guide) -> FrameOperator:
         """The filter of the references."""
-        learnt = self.answer(lambda: learn_filter(self.references.pictures, guide))
+        learnt = self.cached_result(lambda: learn_filter(self.references.pictures, guide))
         found = FrameOperator(
             GuidePicture(self.picture, guide),
             learnt.pilot,
             self.passes.report,
-            count=None,
-            full=True,
+            sample_size=None,
+            full_passes=True,
             kernel=learnt.pilot.kernel,
             bounded=False,
-            workers=self.passes.workers(learnt.pilot.balancing.shape[1]),
-            kept=KeptColumns(1, 0),
+            workers=self.passes.workers(learnt.pilot.moment.shape[1]),
+            cache=ColumnCache(1, 0),
         )
-        found.frame, found._balancing, found._sample = self, learnt.balancing, learnt.blocks
+        found.frame, found._pixel_scaling, found._sample = self, learnt.pixel_scaling, learnt.blocks
         self.operators.append(found)
-        self.floats += learnt.pilot.kernel.landmarks.shape[1]
+        self.tile_floats += learnt.pilot.kernel.landmarks.shape[1]
         return found
 
     def resized(self, size: tuple[int, int]) -> "Frame":
@@ -142,7 +143,7 @@ class Frame(Tiled):
         def reduced() -> References:
             return References([Tiled.resized(other, size).picture for other in self.each_reference()])
 
-        references = self.answer(reduced)
+        references = self.cached_result(reduced)
         return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
 
     def cached(self, fitted: Fitted) -> Fitted:
@@ -151,18 +152,20 @@ class Frame(Tiled):
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over the references."""
-        return self.answer(lambda: mean_of([Tiled.mean(other, planes) for other in self.each_reference()]))
+        return self.cached_result(lambda: average([Tiled.mean(other, planes) for other in self.each_reference()]))
 
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means over the references."""
-        return self.answer(lambda: mean_of([Tiled.mean_of(other, fitted, function) for other in self.each_reference()]))
+        return self.cached_result(
+            lambda: average([Tiled.mean_of(other, fitted, function) for other in self.each_reference()])
+        )
 
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
         """The mean of a measurement over the references."""
-        return self.answer(lambda: mean_of([function(other) for other in self.each_reference()]))
+        return self.cached_result(lambda: average([function(other) for other in self.each_reference()]))
 
 
-def mean_of(values: Sequence[Tensor]) -> Tensor:
+def average(values: Sequence[Tensor]) -> Tensor:
     """The mean of tensors of one shape."""
     return torch.stack(list(values)).mean(0)
 
@@ -179,10 +182,10 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     spatial, generator = options.pop("spatial_bandwidth", None), options.pop("generator", None)
     generator = seeded() if generator is None else generator
     if isinstance(bandwidth, str):
-        looked_at = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
-        bandwidth = mean_of([estimate_bandwidth(looked, guide_channels=channels) for looked in looked_at])
+        guides = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
+        bandwidth = average([estimate_bandwidth(compared, guide_channels=channels) for compared in guides])
     recipe = GuideFeatures(window, bandwidth, spatial, channels)
-    each = min(pictures[0].pixels, max(1, LEARNT_FROM // len(pictures)))
+    each = min(pictures[0].pixels, max(1, REFERENCE_PIXELS // len(pictures)))
     drawn = torch.Generator().manual_seed(generator.initial_seed() % (1 << 63))
     features, images = [], []
     for picture in pictures:
@@ -219,7 +222,9 @@ def film_steps(recipe: Recipe) -> tuple[Step, ...]:
         if step.strokes or step.declared.requires_strokes:
             raise ValueError(f"edits of a film must not have strokes, got {step.edit} with strokes; remove that step")
     return tuple(
-        step.changed(spatial_bandwidth="none" if "none" in step.declared["spatial_bandwidth"].words else FAR)
+        step.changed(
+            spatial_bandwidth="none" if "none" in step.declared["spatial_bandwidth"].words else UNLIMITED_BANDWIDTH
+        )
         if step["spatial_bandwidth"] is None
         else step
         for step in recipe.acting
@@ -239,7 +244,7 @@ class FilmEdit:
         ValueError: if a step has strokes, or references differ in size.
     """
 
-    def __init__(self, recipe: Recipe, references: Sequence[Rows], passes: Passes, *, seed: int = 0) -> None:
+    def __init__(self, recipe: Recipe, references: Sequence[FrameArray], passes: Passes, *, seed: int = 0) -> None:
         self.steps, self.passes, self.seed = film_steps(recipe), replace(passes, kind="float32"), seed
         self.references: list[References] = []
         self.size = references[0].shape[:2]
@@ -252,13 +257,13 @@ class FilmEdit:
             learnt.forget_pixels()
             pictures = [Picture(rows.clip(0, 1), "reference") for rows in edited]
 
-    def edit(self, step: Step, picture: Picture, references: References) -> Rows:
+    def edit(self, step: Step, picture: Picture, references: References) -> FrameArray:
         """Apply a step to a frame (H, W, C)."""
         frame = Frame(picture, self.passes, references)
         rows = frame.rows(fit_step(step, frame, (), {}, generator=seeded(self.seed)), plain=True)
         return np.concatenate([values for _, values in rows])
 
-    def __call__(self, frame: Rows) -> Rows:
+    def __call__(self, frame: FrameArray) -> FrameArray:
         """Apply the edit to a frame (H, W, C); values may leave [0, 1]."""
         for step, references in zip(self.steps, self.references, strict=True):
             source = frame if step is self.steps[0] else frame.clip(0, 1)

@@ -18,7 +18,7 @@ from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import GuidePicture, Tile
-from nlfilter_torch.tiled.sampling import Draws, KeptColumns, Pilot, Report, over_all, patches_at, scaled_patches, visit
+from nlfilter_torch.tiled.sampling import ColumnCache, Draws, Pilot, Report, over_all, patches_at, scaled_patches, visit
 from nlfilter_torch.tiled.statistics import (
     CONVERGED,
     Block,
@@ -32,7 +32,7 @@ from nlfilter_torch.tiled.statistics import (
 )
 from nlfilter_torch.tiled.workers import in_order
 
-PARTS = 8  # blocks that a sample is split into, to be shared among workers
+SAMPLE_BLOCKS = 8  # blocks that a sample is split into, to be shared among workers
 
 
 @dataclass(eq=False)
@@ -58,13 +58,13 @@ class TilePixels:
         if id(operator) not in self._columns:
             known = None
             if self.image.shape[3] == self.width:
-                known = operator.kept.find(slice(self.first, self.first + self.image[0, 0].numel()))
+                known = operator.cache.find(slice(self.first, self.first + self.image[0, 0].numel()))
             self._columns[id(operator)] = (
                 operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
             )
         return self._columns[id(operator)]
 
-    def once(self, layers: Planes) -> Tensor:
+    def cached(self, layers: Planes) -> Tensor:
         """Apply a function to the pixels, and cache its result until another function is given."""
         if self._layers is None or self._layers[0] is not layers:
             self._layers = layers, layers(self)
@@ -99,72 +99,72 @@ class TiledOperator:
         guide: guide of the picture.
         pilot: kernel, even sample and initial balancing.
         report: called with the progress.
-        count: size of the sample that complements the first pass; None for no sample.
-        full: whether to make further passes over all pixels.
+        sample_size: size of the sample that complements the first pass; None for no sample.
+        full_passes: whether to make further passes over all pixels.
         kernel: landmarks, bandwidths and window.
         bounded: whether eigenvalues are to be kept from exceeding 1.
         workers: number of tiles computed at once.
-        kept: columns cached from earlier passes.
+        cache: columns cached from earlier passes.
     """
 
     guide: GuidePicture
     pilot: Pilot
     report: Report
-    count: int | None
-    full: bool
+    sample_size: int | None
+    full_passes: bool
     kernel: Kernel
     bounded: bool
     workers: int
-    kept: KeptColumns
-    _balancing: PixelScaling | None = None
+    cache: ColumnCache
+    _pixel_scaling: PixelScaling | None = None
     _sample: list[Block] | None = None
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
     _grams: Tensor | float = 0.0  # added to those of the sample
 
     @torch.no_grad()
     @full_precision
-    def settle(self, planes: Planes = first_plane, order: int = 1) -> None:
+    def prepare(self, planes: Planes = first_plane, order: int = 1) -> None:
         """Balance, and compute the sums for powers of W and planes that depend on colours alone.
 
         Further calls do nothing.
         """
-        if self._balancing is not None:
+        if self._pixel_scaling is not None:
             return
-        total, completed, lacking = self.pilot.balancing, self.pilot.completed, None
-        if self.count is not None:
-            self._sample, lacking = self._look_again(self.count, planes, order)
-            total = balance_by_passes(self.over("Balancing"), total, completed=completed, correction=lacking.moment)
-        if self.full:
-            self._sample = lacking = None
+        total, completed, difference = self.pilot.moment, self.pilot.completed, None
+        if self.sample_size is not None:
+            self._sample, difference = self._draw_sample(self.sample_size, planes, order)
+            total = balance_by_passes(self.over("Balancing"), total, completed=completed, correction=difference.moment)
+        if self.full_passes:
+            self._sample = difference = None
             total = balance_by_passes(self.over("Balancing"), total, completed=completed)
-        self._balancing = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
-        limiter = limiter_by_passes(self.over("Bounding"), self._balancing, self.guide.dtype) if self.bounded else None
+        self._pixel_scaling = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
+        limiter = (
+            limiter_by_passes(self.over("Bounding"), self._pixel_scaling, self.guide.dtype) if self.bounded else None
+        )
         if limiter is not None:
             self.kernel = replace(self.kernel, limiter=limiter.to(self.kernel.landmarks))
-            self.kept.blocks.clear()
-        if self._sample is None or lacking is None:
+            self.cache.blocks.clear()
+        if self._sample is None or difference is None:
             return
         if limiter is not None:
             self._sample = [replace(block, factor=limiter.to(block.factor) @ block.factor) for block in self._sample]
-            lacking = Totals(
-                lacking.moment, limiter @ lacking.coefficients, limiter @ lacking.grams.to(limiter) @ limiter
+            difference = Totals(
+                difference.moment, limiter @ difference.coefficients, limiter @ difference.grams.to(limiter) @ limiter
             )
-        self._grams = lacking.grams
+        self._grams = difference.grams
         sample = self._summed_up(planes, order, self.over("Summing up"))
-        self._sums[id(planes)] = (planes, replace(sample, correction=lacking.coefficients))
+        self._sums[id(planes)] = (planes, replace(sample, correction=difference.coefficients))
 
-    def _look_again(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
+    def _draw_sample(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
         """Draw about ``count`` pixels; also return the sums over all pixels minus theirs, both at the pilot's guess."""
         pilot = self.pilot
 
         def values(block: Block, columns: Columns) -> Tensor:
             return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)
 
-        guess = Guess(
-            pilot.balancing, torch.empty(1, 0, pilot.balancing.shape[1], 1), values, self.guide.guide.spectral
-        )
+        guess = Guess(pilot.moment, torch.empty(1, 0, pilot.moment.shape[1], 1), values, self.guide.guide.spectral)
         columns = guess.columns(pilot.sample)
-        known = sum_up(self._among([pilot.sample]), lambda block: (values(block, columns), columns), order)
+        known = sum_up(self._over_blocks([pilot.sample]), lambda block: (values(block, columns), columns), order)
         guess = replace(guess, coefficients=known.coefficients()[:, :-1])
         draw, drawn, total = Draws(pilot, columns, count, self.guide.pixels), [], None
 
@@ -176,26 +176,26 @@ class TiledOperator:
             drawn.append(some)
             total = totals if total is None else total.plus(totals)
         assert total is not None  # for mypy; a picture has a pixel
-        each = -(-len(drawn) // PARTS)
-        sample = [Block.together(drawn[first : first + each]) for first in range(0, len(drawn), each)]
-        for totals in self._among(sample)(lambda block: guess.totals(block)[1]):
+        each = -(-len(drawn) // SAMPLE_BLOCKS)
+        sample = [Block.concatenate(drawn[first : first + each]) for first in range(0, len(drawn), each)]
+        for totals in self._over_blocks(sample)(lambda block: guess.totals(block)[1]):
             total = total.plus(totals, sign=-1)
         return sample, total
 
     def _over_all(self, stage: str) -> Pass:
         """A pass over every pixel."""
-        return lambda of: over_all(self.guide, self.kernel, self.report, stage, self.workers, self.kept)(of)
+        return lambda of: over_all(self.guide, self.kernel, self.report, stage, self.workers, self.cache)(of)
 
-    def _among(self, blocks: list[Block]) -> Pass:
+    def _over_blocks(self, blocks: list[Block]) -> Pass:
         """A pass over the given blocks."""
         return lambda function: in_order(function, blocks, self.workers)
 
     @property
-    def balancing(self) -> PixelScaling:
+    def pixel_scaling(self) -> PixelScaling:
         """Computes the scaling of any pixel from its column."""
-        self.settle()
-        assert self._balancing is not None  # for mypy
-        return self._balancing
+        self.prepare()
+        assert self._pixel_scaling is not None  # for mypy
+        return self._pixel_scaling
 
     @property
     def margin(self) -> int:
@@ -209,19 +209,19 @@ class TiledOperator:
 
     def columns(self, features: Tensor) -> Columns:
         """Columns of pixels with features (1, D, n)."""
-        self.settle()  # may change the kernel
+        self.prepare()  # may change the kernel
         return self.scaled(*self.kernel.factor(features))
 
     def scaled(self, factor: Tensor, diagonal: Tensor) -> Columns:
         """Columns of pixels with a given factor and diagonal."""
-        return Columns(factor, *self.balancing(factor, diagonal))
+        return Columns(factor, *self.pixel_scaling(factor, diagonal))
 
     def over(self, stage: str) -> Pass:
         """A pass over the sample, or over all pixels if there is none."""
         if self._sample is None:
             return self._over_all(stage)
         self.report(stage, 0, 1)
-        return self._among(self._sample)
+        return self._over_blocks(self._sample)
 
     def pixels(self, block: Block) -> BlockPixels:
         """The pixels of a block, with their columns."""
@@ -232,10 +232,10 @@ class TiledOperator:
     def sums(self, planes: Planes, order: int) -> Sums:
         """Sums for the first ``order`` powers of W and the given planes.
 
-        Sums of planes other than those given to :meth:`settle` are over all pixels: the sample is drawn for balancing,
+        Sums of planes other than those given to :meth:`prepare` are over all pixels: the sample is drawn for balancing,
         and is off by several grey levels for planes that are large at a few pixels.
         """
-        self.settle(planes, order)
+        self.prepare(planes, order)
         known = self._sums.get(id(planes))
         if known is None or known[1].moments.shape[1] < order:
             known = (planes, self._summed_up(planes, order, self._over_all("Summing up")))
@@ -283,7 +283,7 @@ class TiledOperator:
             found = layers_of_columns(pixels.columns(self), coefficients, image.flatten(2))
             return found.unflatten(-1, image.shape[-2:])
 
-        return lambda pixels: pixels.once(layers) if isinstance(pixels, TilePixels) else layers(pixels)
+        return lambda pixels: pixels.cached(layers) if isinstance(pixels, TilePixels) else layers(pixels)
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""
@@ -294,7 +294,7 @@ class TiledOperator:
     def mean(self, planes: Planes) -> Tensor:
         """Means over the sample, or over all pixels if there is none."""
         total, weight = torch.zeros(()), torch.zeros((), dtype=torch.float64)
-        self.settle()
+        self.prepare()
 
         def part(block: Block) -> tuple[Tensor, Tensor]:
             values = planes(self.pixels(block)).flatten(2) * block.weights.unsqueeze(1)

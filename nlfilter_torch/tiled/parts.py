@@ -21,13 +21,13 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, RowSource
-from nlfilter_torch.tiled.sampling import KeptColumns
+from nlfilter_torch.tiled.sampling import ColumnCache
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.strokes import by_rows
+from nlfilter_torch.tiled.strokes import strokes_by_rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics
 from nlfilter_torch.tiled.workers import in_order
 
-STRIP = 1 << 15  # pixels of a rectangle that one worker computes at a time
+STRIP_PIXELS = 1 << 15  # pixels of a rectangle that one worker computes at a time
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def margin_of(operator: TiledOperator) -> int:
 def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     """Apply an edit that was fitted to a picture to a rectangle (1, C, h, w) of it."""
     around = part if fitted.finish is None else part.aligned(fitted.step, tiled.size).grown(fitted.margin, tiled.size)
-    step = max(1, STRIP // len(around.columns))
+    step = max(1, STRIP_PIXELS // len(around.columns))
     rows = around.rows
     strips = [
         Rectangle(range(start, min(start + step, rows.stop)), around.columns)
@@ -127,7 +127,7 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     ]
     landmarks = max((operator.kernel.landmarks.shape[2] for operator in tiled.operators), default=1)
     for operator in tiled.operators:
-        operator.settle()  # before several workers need it
+        operator.prepare()  # before several workers need it
 
     def planes_of(strip: Rectangle) -> Tensor:
         return fitted.pixels(pixels_of_part(tiled, strip))
@@ -156,9 +156,9 @@ class Stage:
         if self._fitted is None or self._fitted[0] != step:
             self._fitted = None
             tiled = Tiled(self.picture, passes)
-            fitted = fit_step(step, tiled, *by_rows(step, tiled.size))
+            fitted = fit_step(step, tiled, *strokes_by_rows(step, tiled.size))
             for operator in tiled.operators:
-                operator.settle()
+                operator.prepare()
             self._fitted = step, tiled, fitted
         return self._fitted[1:]
 
@@ -174,7 +174,7 @@ class Stage:
     def forget_columns(self) -> None:
         """Free the columns cached between passes."""
         for operator in [] if self._fitted is None else self._fitted[1].operators:
-            operator.kept = KeptColumns(1, 0)
+            operator.cache = ColumnCache(1, 0)
 
     def close(self) -> None:
         """Remove the file."""

@@ -84,14 +84,14 @@ class Picture:
         dtype: of the computation.
     """
 
-    def __init__(self, source: RowSource, name: str = "source", *, planes: int | None = None) -> None:
+    def __init__(self, source: RowSource, name: str = "source", *, channels: int | None = None) -> None:
         """Check the shape and type of ``source``, called ``name`` in error messages.
 
-        ``planes`` is the number of channels of something other than a picture; all are read, and none is transparency.
+        ``channels`` is that of something other than a picture: all of them are read, and none is transparency.
         """
         self.source, self.name = source, name
         shape, kind = tuple(source.shape), np.dtype(source.dtype).name
-        if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] > (planes or 4)):
+        if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] > (channels or 4)):
             raise ValueError(
                 f"{name} must have the shape (H, W) or (H, W, S) with one to four channels, got {shape}; "
                 "move the channels to the end"
@@ -100,7 +100,7 @@ class Picture:
             raise TypeError(f"{name} must hold one of {', '.join(KINDS)}, got {kind}; convert it")
         self.size = (int(shape[0]), int(shape[1]))
         self.samples = int(shape[2]) if len(shape) == 3 else 1
-        self.colours = planes or (3 if self.samples >= 3 else 1)
+        self.colours = channels or (3 if self.samples >= 3 else 1)
         self.kind = kind
         self.dtype = torch.float64 if kind == "float64" else torch.float32
 

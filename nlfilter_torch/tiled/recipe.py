@@ -9,9 +9,9 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.strokes import by_rows
+from nlfilter_torch.tiled.strokes import strokes_by_rows
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
-from nlfilter_torch.tiled.workers import undivided
+from nlfilter_torch.tiled.workers import single_threaded
 
 
 def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Rows:
@@ -37,7 +37,7 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
         if steps:
             yield from step_rows(steps[-1], passes, source, name)
         else:
-            yield from passes.work_out(
+            yield from passes.apply_in_tiles(
                 picture, lambda tile: tile.inner, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1])
             )
 
@@ -45,6 +45,6 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
 def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
     """Yield the rows of a picture after a step."""
     tiled = Tiled(Picture(source, name), passes)
-    with undivided(passes.workers(1)):
-        fitted = fit_step(step, tiled, *by_rows(step, tiled.size))
+    with single_threaded(passes.workers(1)):
+        fitted = fit_step(step, tiled, *strokes_by_rows(step, tiled.size))
     yield from tiled.rows(fitted)

@@ -29,35 +29,35 @@ from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
-from nlfilter_torch.tiled.workers import in_order, undivided
+from nlfilter_torch.tiled.workers import in_order, single_threaded
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
-STARTED = 1e-3  # tolerance of its balancing, which is an initial guess
+PILOT_TOLERANCE = 1e-3  # tolerance of its balancing, which is an initial guess
 CHUNK = 1 << 16  # scribbled pixels whose factor is in memory at once
 
 Report = Callable[[str, int, int], None]
 
 
-class KeptColumns:
+class ColumnCache:
     """Cache of columns between passes, for the first pixels of a picture.
 
     Args:
-        each: pixels in a block of a pass.
-        count: largest number of pixels to keep.
+        block_pixels: pixels in a block of a pass.
+        max_pixels: largest number of pixels to keep.
     """
 
-    def __init__(self, each: int, count: int) -> None:
-        self.each, self.count = each, count
+    def __init__(self, block_pixels: int, max_pixels: int) -> None:
+        self.block_pixels, self.max_pixels = block_pixels, max_pixels
         self.blocks: dict[int, tuple[Tensor, Tensor]] = {}
 
     def keep(self, first: int, columns: tuple[Tensor, Tensor]) -> None:
         """Store the columns of the block that begins at pixel ``first``, if there is room."""
-        if first + columns[1].shape[1] <= self.count:
+        if first + columns[1].shape[1] <= self.max_pixels:
             self.blocks[first] = columns
 
     def find(self, pixels: slice) -> tuple[Tensor, Tensor] | None:
         """Factor and diagonal of some pixels, or None unless all are in one stored block."""
-        first = pixels.start // self.each * self.each
+        first = pixels.start // self.block_pixels * self.block_pixels
         known = self.blocks.get(first)
         if known is None or pixels.stop > first + known[1].shape[1]:
             return None
@@ -66,7 +66,7 @@ class KeptColumns:
 
 
 def over_all(
-    picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int, kept: KeptColumns
+    picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int, cache: ColumnCache
 ) -> Pass:
     """A pass over every pixel of a picture."""
     size = kernel.recipe.patch_weights.shape[0] // 2
@@ -78,11 +78,11 @@ def over_all(
 
     def block_of(tile: Tile) -> Block:
         image, first = tile.inner.flatten(2), tile.start * picture.size[1]
-        columns = kept.find(slice(first, first + image.shape[2]))
+        columns = cache.find(slice(first, first + image.shape[2]))
         if columns is None:
             guide = picture.seen(tile, size)
             columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
-            kept.keep(first, columns)
+            cache.keep(first, columns)
         return Block(*columns, image, torch.ones_like(columns[1]), tile.start)
 
     return lambda function: in_order(lambda tile: function(block_of(tile)), tiles(), workers)
@@ -95,13 +95,13 @@ class Pilot:
     Attributes:
         kernel: landmarks, bandwidths and window.
         sample: pixels spread evenly over the picture.
-        balancing: the moment t (1, M, 1) of the balanced sample.
+        moment: the moment t (1, M, 1) of the balanced sample.
         seed: for further samples.
     """
 
     kernel: Kernel
     sample: Block
-    balancing: Tensor
+    moment: Tensor
     seed: int
 
     @property
@@ -177,10 +177,10 @@ def take_pilot(
         points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
         kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
         columns = kernel.factor(features[:, :, len(candidates) :])
-        found = balance(*columns, tolerance=STARTED, completed=completion == "diagonal", weights=weights)
+        found = balance(*columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=weights)
         return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
 
-    with undivided(workers):  # so few pixels that a second thread would wait most of the time
+    with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
         return fitted()
 
 
@@ -222,7 +222,7 @@ def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: Gu
     return torch.cat([features, places[None] / torch.as_tensor(recipe.spatial_bandwidth).to(features)], dim=1)
 
 
-EVEN = 0.1  # share of a sample that is spread evenly over the picture
+EVEN_SHARE = 0.1  # share of a sample that is spread evenly over the picture
 
 
 class Draws:
@@ -236,7 +236,7 @@ class Draws:
 
     def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
         """``columns`` are those of the pilot's sample."""
-        self.completed, self.seed, self.even = pilot.completed, pilot.seed, EVEN * count / pixels
+        self.completed, self.seed, self.even = pilot.completed, pilot.seed, EVEN_SHARE * count / pixels
         weight = float(pilot.sample.weights[0, 0])
         self.rate = _rate(self.leverage(pilot.sample, columns), weight, self.even, count)
 
@@ -248,7 +248,7 @@ class Draws:
     def __call__(self, block: Block, columns: Columns) -> Block:
         """Draw pixels from a block."""
         likely = (self.even + self.rate * self.leverage(block, columns)).clamp(max=1.0)
-        chosen, counts = draw(likely, np.random.default_rng([self.seed, block.number]))
+        chosen, counts = draw(likely, np.random.default_rng([self.seed, block.start_row]))
         weights = (counts / likely[chosen]).to(block.weights)[None]
         factor, diagonal, image = (planes[..., chosen] for planes in (block.factor, block.diagonal, block.image))
         return Block(factor, diagonal, image, weights)

@@ -11,15 +11,15 @@ from torch import Tensor
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.tiled.pictures import Picture, RowSource, transparency
 
-Rows = Callable[[int, int], Tensor]  # (start, stop) to these rows
+ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
 @dataclass(frozen=True)
 class RegionRows:
-    """The mask of region ``number``: rows (h, W), one channel of rows (h, W, K)."""
+    """The mask of region ``region``: rows (h, W), one channel of rows (h, W, K)."""
 
     masks: RowSource
-    number: int
+    region: int
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -33,7 +33,7 @@ class RegionRows:
 
     def __getitem__(self, rows: slice) -> Any:
         """The rows from ``rows.start`` to ``rows.stop``."""
-        return np.asarray(self.masks[rows])[..., self.number]
+        return np.asarray(self.masks[rows])[..., self.region]
 
 
 def read_scribbles(
@@ -85,7 +85,7 @@ def read_scribbles(
             )
         chosen = plane.nonzero().squeeze(1)
         count += len(chosen)
-        check_room(picture, count, 0, memory)
+        check_scribble_memory(picture, count, 0, memory)
         if len(chosen):
             places.append(chosen + start * width)
             values.append(plane[chosen].to(picture.dtype))
@@ -99,12 +99,12 @@ def read_scribbles(
     return Scribbles(torch.cat(places), torch.cat(values)[None, None], torch.cat(below, dim=2), shown)
 
 
-def _transparency(over: Picture) -> Rows:
+def _transparency(over: Picture) -> ReadRows:
     """Read the transparency (h, W) of a picture."""
     return lambda start, stop: torch.from_numpy(transparency(over.tile(start, stop, 0), "float32"))[..., 0]
 
 
-def _plane(picture: Picture, mask: RowSource, name: str) -> Rows:
+def _plane(picture: Picture, mask: RowSource, name: str) -> ReadRows:
     """Read the rows (h, W) of a mask."""
     over = _overlay(picture, mask, name)
     if over.samples != 1:
@@ -122,14 +122,14 @@ def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
     return Picture(rows, name)
 
 
-def floats_of_scribbled(numbers: int) -> int:
-    """Floats per scribbled pixel with ``numbers`` features, which are in memory twice while they are concatenated."""
-    return 2 * numbers + 40
+def floats_per_scribbled_pixel(num_features: int) -> int:
+    """Floats per scribbled pixel in memory; features are there twice while they are concatenated."""
+    return 2 * num_features + 40
 
 
-def check_room(picture: Picture, count: int, numbers: int, memory: int) -> None:
-    """Raise MemoryError if ``count`` scribbled pixels with ``numbers`` features take more than ``memory`` bytes."""
-    needed = count * floats_of_scribbled(numbers) * picture.dtype.itemsize
+def check_scribble_memory(picture: Picture, count: int, num_features: int, memory: int) -> None:
+    """Raise MemoryError if ``count`` scribbled pixels with their features take more than ``memory`` bytes."""
+    needed = count * floats_per_scribbled_pixel(num_features) * picture.dtype.itemsize
     if needed > memory:
         raise MemoryError(
             f"the strokes on {picture.name} cover at least {count} pixels and need {needed / 1e6:.0f} MB of memory, "

@@ -18,13 +18,13 @@ from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
-from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot, visit
-from nlfilter_torch.tiled.scribbles import RegionRows, check_room, floats_of_scribbled, read_scribbles
-from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
-from nlfilter_torch.tiled.workers import Result, in_order, undivided
+from nlfilter_torch.tiled.sampling import ColumnCache, take_pilot, visit
+from nlfilter_torch.tiled.scribbles import RegionRows, check_scribble_memory, floats_per_scribbled_pixel, read_scribbles
+from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, cacheable_pixels, rows_that_fit
+from nlfilter_torch.tiled.workers import Result, in_order, single_threaded
 
-HELD = 1 / 16  # largest share of the memory for planes that an edit reuses
-FINISHED = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
+CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses
+FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
 
 
 class Tiled:
@@ -44,10 +44,10 @@ class Tiled:
         self.picture, self.passes, self.strokes = picture, passes, strokes
         self.size, self.channels, self.dtype = picture.size, picture.colours, picture.dtype
         self.operators: list[TiledOperator] = []
-        self.floats = 8 * picture.colours + 40  # floats per pixel of a tile; each operator adds its features
-        self.scribbled = 0  # pixels
-        self.kept = 0  # floats of cached columns
-        self.stored = 0  # floats of stored guides
+        self.tile_floats = 8 * picture.colours + 40  # floats per pixel of a tile; each operator adds its features
+        self.scribbled_pixels = 0
+        self.cached_floats = 0  # floats of cached columns
+        self.guide_floats = 0  # floats of stored guides
 
     @torch.no_grad()
     @full_precision
@@ -61,56 +61,56 @@ class Tiled:
         patch_size, count = options.get("patch_size", 5), options.get("num_landmarks", 100)
         check_count(patch_size, "patch_size")
         check_count(count, "num_landmarks")
-        compared = guide.planes or (self.channels if options.get("guide_channels") == "all" else 1)
-        numbers = patch_size**2 * compared + 2
+        compared = guide.channels or (self.channels if options.get("guide_channels") == "all" else 1)
+        num_features = patch_size**2 * compared + 2
         for other in self.operators:
-            other.kept = KeptColumns(1, 0)  # frees memory
-        self.kept = 0
-        self.room(numbers, count)
+            other.cache = ColumnCache(1, 0)  # frees memory
+        self.cached_floats = 0
+        self.fitting_rows(num_features, count)
         passes, picture = self.passes, GuidePicture(self.picture, guide)
         workers = passes.workers(count)
-        if guide.margin and passes.stores(picture.pixels * compared * self.dtype.itemsize):
-            self.stored += picture.pixels * compared
-            self.room(numbers, count)
+        if guide.margin and passes.stores_guide(picture.pixels * compared * self.dtype.itemsize):
+            self.guide_floats += picture.pixels * compared
+            self.fitting_rows(num_features, count)
             picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
         pilot = take_pilot(picture, passes.report, workers, **options)
-        sampled, count = passes.sample < picture.pixels, pilot.balancing.shape[1]
-        kept = pixels_kept(picture, passes, numbers, count, self.floats_stored(numbers))
-        self.kept = kept * (count + 2)
+        sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
+        cached_pixels = cacheable_pixels(picture, passes, num_features, count, self.stored_floats(num_features))
+        self.cached_floats = cached_pixels * (count + 2)
         found = TiledOperator(
             picture,
             pilot,
             passes.report,
             passes.sample if sampled else None,
-            full=not sampled or passes.statistics == "full" or guide.exact,
+            full_passes=not sampled or passes.statistics == "full" or guide.exact,
             kernel=pilot.kernel,
             bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, count),
             workers=workers,
-            kept=KeptColumns(picture.statistics_rows * self.size[1], kept),
+            cache=ColumnCache(picture.statistics_rows * self.size[1], cached_pixels),
         )
         self.operators.append(found)
-        self.floats += numbers
+        self.tile_floats += num_features
         return found
 
-    def room(self, numbers: int, num_landmarks: int) -> int:
-        """Rows of a tile that fit in memory, with ``numbers`` more features per pixel.
+    def fitting_rows(self, num_features: int, num_landmarks: int) -> int:
+        """Rows of a tile that fit in memory, with ``num_features`` more features per pixel.
 
         Raises:
             MemoryError: if not even one row fits, or the samples do not.
         """
-        check_room(self.picture, self.scribbled, numbers, self.passes.memory)
+        check_scribble_memory(self.picture, self.scribbled_pixels, num_features, self.passes.memory)
         return rows_that_fit(
             self.picture,
             self.passes,
-            floats=self.floats + numbers,
-            planes=numbers,
+            floats=self.tile_floats + num_features,
+            num_features=num_features,
             num_landmarks=num_landmarks,
-            held=self.kept + self.floats_stored(numbers),
+            extra_floats=self.cached_floats + self.stored_floats(num_features),
         )
 
-    def floats_stored(self, numbers: int) -> int:
-        """Floats of stored guides, and of scribbles with ``numbers`` features per pixel."""
-        return self.stored + self.scribbled * floats_of_scribbled(numbers)
+    def stored_floats(self, num_features: int) -> int:
+        """Floats of stored guides, and of scribbles with ``num_features`` features per pixel."""
+        return self.guide_floats + self.scribbled_pixels * floats_per_scribbled_pixel(num_features)
 
     def scribbles(
         self, mask: RowSource | None, colours: RowSource | None, name: str, *, needed: bool = True
@@ -136,7 +136,7 @@ class Tiled:
         if needed and len(found.places) == 0:
             called = self.strokes if mask is None else name
             raise ValueError(f"{called} must hold a painted pixel, got none; paint at least one")
-        self.scribbled += len(found.places)
+        self.scribbled_pixels += len(found.places)
         return found
 
     def regions(self, masks: RowSource, name: str) -> list[Scribbles]:
@@ -197,7 +197,7 @@ class Tiled:
 
     def cached(self, fitted: Fitted) -> Fitted:
         """Compute the planes of an edit and keep them in memory, if small; else they are recomputed on every use."""
-        if self.picture.pixels * self.channels * self.dtype.itemsize > HELD * self.passes.memory:
+        if self.picture.pixels * self.channels * self.dtype.itemsize > CACHED_SHARE * self.passes.memory:
             return fitted
         planes = self.all(fitted)
 
@@ -229,7 +229,7 @@ class Tiled:
         def summed(tile: Tile) -> Tensor:
             return planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
 
-        total = sum(self._of_tiles(summed, 0, self.picture.statistics_rows, "Averaging"))
+        total = sum(self._map_tiles(summed, 0, self.picture.statistics_rows, "Averaging"))
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
 
     @torch.no_grad()
@@ -240,9 +240,9 @@ class Tiled:
         def part(tile: Tile) -> Tensor:
             return block_means(planes(self.pixels_of(tile)), step)
 
-        return torch.cat(list(self._of_tiles(part, 0, rows, "Reducing")), dim=2)
+        return torch.cat(list(self._map_tiles(part, 0, rows, "Reducing")), dim=2)
 
-    def _of_tiles(self, function: Callable[[Tile], Result], margin: int, rows: int, stage: str) -> Iterator[Result]:
+    def _map_tiles(self, function: Callable[[Tile], Result], margin: int, rows: int, stage: str) -> Iterator[Result]:
         """Apply a function to each tile, and yield the results in order.
 
         The first tile is finished before the others begin, since it may compute the sums of an operator.
@@ -261,7 +261,7 @@ class Tiled:
         """The picture, reduced by means over blocks of an integer number of pixels along each axis, in memory.
 
         Raises:
-            MemoryError: if ``floats`` numbers for each of its pixels do not fit.
+            MemoryError: if ``floats`` num_features for each of its pixels do not fit.
         """
         needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
         if needed > self.passes.memory:
@@ -287,7 +287,7 @@ class Tiled:
         The height of tiles therefore does not affect results, although the rounding of a matrix product depends on its
         shape.
         """
-        width, step = self.size[1], self.passes.rows_together(self.size[1])
+        width, step = self.size[1], self.passes.chunk_rows(self.size[1])
         features: dict[int, tuple[Tensor, ...]] = {}
 
         def part_of(operator: TiledOperator, part: int) -> Tensor:
@@ -323,14 +323,16 @@ class Tiled:
         """
         passes = self.plain if plain else self.passes
         landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
-        rows = self.passes.tile_rows or (self.room(0, landmarks) if self.operators else TILE_PIXELS // self.size[1])
-        together, workers = self.passes.rows_together(self.size[1]), self.passes.workers(landmarks)
+        rows = self.passes.tile_rows or (
+            self.fitting_rows(0, landmarks) if self.operators else TILE_PIXELS // self.size[1]
+        )
+        together, workers = self.passes.chunk_rows(self.size[1]), self.passes.workers(landmarks)
         rows = max(1, rows // together) * together
-        with undivided(workers):
+        with single_threaded(workers):
             for operator in self.operators:
-                operator.settle()  # before several workers need it
+                operator.prepare()  # before several workers need it
         if fitted.finish is None:
-            yield from passes.work_out(
+            yield from passes.apply_in_tiles(
                 self.picture,
                 lambda tile: self.edited(fitted, tile),
                 self.margin,
@@ -340,7 +342,7 @@ class Tiled:
             )
             return
         finish, margin = fitted.finish, fitted.margin
-        before = self.plain.work_out(
+        before = self.plain.apply_in_tiles(
             self.picture,
             lambda tile: self.edited(fitted, tile),
             self.margin,
@@ -350,7 +352,7 @@ class Tiled:
             stage="Comparing",
         )
         with intermediate(before, self.size, self.passes.folder) as planes:
-            stored = Picture(planes, self.picture.name, planes=planes.shape[2])
+            stored = Picture(planes, self.picture.name, channels=planes.shape[2])
 
             def finished(tile: Tile) -> Tensor:
                 stop = tile.start + tile.inner.shape[2]
@@ -358,7 +360,9 @@ class Tiled:
                 return found[..., tile.halo[0] : found.shape[2] - tile.halo[1], :]
 
             rows, workers = self._rows_to_finish(fitted, rows, workers)
-            yield from passes.work_out(self.picture, finished, margin, rows, workers=workers, transparent=not plain)
+            yield from passes.apply_in_tiles(
+                self.picture, finished, margin, rows, workers=workers, transparent=not plain
+            )
 
     def _rows_to_finish(self, fitted: Fitted, rows: int, workers: int) -> tuple[int, int]:
         """Rows per tile and number of workers for ``finish``.
@@ -369,7 +373,7 @@ class Tiled:
         Raises:
             MemoryError: if no tile fits.
         """
-        row = self.size[1] * FINISHED * self.dtype.itemsize
+        row = self.size[1] * FINISH_FLOATS * self.dtype.itemsize
         most = self.passes.memory // row - 2 * fitted.margin
         if self.size[0] > most and most < fitted.step:
             raise MemoryError(

@@ -37,16 +37,16 @@ ALARM = 1e-3
 
 @dataclass(frozen=True)
 class Block:
-    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each represents (1, n); an index."""
+    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each represents (1, n); first row."""
 
     factor: Tensor
     diagonal: Tensor
     image: Tensor
     weights: Tensor
-    number: int = 0
+    start_row: int = 0
 
     @staticmethod
-    def together(parts: list["Block"]) -> "Block":
+    def concatenate(parts: list["Block"]) -> "Block":
         """Several blocks as one."""
         factors, diagonals, images, weights = zip(
             *((part.factor, part.diagonal, part.image, part.weights) for part in parts), strict=True
@@ -92,19 +92,19 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
     return total
 
 
-def limiter_by_passes(blocks: Pass, balancing: PixelScaling, dtype: torch.dtype) -> Tensor | None:
+def limiter_by_passes(blocks: Pass, pixel_scaling: PixelScaling, dtype: torch.dtype) -> Tensor | None:
     """Compute the ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
 
     def gram(at: Tensor, power: int) -> Tensor:
         def part(block: Block) -> Tensor:
-            scaling, remainder = balancing(block.factor, block.diagonal)
+            scaling, remainder = pixel_scaling(block.factor, block.diagonal)
             weights = block.weights * shift(at, remainder).pow(-power)
             return sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
 
         return torch.stack(list(blocks(part))).sum(0)
 
     allowed = slack(dtype, CONVERGED[dtype])
-    return limiter(gram, balancing.moment, allowed) if exceeds(gram, balancing.moment, allowed) else None
+    return limiter(gram, pixel_scaling.moment, allowed) if exceeds(gram, pixel_scaling.moment, allowed) else None
 
 
 @dataclass(frozen=True)

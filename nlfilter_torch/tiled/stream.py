@@ -14,7 +14,7 @@ from nlfilter_torch.tiled.pictures import Picture, RowSource, RowTarget
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
-from nlfilter_torch.tiled.workers import undivided
+from nlfilter_torch.tiled.workers import single_threaded
 
 
 def stream_detail(
@@ -80,7 +80,7 @@ def stream_detail(
     check_target(target, source)
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
-    with undivided(tiled.passes.workers(1)):
+    with single_threaded(tiled.passes.workers(1)):
         fitted = fit_detail(
             tiled,
             alpha,
@@ -159,7 +159,7 @@ def stream_recolor(
             f"source must have 3 or 4 channels to be recoloured, got {tiled.picture.samples}; colourise it instead"
         )
     options |= {"photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
-    with undivided(tiled.passes.workers(1)):
+    with single_threaded(tiled.passes.workers(1)):
         fitted = fit_recolor(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)
     fill(target, tiled.rows(fitted))
 
@@ -226,7 +226,7 @@ def stream_colorize(
     """
     check_target(target, source, coloured=True)
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
-    with undivided(tiled.passes.workers(1)):
+    with single_threaded(tiled.passes.workers(1)):
         fitted = fit_colorize(
             tiled,
             strokes,

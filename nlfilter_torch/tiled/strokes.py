@@ -13,7 +13,7 @@ from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.steps import Step
 
 Floats = NDArray[np.float32]
-LOOKED_AT = 64  # rows read at once
+CHUNK_ROWS = 64  # rows read at once
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class CoveredRows:
 
     def any(self) -> bool:
         """Whether the strokes cover a pixel."""
-        starts = range(0, self.size[0], LOOKED_AT)
-        return any(self[start : min(start + LOOKED_AT, self.size[0])].any() for start in starts)
+        starts = range(0, self.size[0], CHUNK_ROWS)
+        return any(self[start : min(start + CHUNK_ROWS, self.size[0])].any() for start in starts)
 
     def __getitem__(self, rows: slice) -> Floats:
         """The rows from ``rows.start`` to ``rows.stop``."""
@@ -60,6 +60,6 @@ class ColouredRows(CoveredRows):
         return found
 
 
-def by_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+def strokes_by_rows(step: Step, size: tuple[int, int]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The strokes of a step as in :func:`scribbles_of`, as sources of rows."""
     return scribbles_of(step, size, lambda strokes, size: (ColouredRows(strokes, size), None), CoveredRows)

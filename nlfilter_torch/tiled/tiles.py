@@ -18,9 +18,9 @@ from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
-TOGETHER, AMPLE = 1 << 14, 1 << 28  # pixels computed together, for speed, if that many bytes may be used
+CHUNK_PIXELS, LARGE_MEMORY = 1 << 14, 1 << 28  # pixels computed together, for speed, if that many bytes may be used
 Statistics = Literal["sample", "full"]
-Edit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
+TileEdit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
 
 
 def in_silence(stage: str, done: int, rows: int) -> None:
@@ -35,7 +35,7 @@ class Passes:
         kind: dtype of the output.
         statistics: from a sample of the pixels or from all of them.
         sample: number of pixels of that sample.
-        tile_rows: rows of a tile, see :meth:`rows_together`; None is as many as fit in memory.
+        tile_rows: rows of a tile, see :meth:`chunk_rows`; None is as many as fit in memory.
         memory: bytes that may be used.
         report: called with the progress.
         folder: for planes between two passes; None is the system's folder for temporary files.
@@ -71,24 +71,24 @@ class Passes:
         if self.tile_rows is not None:
             check_count(self.tile_rows, "tile_rows")
 
-    def rows_together(self, width: int) -> int:
+    def chunk_rows(self, width: int) -> int:
         """Number of rows that are always computed together; the height of a tile is a multiple of it."""
-        return max(1, (TOGETHER if self.memory >= AMPLE else 1) // width)
+        return max(1, (CHUNK_PIXELS if self.memory >= LARGE_MEMORY else 1) // width)
 
     def workers(self, num_landmarks: int) -> int:
         """Number of tiles computed at once, each by its own thread: as many as memory allows."""
-        if self.memory < AMPLE:
+        if self.memory < LARGE_MEMORY:
             return 1
-        return max(1, min(self.threads, self.memory // (4 * bytes_at_hand(TOGETHER, num_landmarks))))
+        return max(1, min(self.threads, self.memory // (4 * factor_bytes(CHUNK_PIXELS, num_landmarks))))
 
-    def stores(self, taken: int) -> bool:
-        """Whether a guide of ``taken`` bytes is kept from one pass to the next."""
-        return self.memory >= AMPLE and taken <= self.memory // 4
+    def stores_guide(self, guide_bytes: int) -> bool:
+        """Whether a guide of ``guide_bytes`` bytes is kept from one pass to the next."""
+        return self.memory >= LARGE_MEMORY and guide_bytes <= self.memory // 4
 
-    def work_out(
+    def apply_in_tiles(
         self,
         picture: Picture,
-        edit: Edit,
+        edit: TileEdit,
         margin: int,
         rows: int,
         *,
@@ -103,17 +103,17 @@ class Passes:
                 self.report(stage, tile.start, picture.size[0])
                 yield tile
 
-        def worked_out(tile: Tile) -> tuple[slice, NDArray[Any]]:
+        def edited_tile(tile: Tile) -> tuple[slice, NDArray[Any]]:
             values = stored_as(edit(tile), self.kind)
             if transparent:
                 values = np.concatenate([values, transparency(tile, self.kind)], axis=2)
             return slice(tile.start, tile.start + len(values)), values
 
-        yield from in_order(worked_out, tiles(), workers)
+        yield from in_order(edited_tile, tiles(), workers)
         self.report(stage, picture.size[0], picture.size[0])
 
 
-def bytes_at_hand(pixels: int, num_landmarks: int) -> int:
+def factor_bytes(pixels: int, num_landmarks: int) -> int:
     """Memory in bytes for pixels that are computed together: their factor, and products of the same size."""
     return 16 * pixels * num_landmarks
 
@@ -134,16 +134,16 @@ def fill(target: RowTarget, rows: Rows) -> None:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
 
 
-def bytes_needed(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int = 0) -> int:
+def bytes_needed(picture: Picture, passes: Passes, num_features: int, num_landmarks: int, extra_floats: int = 0) -> int:
     """Smallest memory in bytes for statistics and for rows; arguments as in :func:`rows_that_fit`."""
     size = picture.dtype.itemsize
-    workers, rows = passes.workers(num_landmarks), passes.rows_together(picture.size[1])
-    at_hand = workers * bytes_at_hand(rows * picture.size[1], num_landmarks) // 4
+    workers, rows = passes.workers(num_landmarks), passes.chunk_rows(picture.size[1])
+    factors = workers * factor_bytes(rows * picture.size[1], num_landmarks) // 4
     # First the pilot, with copies of its features and its factor; later the factors of both samples, and blocks.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
     some = (pilot + min(picture.pixels, passes.sample)) * (num_landmarks + picture.colours + 2)
-    later = some + workers * block * (num_landmarks + planes + 8)
-    return size * (held + at_hand + max(pilot * (num_landmarks + 3 * planes), later))
+    later = some + workers * block * (num_landmarks + num_features + 8)
+    return size * (extra_floats + factors + max(pilot * (num_landmarks + 3 * num_features), later))
 
 
 def rows_that_fit(
@@ -151,9 +151,9 @@ def rows_that_fit(
     passes: Passes,
     *,
     floats: int,
-    planes: int,
+    num_features: int,
     num_landmarks: int,
-    held: int = 0,
+    extra_floats: int = 0,
 ) -> int:
     """Number of rows of a tile that fit in memory.
 
@@ -161,28 +161,28 @@ def rows_that_fit(
         picture: to be edited.
         passes: tiling options.
         floats: per pixel of a tile.
-        planes: features per pixel.
+        num_features: features per pixel.
         num_landmarks: M.
-        held: floats that are kept in memory besides.
+        extra_floats: floats that are kept in memory besides.
 
     Raises:
         MemoryError: if not even one row fits, or the samples do not.
     """
     row = picture.size[1] * floats * picture.dtype.itemsize
-    least = bytes_needed(picture, passes, planes, num_landmarks, held)
+    least = bytes_needed(picture, passes, num_features, num_landmarks, extra_floats)
     if max(row, least) > passes.memory:
         raise MemoryError(
             f"{picture.name} needs at least {max(row, least) / 1e6:.0f} MB of memory, but only "
             f"{passes.memory / 1e6:.0f} MB may be used; allow more, or use fewer landmarks"
         )
-    tiles, together = 1 + passes.workers(num_landmarks), passes.rows_together(picture.size[1]) * picture.size[1]
-    taken = picture.dtype.itemsize * held + (tiles - 1) * bytes_at_hand(together, num_landmarks)
+    tiles, together = 1 + passes.workers(num_landmarks), passes.chunk_rows(picture.size[1]) * picture.size[1]
+    taken = picture.dtype.itemsize * extra_floats + (tiles - 1) * factor_bytes(together, num_landmarks)
     return max(1, min((passes.memory - taken) // (tiles * row), TILE_PIXELS // picture.size[1]))
 
 
-def pixels_kept(picture: Picture, passes: Passes, planes: int, num_landmarks: int, held: int) -> int:
+def cacheable_pixels(picture: Picture, passes: Passes, num_features: int, num_landmarks: int, extra_floats: int) -> int:
     """Number of pixels whose columns can be kept from one pass to the next."""
-    if passes.memory < AMPLE:
+    if passes.memory < LARGE_MEMORY:
         return 0
-    spare = passes.memory * 7 // 10 - bytes_needed(picture, passes, planes, num_landmarks, held)
+    spare = passes.memory * 7 // 10 - bytes_needed(picture, passes, num_features, num_landmarks, extra_floats)
     return min(picture.pixels, max(0, spare // (picture.dtype.itemsize * (num_landmarks + 2))))

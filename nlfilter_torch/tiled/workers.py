@@ -52,7 +52,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
 
 
 @contextmanager
-def undivided(workers: int) -> Iterator[None]:
+def single_threaded(workers: int) -> Iterator[None]:
     """Keep the calling thread from dividing operations among threads, if there are several workers.
 
     Other threads still divide their operations.
