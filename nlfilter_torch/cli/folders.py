@@ -9,9 +9,6 @@ import contextlib
 import io
 import json
 import os
-import signal
-import threading
-import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -19,13 +16,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-
+from nlfilter_torch.cli.workers import be_worker
 from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, remove_stale
 
 CONNECTING = 30  # seconds for a cluster to answer
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
-WATCHED = 0.5  # seconds after which a worker looks whether the main process is there
 DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the files
 
 DIED = "the process that worked on it died; give it more memory, by fewer --workers, or look at the file"
@@ -124,15 +119,20 @@ def edit_folder(
         begin: called with the name of every file that ended.
         tally: updated as each file ends, so that it is correct after an interrupt too.
     """
-    remove_stale(target, {path.name for path in paths})
+    names = {path.name for path in paths}
+    remove_stale(target, names)
     jobs = [path for path in paths if not (target / path.name).exists()]
     tally.skipped += len(paths) - len(jobs)
     tally.left += len(jobs)
+    if not jobs:
+        return
     deaths = 0
     with (
+        contextlib.ExitStack() as afterwards,
         _pool(cluster, min(workers, len(jobs)), threads) as workers,
         contextlib.closing(_outcomes(jobs, target, edit, workers)) as ended,
     ):
+        afterwards.callback(remove_stale, target, names)  # of workers that were ended by an interrupt
         for path, outcome in ended:
             begin(path.name)
             tally.left -= 1
@@ -155,10 +155,15 @@ def _pool(cluster: str | None, workers: int, threads: int) -> Iterator[int]:
     import joblib
 
     if cluster is None:
-        # A single one would be this process, which must outlive them.
+        from joblib.externals.loky import get_reusable_executor
+
+        # With one, joblib would work in this process, which must outlive the files; a second one stays idle then.
         options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
-        with joblib.parallel_config("loky", initializer=_begin, initargs=(os.getpid(), threads), **options):
-            yield workers
+        try:
+            with joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options):
+                yield workers
+        finally:
+            get_reusable_executor().shutdown()
         return
     try:
         from distributed import Client
@@ -181,51 +186,40 @@ def _outcomes(jobs: Sequence[Path], target: Path, edit: Edit, workers: int) -> G
     from joblib import Parallel, delayed
 
     def run(paths: Sequence[Path]) -> Generator[tuple[Path, list[str] | str]]:
-        calls = (delayed(_work)(edit, path, target / path.name) for path in paths)
+        calls = [delayed(_work)(edit, path, target / path.name) for path in paths]
         return Parallel(return_as="generator_unordered", pre_dispatch=workers, batch_size=1)(calls)
 
-    waiting = list(jobs)
+    def alone(path: Path) -> tuple[Path, list[str] | str]:
+        if (target / path.name).exists():  # it had ended
+            return path, []
+        if workers > 1:
+            try:
+                (outcome,) = run([path])
+            except Exception as error:
+                if not _is_death(error):
+                    raise
+            else:
+                return outcome
+        return path, DIED
+
+    waiting = dict.fromkeys(jobs)
     while waiting:
         try:
-            for path, outcome in run(waiting):
-                waiting.remove(path)
-                yield path, outcome
+            with contextlib.closing(run(list(waiting))) as ended:
+                for path, outcome in ended:
+                    del waiting[path]
+                    yield path, outcome
         except Exception as error:
             if not _is_death(error):
                 raise
-            begun = waiting[:workers]
-            for path in begun:
-                waiting.remove(path)
-                if (target / path.name).exists():  # it had ended
-                    yield path, []
-                    continue
-                try:
-                    yield from [(path, DIED)] if workers == 1 else list(run([path]))
-                except Exception as again:
-                    if not _is_death(again):
-                        raise
-                    yield path, DIED
+            for path in list(waiting)[:workers]:
+                del waiting[path]
+                yield alone(path)
 
 
 def _is_death(error: Exception) -> bool:
     """Whether a worker died; Dask tries a file on several of them before it says so."""
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
-
-
-def _begin(parent: int, threads: int) -> None:
-    """Initialise a worker."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the main process handles them
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
-    torch.set_num_threads(threads)
-    # A worker would not notice that the main process was killed, and would wait for ever.
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(WATCHED)
-    os._exit(1)
 
 
 def _work(edit: Edit, source: Path, target: Path) -> tuple[Path, list[str] | str]:
