@@ -160,7 +160,11 @@ def _pool(cluster: str | None, workers: int, threads: int) -> Iterator[int]:
         # With one, joblib would work in this process, which must outlive the files; a second one stays idle then.
         options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
         try:
-            with joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options):
+            with (
+                joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options),
+                warnings.catch_warnings(),
+            ):
+                warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
                 yield workers
         finally:
             get_reusable_executor().shutdown()
