@@ -149,7 +149,7 @@ def test_a_cluster_that_does_not_answer(
 
 def copy_or_fail(source: str, target: str) -> None:
     """An edit whose process dies on some files and raises an unexpected error on others."""
-    if Path(source).stem in ("1", "4"):
+    if Path(source).stem == "1":
         os.kill(os.getpid(), signal.SIGKILL)
     if Path(source).stem == "2":
         raise KeyError("what")
@@ -177,15 +177,11 @@ def plain_files(folder: Path, count: int) -> list[Path]:
 @pytest.mark.slow
 def test_a_worker_that_dies_and_an_error_are_reported(tmp_path: Path) -> None:
     """The file of a worker that died with it is done."""
-    paths = plain_files(tmp_path / "in", 6)
+    paths = plain_files(tmp_path / "in", 5)
     tally, told = tally_of(paths, tmp_path / "out", copy_or_fail, workers=2)
     assert (tally.done, tally.skipped, tally.left) == (3, 0, 0)
-    assert sorted(told) == [
-        f"1.png: {folders.DIED}",
-        "2.png: KeyError: 'what'",
-        f"4.png: {folders.DIED}",
-    ]
-    assert sorted(finished(tmp_path / "out")) == ["0.png", "3.png", "5.png"]
+    assert sorted(told) == [f"1.png: {folders.DIED}", "2.png: KeyError: 'what'"]
+    assert sorted(finished(tmp_path / "out")) == ["0.png", "3.png", "4.png"]
 
 
 @pytest.mark.slow
