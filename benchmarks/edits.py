@@ -37,7 +37,7 @@ STEP = 7  # pixels that the camera moves from frame to frame
 
 
 @dataclass(frozen=True)
-class Promise:
+class Claim:
     """A claim that a measured value is at least, or at most, its limit."""
 
     what: str
@@ -58,7 +58,7 @@ def _astronaut(side: int) -> tuple[Tensor, Tensor, Spectrum]:
     return image, spots(image, scale, SUIT), operator.spectrum()
 
 
-def masks() -> Iterator[Promise]:
+def masks() -> Iterator[Claim]:
     """Masks of a scribble on the astronaut's suit, with RGB guide and h = 25/255."""
     _, spot, whole = _astronaut(512)
     _, small_spot, preview = _astronaut(256)
@@ -67,38 +67,40 @@ def masks() -> Iterator[Promise]:
     below_collar = np.arange(512)[:, None] > 200
     suit = torch.from_numpy((hue > 0.01) & (hue < 0.08) & (saturation > 0.6) & (value > 0.35) & below_collar)
     ratio = float(mask[0, 0][suit].mean() / mask[0, 0][~suit].mean())
-    yield Promise("mask at t = 1: mean on the suit, over the mean elsewhere", 3.0, ratio, at_least=True)
+    yield Claim("mask at t = 1: mean on the suit / mean elsewhere", 3.0, ratio, at_least=True)
     levels = torch.linspace(0, 1, 21)
     quantiles = torch.stack([diffusion_mask(preview, small_spot, time=t).flatten().quantile(levels) for t in TIMES])
-    yield Promise(
-        f"least growth of its quantiles from 5 to 95 %, t = {TIMES}",
+    yield Claim(
+        f"smallest growth of its 5 to 95 % quantiles, t = {TIMES}",
         0.0,
         float(quantiles.diff(dim=0)[:, 1:-1].min()),
         at_least=True,
     )
-    yield Promise("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
-    yield Promise("largest value of the mask", 1.0, float(mask.max()))
+    yield Claim("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
+    yield Claim("largest value of the mask", 1.0, float(mask.max()))
     apart = F.avg_pool2d(mask, 2) - diffusion_mask(preview, small_spot)
-    yield Promise("mean difference of the masks at 256 and at 512 pixels", 0.05, float(apart.abs().mean()))
+    yield Claim("mean difference between masks at 256 and 512 pixels", 0.05, float(apart.abs().mean()))
 
 
-def recolouring() -> Iterator[Promise]:
+def recolouring() -> Iterator[Claim]:
     """Recolouring from one blue stroke on the suit."""
     image, scale = scene("astronaut", 256)
     colours, painted = strokes(image, scale, (SUIT, (0.1, 0.3, 0.9)))
     edited = recolor(image, colours, painted)
     change = float(255 * (luminance(edited) - luminance(image)).abs().max())
-    yield Promise("recolor: largest change of luminance, grey levels", 1.0, change)
+    yield Claim("recolor: largest change of luminance, grey levels", 1.0, change)
     outside = spots(image, scale, (300, 20, 100, 120)).expand_as(image) > 0  # backdrop
-    yield Promise("recolor: largest change of the backdrop, grey levels", 2.0, _levels(edited - image, outside))
+    yield Claim("recolor: largest change of the backdrop, grey levels", 2.0, _levels(edited - image, outside))
     kept = spots(image, scale, (200, 90, 50, 60))  # face
     edited = recolor(image, colours, painted, keep=kept)
-    yield Promise(
-        "recolor: largest change of what is to be kept", 2.0, _levels(edited - image, kept.expand_as(image) > 0)
+    yield Claim(
+        "recolor: largest change of the area to keep, grey levels",
+        2.0,
+        _levels(edited - image, kept.expand_as(image) > 0),
     )
 
 
-def focusing() -> Iterator[Promise]:
+def focusing() -> Iterator[Claim]:
     """Defocus that keeps the astronaut sharp, but not the shuttle behind her."""
     image, scale = scene("astronaut", 256)
     region = spots(image, scale, (188, 60, 60, 60), (40, 260, 32, 160))
@@ -106,30 +108,30 @@ def focusing() -> Iterator[Promise]:
     for aperture in ("disc", "gaussian"):
         blurred = defocus(image, region, radius=4.0, aperture=aperture)
         kept = _energy(blurred, face) / _energy(image, face)
-        yield Promise(f"defocus, {aperture}: gradient energy that the face keeps", 0.95, kept, at_least=True)
+        yield Claim(f"defocus, {aperture}: remaining gradient energy of the face", 0.95, kept, at_least=True)
         left = _energy(blurred, shuttle) / _energy(image, shuttle)
-        yield Promise(f"defocus, {aperture}: gradient energy left behind it", 0.3, left)
+        yield Claim(f"defocus, {aperture}: remaining gradient energy behind it", 0.3, left)
 
 
-def abstraction() -> Iterator[Promise]:
+def abstraction() -> Iterator[Claim]:
     """Abstraction for k near 0, and the change of the mean under contrast."""
     image = scene("chelsea", 256)[0]
     for power, limit in ((0.0, 0.01), (1e-5, 0.1)):
         change = float(255 * (abstract(image, power=power) - image).square().mean().sqrt())
-        yield Promise(f"abstract, k = {power:g}: RMS change, grey levels", limit, change)
+        yield Claim(f"abstract, k = {power:g}: RMS change, grey levels", limit, change)
     drift = adjust_tone(image, contrast=1.4, clarity=3.0, limits="none").mean((2, 3)) - image.mean((2, 3))
-    yield Promise("tone, contrast 1.4: drift of the mean, grey levels", 0.1, float(255 * drift.abs().max()))
+    yield Claim("tone, contrast 1.4: drift of the mean, grey levels", 0.1, float(255 * drift.abs().max()))
 
 
-def pan() -> Iterator[Promise]:
+def pan() -> Iterator[Claim]:
     """Flicker in ten frames of a pan over the astronaut, edited together and each alone."""
     whole = scene("astronaut", 512)[0]
     film = [whole[..., 60 + STEP * i : 160 + STEP * i, 130 + STEP * i : 250 + STEP * i] for i in range(10)]
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
     each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
-    yield Promise(
-        "flicker of a pan of ten frames, over that of frames edited alone", 0.25, _flicker(together) / _flicker(each)
+    yield Claim(
+        "flicker of a ten-frame pan / flicker of frames edited alone", 0.25, _flicker(together) / _flicker(each)
     )
 
 
@@ -147,26 +149,26 @@ def _flicker(edited: list[Tensor]) -> float:
     return float(torch.stack(pairs).mean())
 
 
-TOPICS: tuple[Callable[[], Iterator[Promise]], ...] = (masks, recolouring, focusing, abstraction, pan)
+TOPICS: tuple[Callable[[], Iterator[Claim]], ...] = (masks, recolouring, focusing, abstraction, pan)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print a line per claim; exit with status 1 if one does not hold."""
-    parser = argparse.ArgumentParser(description="What masks and edits have to keep, and how well they do.")
-    parser.add_argument("--out", type=Path, help="also write them as JSON")
+    parser = argparse.ArgumentParser(description="Claims about masks and edits, and whether they hold.")
+    parser.add_argument("--out", type=Path, help="also write the results to this JSON file")
     options = parser.parse_args(arguments)
     kept = []
     print(f"{'':66}{'limit':>12}{'measured':>12}")
     for topic in TOPICS:
-        for promise in topic():
-            kept.append(asdict(promise) | {"holds": promise.holds})
-            sign = ">=" if promise.at_least else "<="
-            verdict = "" if promise.holds else "  FALLS SHORT"
-            print(f"{promise.what:66}{sign + f' {promise.limit:g}':>12}{promise.measured:12.4g}{verdict}", flush=True)
+        for claim in topic():
+            kept.append(asdict(claim) | {"holds": claim.holds})
+            sign = ">=" if claim.at_least else "<="
+            verdict = "" if claim.holds else "  FALLS SHORT"
+            print(f"{claim.what:66}{sign + f' {claim.limit:g}':>12}{claim.measured:12.4g}{verdict}", flush=True)
     if options.out is not None:
         with open_beside(options.out) as stream:
             stream.write((json.dumps(kept, indent=1) + "\n").encode())
-    raise SystemExit(not all(promise["holds"] for promise in kept))
+    raise SystemExit(not all(claim["holds"] for claim in kept))
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ METHODS: dict[str, dict[str, str]] = {
     "the paper's method (uniform samples, no completion)": {"landmarks": "uniform", "completion": "none"},
     "the library's defaults (k-means, completion)": {},
 }
-HELD = 0.998  # share of energy that counts as sufficient in Table I
+SUFFICIENT = 0.998  # share of energy that counts as sufficient in Table I
 ROW_SUMS = 1e-2  # largest deviation of row sums from 1; beyond it the method has failed
 
 PAPER_TABLE_I = """the paper's Table I (beta in %), h_y in units of its own patch weights, 1/4.2 of those of unit sum
@@ -52,7 +52,7 @@ PAPER_FIG_20 = """the paper's Fig. 20 is a plot; its text: the error shrinks as 
 
 
 @dataclass(frozen=True)
-class Held:
+class CapturedEnergy:
     """Energy of the picture captured by the eigenvectors of one operator, and checks of the operator."""
 
     beta: float
@@ -65,7 +65,7 @@ class Held:
         return all(math.isfinite(value) for value in (self.beta, self.row_sum_error, self.largest_eigenvalue))
 
     @property
-    def broke(self) -> bool:
+    def failed(self) -> bool:
         """Whether the operator is not a doubly stochastic filter."""
         return not (self.finite and self.row_sum_error <= ROW_SUMS and self.largest_eigenvalue <= 1 + ROW_SUMS)
 
@@ -75,7 +75,7 @@ class Held:
         return 100 * math.sqrt(max(0.0, 1 - self.beta))
 
 
-Rows = dict[str, list[Held]]
+Rows = dict[str, list[CapturedEnergy]]
 
 
 def picture(name: str, long_side: int = LONG_SIDE) -> torch.Tensor:
@@ -85,13 +85,13 @@ def picture(name: str, long_side: int = LONG_SIDE) -> torch.Tensor:
 
 def measure(
     image: torch.Tensor, bandwidth: float, count: int, options: dict[str, str], rank: int | None = None
-) -> Held:
+) -> CapturedEnergy:
     """Build the operator and project the picture on its eigenvectors, or on the ``rank`` leading ones."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # failed balancing shows in the row sums
         operator = nonlocal_operator(image, photometric_bandwidth=bandwidth, num_landmarks=count, **options)
     spectrum = operator.spectrum(rank)
-    return Held(
+    return CapturedEnergy(
         captured_energy(spectrum, image).item(),
         (operator.row_sums() - 1).abs().max().item(),
         spectrum.largest.item(),
@@ -103,19 +103,25 @@ def auto(image: torch.Tensor) -> float:
     return estimate_bandwidth(image).item()
 
 
-def table_1(name: str, long_side: int, options: dict[str, str], multiples: Sequence[float] = MULTIPLES) -> list[Held]:
+def table_1(
+    name: str, long_side: int, options: dict[str, str], multiples: Sequence[float] = MULTIPLES
+) -> list[CapturedEnergy]:
     """Beta of one picture at multiples of the automatic bandwidth."""
     image = picture(name, long_side)
     return [measure(image, multiple * auto(image), LANDMARKS, options) for multiple in multiples]
 
 
-def figure_20(name: str, long_side: int, options: dict[str, str], counts: Sequence[int] = COUNTS) -> list[Held]:
+def figure_20(
+    name: str, long_side: int, options: dict[str, str], counts: Sequence[int] = COUNTS
+) -> list[CapturedEnergy]:
     """Energy captured by the leading eigenvectors of one picture, for increasing numbers of them."""
     image = picture(name, long_side)
     return [measure(image, auto(image), max(counts), options, rank=count) for count in counts]
 
 
-def growing_samples(name: str, long_side: int, options: dict[str, str], counts: Sequence[int] = COUNTS) -> list[Held]:
+def growing_samples(
+    name: str, long_side: int, options: dict[str, str], counts: Sequence[int] = COUNTS
+) -> list[CapturedEnergy]:
     """Energy captured by all eigenvectors of one picture, for increasing numbers of samples."""
     image = picture(name, long_side)
     return [measure(image, auto(image), count, options) for count in counts]
@@ -126,38 +132,44 @@ def is_rising(values: Sequence[float]) -> bool:
     return all(a <= b + 5e-5 for a, b in pairwise(values))
 
 
-def print_rows(head: Sequence[object], rows: Iterator[tuple[str, list[Held]]], value: Callable[[Held], float]) -> Rows:
+def print_rows(
+    head: Sequence[object], rows: Iterator[tuple[str, list[CapturedEnergy]]], value: Callable[[CapturedEnergy], float]
+) -> Rows:
     """Print a table row by row, with ! where the row sums of the filter are off by more than a hundredth."""
     print(f"{'':18}" + "".join(f"{text:>8} " for text in head))
     done = {}
     for name, row in rows:
         done[name] = row
-        print(f"{name:18}" + "".join(f"{value(held):8.2f}{'!' if held.broke else ' '}" for held in row), flush=True)
+        print(
+            f"{name:18}" + "".join(f"{value(captured):8.2f}{'!' if captured.failed else ' '}" for captured in row),
+            flush=True,
+        )
     return done
 
 
 def print_table_1(long_side: int, options: dict[str, str]) -> None:
     """Print Table I and a summary."""
     measured = ((name, table_1(name, long_side, options)) for name in PICTURES)
-    rows = print_rows([f"{m} auto" for m in MULTIPLES], measured, lambda held: 100 * held.beta)
+    rows = print_rows([f"{m} auto" for m in MULTIPLES], measured, lambda captured: 100 * captured.beta)
     start = MULTIPLES.index(1.0)
-    enough = sum(row[start].beta >= HELD and not row[start].broke for row in rows.values())
-    rising = sum(is_rising([held.beta for held in row[start:]]) for row in rows.values())
+    enough = sum(row[start].beta >= SUFFICIENT and not row[start].failed for row in rows.values())
+    rising = sum(is_rising([captured.beta for captured in row[start:]]) for row in rows.values())
     print(
-        f"at auto: beta >= {100 * HELD:.1f} % on {enough} of {len(rows)}; rising from there on {rising} of {len(rows)}"
+        f"at auto: beta >= {100 * SUFFICIENT:.1f} % on {enough} of {len(rows)}; "
+        f"rising from there on {rising} of {len(rows)}"
     )
     for position, multiple in enumerate(MULTIPLES):
-        broken = [name for name, row in rows.items() if row[position].broke]
+        broken = [name for name, row in rows.items() if row[position].failed]
         finite = sum(row[position].finite for row in rows.values())
         told = f"finite on {finite} of {len(rows)}, row sums off on {len(broken)}"
         print(f"at {multiple} auto: {told}" + (f" ({', '.join(broken)})" if broken else ""))
 
 
-def print_figure_20(long_side: int, options: dict[str, str], measured: Callable[..., list[Held]]) -> None:
+def print_figure_20(long_side: int, options: dict[str, str], measured: Callable[..., list[CapturedEnergy]]) -> None:
     """Print Fig. 20, by eigenvectors or by samples, and a summary."""
     every = ((name, measured(name, long_side, options)) for name in PICTURES)
-    rows = print_rows([f"m = {count}" for count in COUNTS], every, lambda held: held.relative_rmse)
-    falling = sum(is_rising([held.beta for held in row]) for row in rows.values())
+    rows = print_rows([f"m = {count}" for count in COUNTS], every, lambda captured: captured.relative_rmse)
+    falling = sum(is_rising([captured.beta for captured in row]) for row in rows.values())
     print(f"falling with m on {falling} of {len(rows)}")
 
 

@@ -32,7 +32,7 @@ image = torch.from_numpy(pixels).float().permute(2, 0, 1)[None]
 
 
 def spot(top: int, left: int, height: int = 8, width: int = 8) -> torch.Tensor:
-    """A rectangle, (1, 1, H, W)."""
+    """A rectangular mask (1, 1, H, W)."""
     region = torch.zeros(1, 1, *image.shape[2:])
     region[..., top : top + height, left : left + width] = 1
     return region

@@ -44,7 +44,7 @@ class Denoiser(nn.Module):
         self.filter = NonlocalFilter(
             alpha=(0.2, 0.8, 1.0),
             learn=("alpha", "photometric_bandwidth", "spatial_bandwidth"),
-            patch_size=1,  # the convolutions cover the surroundings
+            patch_size=1,  # the convolutions cover neighbouring pixels
             photometric_bandwidth=0.2,
             spatial_bandwidth=10.0,
             num_landmarks=32,

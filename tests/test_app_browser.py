@@ -335,7 +335,7 @@ def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
 
     (folder / "edit.json").write_text('{"detail": {"sharpness": 11}}')
     opened.load_edit(folder / "edit.json")
-    expect(page.get_by_text("detail in edit.json must hold no other entries than")).to_be_visible()
+    expect(page.get_by_text("detail in edit.json must have no entries other than")).to_be_visible()
 
     page.get_by_role("button", name="Save photo").click()
     for name, sentence in (("../out.png", "the name must be one of a file"), ("out.gif", "out.gif must end in .png")):

@@ -152,7 +152,7 @@ def test_app_says_what_it_lacks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["app", "--out", str(tmp_path / "gone"), "--no-open"]) == 2
-    assert "does not exist; make the folder first" in capsys.readouterr().err
+    assert "does not exist; create the folder first" in capsys.readouterr().err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2

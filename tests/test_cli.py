@@ -180,7 +180,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     ("options", "sentence"),
     [
         (["--alpha", "3"], "--alpha must have at least two numbers, such as 3,3,4,1.05, got '3'"),
-        (["--alpha", "3,x"], "--alpha must be numbers with commas between, such as 3,3,4,1.05, got '3,x'"),
+        (["--alpha", "3,x"], "--alpha must be numbers separated by commas, such as 3,3,4,1.05, got '3,x'"),
         (["--alpha", "3,nan"], "--alpha must be finite numbers, such as 3,3,4,1.05, got '3,nan'"),
         (["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels, such as 20, or auto, got '0'"),
         (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),
@@ -214,7 +214,7 @@ def test_wrong_inputs(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "half.png").write_bytes(photo.read_bytes()[:3000])
     sentences = {
         "none.png": "none.png does not exist; check the name and the folder",
-        "empty.png": "empty.png is empty; copy it again from where it came",
+        "empty.png": "empty.png is empty; copy it again from its source",
         "text.jpg": "text.jpg is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these",
         "half.png": "half.png is damaged or cut short (",
     }
@@ -234,8 +234,12 @@ def test_outputs_that_cannot_be(photo: Path, tmp_path: Path, capsys: pytest.Capt
         ("in.png", "nowhere/out.png", "does not exist; make it first"),
         ("in.png", "out.gif", "out.gif must end in .png, .jpg, .webp, .avif or .tif, got '.gif'"),
         ("rgba.png", "out.jpg", "JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"),
-        ("deep.png", "out.jpg", "JPEG has no 16 bits a channel; write a PNG or TIFF file or choose a depth of 8 bits"),
-        ("float.tif", "out.png", "PNG has no floats a channel; write a TIFF file or choose a depth of 16 bits"),
+        (
+            "deep.png",
+            "out.jpg",
+            "JPEG has no 16 bits per channel; write a PNG or TIFF file or choose a depth of 8 bits",
+        ),
+        ("float.tif", "out.png", "PNG has no floats per channel; write a TIFF file or choose a depth of 16 bits"),
     ):
         assert sentence in refused(capsys, "detail", tmp_path / source, tmp_path / target)
     assert "does not exist; make it first" in refused(capsys, "inspect", photo, tmp_path / "no" / "where")
@@ -250,9 +254,12 @@ def test_too_large_for_memory(
     free = psutil.virtual_memory()._replace(available=1_000_000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     sentence = refused(capsys, "tone", photo, tmp_path / "out.png")  # not even in tiles
-    assert "in.png needs 21 MB of memory at least, but 1 MB may be used; allow more, or use fewer landmarks" in sentence
+    assert (
+        "in.png needs at least 21 MB of memory, but only 1 MB may be used; allow more, or use fewer landmarks"
+        in sentence
+    )
     sentence = refused(capsys, "inspect", photo, tmp_path)  # needs all pixels at once
-    assert "has 90x60 pixels and needs about 34 MB of memory, but 1 MB is free; use fewer landmarks" in sentence
+    assert "has 90x60 pixels and needs about 34 MB of memory, but only 1 MB is free; use fewer landmarks" in sentence
 
 
 def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

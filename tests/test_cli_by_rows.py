@@ -30,7 +30,7 @@ LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to small pictures."""
     monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
 
 
 @pytest.fixture
@@ -98,9 +98,9 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
     (tmp_path / "folder.zarr").mkdir()
     for source, target, message in (
-        ("in.zarr", "folder.zarr", "is a folder, but no array of zarr that could be replaced"),
-        ("folder.zarr", "new.zarr", "is no array of zarr"),
-        ("none.zarr", "new.zarr", "is no array of zarr"),
+        ("in.zarr", "folder.zarr", "is a folder, not a zarr array that can be replaced"),
+        ("folder.zarr", "new.zarr", "is not a zarr array"),
+        ("none.zarr", "new.zarr", "is not a zarr array"),
         ("in.zarr", "no/new.zarr", "does not exist; make it first"),
         ("in.zarr", "new.gif", "must end in .png, .jpg, .webp, .avif or .tif"),
     ):
@@ -112,7 +112,7 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     zarr.create_array(store=tmp_path / "deep.zarr", data=np.zeros((5, 5), np.uint32))
     for depth in ((), ("--depth", "8")):
         assert detail(tmp_path / "deep.zarr", tmp_path / "new.zarr", *depth) == 2
-        assert "deep.zarr stores its channels as uint32, which is not handled" in capsys.readouterr().err
+        assert "deep.zarr stores its channels as uint32, which is not supported" in capsys.readouterr().err
 
 
 def test_zarr_is_needed_for_zarr(
@@ -201,7 +201,7 @@ def test_a_full_disk_is_named(
 ) -> None:
     with file_limit(20_000):
         sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE, "--threshold", "0")  # no temporaries
-    assert f"{target} cannot be written: File too large; make room there or write elsewhere" in sentence
+    assert f"{target} cannot be written: File too large; free some space there or write elsewhere" in sentence
 
 
 def test_a_folder_that_cannot_be_written_is_named(
@@ -218,7 +218,10 @@ def test_what_is_too_large_to_be_put_together_is_named(
 ) -> None:
     assert "needs " in refused(capsys, photo, tmp_path / "out.tif", "--memory", "0.001")
     sentence = refused(capsys, photo, tmp_path / "out.png", "--memory", "0.003")
-    assert "out.png takes 4 MB to be put together, but 3 MB may be used; write a TIFF file, or allow more" in sentence
+    assert (
+        "out.png needs 4 MB of memory to be encoded, but only 3 MB may be used; write a TIFF file, or allow more"
+        in sentence
+    )
     write_photograph(read_photograph(photo), photo.with_suffix(".png"))
     sentence = refused(capsys, photo.with_suffix(".png"), tmp_path / "out.tif", "--memory", "0.0001")
     assert "in.png has 300x200 pixels and needs about" in sentence
@@ -243,7 +246,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "import signal, sys, time\n"
         # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from nlfilter_torch.tiled import sources as rows, tiles\n"
+        "from nlfilter_torch.tiled import pictures, tiles\n"
         "from nlfilter_torch.tiled.source import Tiled\n"
         "def slow(original):\n"
         "    def edit(*arguments):\n"
@@ -251,7 +254,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "        return original(*arguments)\n"
         "    return edit\n"
         "Tiled.edited, tiles.TILE_PIXELS = slow(Tiled.edited), 300\n"
-        "tiles.sampling.PILOT = rows.STATISTICS_PIXELS = 8000\n"
+        "tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000\n"
         "from nlfilter_torch.cli import main\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )

@@ -86,8 +86,8 @@ def test_numbers_without_sense(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("[" * 100_000, "is no preset: it is nested too deeply"),
-        ('{"alpha": ' * 100_000, "is no preset: it is nested too deeply"),
+        ("[" * 100_000, "is not a preset: it is nested too deeply"),
+        ('{"alpha": ' * 100_000, "is not a preset: it is nested too deeply"),
         ('{"alpha": ' + "[" * 900 + "]" * 900 + "}", "must be a list of 2 to 100 numbers"),
         (f'{{"alpha": [1, {LONG}]}}', "must be a list of 2 to 100 numbers"),
         (f'{{"alpha": [1, 1], "bandwidth": {LONG}}}', "must be a positive number of grey levels, from 0.01 to"),
@@ -163,7 +163,7 @@ def test_an_unreadable_file_is_told(photo: Path, monkeypatch: pytest.MonkeyPatch
         raise PermissionError(13, "Permission denied", str(photo))
 
     monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(ValueError, match=r"in\.png cannot be read: Permission denied; ask its owner"):
+    with pytest.raises(ValueError, match=r"in\.png cannot be read: Permission denied; check its permissions"):
         read_photograph(photo)
 
 
@@ -190,7 +190,7 @@ def test_links_that_lead_nowhere(photo: Path, tmp_path: Path, capsys: pytest.Cap
 
 def test_a_file_is_no_array_of_zarr(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "out.zarr").write_text("mine")
-    assert "is a file, but no array of zarr" in refused(capsys, "detail", photo, tmp_path / "out.zarr")
+    assert "is a file, not a zarr array" in refused(capsys, "detail", photo, tmp_path / "out.zarr")
     assert (tmp_path / "out.zarr").read_text() == "mine"
 
 

@@ -256,11 +256,13 @@ def test_bad_input(image: Tensor, noise: object, error: type[Exception], message
 
 
 def test_the_edit_refuses_what_it_cannot_take() -> None:
-    with pytest.raises(ValueError, match=r"noise_level must be a number or \(B,\) for the rule, got a map"):
+    with pytest.raises(
+        ValueError, match=r"noise_level must be a number or have shape \(B,\) for method rule, got a map"
+    ):
         denoise(CAT, noise_level=torch.zeros_like(CAT), method="rule")
     with pytest.raises(ValueError, match="method must be one of 'network', 'rule', got 'luck'"):
         denoise(CAT, method="luck")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="denoise takes no argument landmark"):
+    with pytest.raises(TypeError, match="denoise has no argument landmark"):
         denoise(CAT, landmark=3)
 
 

@@ -48,7 +48,7 @@ def raises(call: Callable[[], object], error: type[Exception], message: str) -> 
 
 # --- images
 
-FLOATS = "must be of a floating-point dtype with values in [0, 1], got"
+FLOATS = "must have a floating-point dtype with values in [0, 1], got"
 BAD_IMAGES: dict[str, tuple[Any, type[Exception], str]] = {
     "array": (np.zeros((2, 1, 8, 9)), TypeError, "must be a torch.Tensor, got ndarray"),
     "list": ([[0.0]], TypeError, "must be a torch.Tensor, got list"),
@@ -176,7 +176,9 @@ def test_bad_rank(rank: Any, error: type[Exception], message: str) -> None:
 
 def test_dense_matrix_of_a_large_image_is_refused() -> None:
     operator = nonlocal_operator(noise(1, 1, 129, 128), num_landmarks=5, photometric_bandwidth=0.5)
-    with pytest.raises(ValueError, match=r"must have at most 16384 pixels to be dense, got 16512; use a smaller image"):
+    with pytest.raises(
+        ValueError, match=r"must have at most 16384 pixels for a dense matrix, got 16512; use a smaller image"
+    ):
         operator.to_dense()
 
 
@@ -185,7 +187,7 @@ def test_dense_matrix_of_a_large_image_is_refused() -> None:
 TWO = "must have at least two entries, got 1"
 BAD_SLIDERS: list[tuple[Any, type[Exception], str]] = [
     ([1.0, 1.0], TypeError, "must be a torch.Tensor, got list; convert"),
-    (torch.tensor([1, 1]), TypeError, "must be of a floating-point dtype, got torch.int64"),
+    (torch.tensor([1, 1]), TypeError, "must have a floating-point dtype, got torch.int64"),
     (torch.ones(1), ValueError, TWO),
     (torch.ones(2, 1), ValueError, TWO),
     (torch.ones(2, 1, 8, 9), ValueError, TWO),
@@ -223,16 +225,20 @@ BAD_MASKS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: diffusion_mask(SPECTRUM, PAINTED, width=0.0), ValueError, f"width {POSITIVE} 0.0"),
     (lambda: diffusion_mask(SPECTRUM, PAINTED, width="4"), TypeError, f"width {NUMBER} str"),
     (lambda: diffusion_mask(SPECTRUM, -PAINTED), ValueError, "region must be non-negative, got -1"),
-    (lambda: diffusion_mask(SPECTRUM, EMPTY), ValueError, "region must each hold a pixel of positive weight, got an"),
+    (
+        lambda: diffusion_mask(SPECTRUM, EMPTY),
+        ValueError,
+        "region must hold a pixel of positive weight in every mask, got an",
+    ),
     (
         lambda: segment_mask(SPECTRUM, torch.cat([PAINTED, EMPTY], dim=1)),
         ValueError,
-        "regions must each hold a pixel of positive weight, got an empty one",
+        "regions must hold a pixel of positive weight in every mask, got an empty one",
     ),
     (
         lambda: diffusion_mask(SPECTRUM, PAINTED, negative=PAINTED.expand(-1, 3, -1, -1)),
         ValueError,
-        "negative must have 1 channel or the region's 1, got 3",
+        "negative must have 1 channel or those of region, 1, got 3",
     ),
 ]
 

@@ -47,6 +47,6 @@ def test_every_promise_of_masks_and_edits_is_kept(tmp_path: Path, capsys: pytest
 
 
 def test_a_promise_that_is_broken_is_told() -> None:
-    assert not edits.Promise("", 1.0, 2.0).holds
-    assert not edits.Promise("", 2.0, 1.0, at_least=True).holds
-    assert not edits.Promise("", 1.0, float("nan")).holds
+    assert not edits.Claim("", 1.0, 2.0).holds
+    assert not edits.Claim("", 2.0, 1.0, at_least=True).holds
+    assert not edits.Claim("", 1.0, float("nan")).holds

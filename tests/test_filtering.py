@@ -294,7 +294,7 @@ def test_coefficients_of_another_image_are_refused() -> None:
         ValueError, match=r"coefficients must have shape \(1, 1, 10\), got \(1, 3, 10\); take spectrum.coe"
     ):
         spectral_filter(spectrum, image, torch.sqrt, coefficients=held)
-    with pytest.raises(TypeError, match=r"coefficients must be a torch\.Tensor, got list; take"):
+    with pytest.raises(TypeError, match=r"coefficients must be a torch\.Tensor, got list; use"):
         spectral_filter(spectrum, image, torch.sqrt, coefficients=held.tolist())  # type: ignore[arg-type]
 
 

@@ -213,7 +213,7 @@ def test_half_precision_and_autocast_change_the_dtype_alone() -> None:
         ),
         ({"target": torch.rand(1, 3, 8, 8)}, ValueError, r"target must have 1 channel\(s\), got 3"),
         ({"target": torch.rand(3, 1, 8, 8)}, ValueError, r"target must have batch size 1 or 2, got 3"),
-        ({"target": torch.ones(1, 1, 8, 8, dtype=torch.uint8)}, TypeError, "target must be of a floating-point dtype"),
+        ({"target": torch.ones(1, 1, 8, 8, dtype=torch.uint8)}, TypeError, "target must have a floating-point dtype"),
         ({"image": torch.rand(2, 1, 9, 8)}, ValueError, "image must have the height and width of the operator"),
         ({"mask": torch.zeros(1, 1, 8, 8)}, ValueError, "mask must hold a pixel of positive weight"),
         ({"mask": -torch.ones(1, 1, 8, 8)}, ValueError, "mask must be non-negative, got -1"),

@@ -160,7 +160,7 @@ def test_frames_are_read_one_at_a_time() -> None:
     ("arguments", "sentence"),
     [
         ({"references": []}, "references must hold at least one frame, got none"),
-        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must be a single frame where"),
+        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must hold a single frame if"),
         (
             {"references": [*pan(1, 1, 20, 20), *pan(1, 1, 20, 21)]},
             "references must have the height and width of the first",
@@ -176,7 +176,7 @@ def test_bad_references(arguments: dict, sentence: str) -> None:
 def test_bad_fits_and_frames() -> None:
     image = noise(1, 1, 12, 13)
     operator = build(image, num_landmarks=20)
-    with pytest.raises(ValueError, match=r"image must be one image, as the operator's must, got 2 and 1"):
+    with pytest.raises(ValueError, match=r"image and operator must have batch size 1, got 2 and 1"):
         fit_filter(operator, image.expand(2, -1, -1, -1))
     with pytest.raises(ValueError, match="order must be at least 1, got 0"):
         fit_filter(operator, image, order=0)
@@ -246,8 +246,8 @@ def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
     write_photograph(Photograph(pan(1, 1, 20, 22)[0]), tmp_path / "film" / "b.png")
     assert "is no folder; name the one that holds the frames" in refused(tmp_path / "none", tmp_path / "out")
     assert "holds no PNG, JPEG, TIFF, WebP or AVIF file" in refused(tmp_path / "empty", tmp_path / "out")
-    assert "must be another folder than that of the frames" in refused(tmp_path / "film", tmp_path / "film")
+    assert "must not be the folder of the frames" in refused(tmp_path / "film", tmp_path / "film")
     assert "does not exist; make it first" in refused(tmp_path / "film", tmp_path / "no" / "where")
     assert "is a file, not a folder" in refused(tmp_path / "film", tmp_path / "film" / "a.png")
-    assert "must have the size and the colours of the other frames" in refused(tmp_path / "film", tmp_path / "out")
+    assert "must have the size and channels of the first frame" in refused(tmp_path / "film", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -12,8 +12,8 @@ from nlfilter_torch.edits import local_values
 from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.source import InMemory, luminance
 from nlfilter_torch.tiled import stream_colorize
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import box, colour
 from tests.problems import luminance as grey_of
@@ -65,7 +65,9 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
     generator = torch.Generator().manual_seed(1)
     image, values, weights = (torch.rand(1, c, 5, 6, generator=generator, dtype=torch.float64) for c in (1, 2, 1))
     places = torch.tensor([3, 7, 20, 29])
-    monkeypatch.setattr(local_values, "FIXED", 2.0)  # finite differences of fixed values would be lost in rounding
+    monkeypatch.setattr(
+        local_values, "SCRIBBLE_WEIGHT", 2.0
+    )  # finite differences of fixed values would be lost in rounding
 
     def found(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         return local(0.1 * image, places, weights, values)
@@ -76,7 +78,7 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
 
 @pytest.mark.parametrize("step", [1, 3, 7])
 def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 500)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 500)
     picture = np.random.default_rng(0).random((83, 61, 3), np.float32)
     tiled = Tiled(Picture(picture), Passes("float32"))
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]

@@ -382,7 +382,7 @@ def test_the_command_fits_folders_and_draws(tmp_path: Path, capsys: pytest.Captu
         assert main([command, str(before), str(out), "--preset", str(look)]) == 0
         assert (read_photograph(out).pixels - in_bytes(CUP**0.6)).abs().mean() < 2 / 255
     assert main(["detail", str(before), str(out), "--preset", str(look), "--alpha", "1,2"]) == 2
-    assert "without options of detail" in capsys.readouterr().err
+    assert "must not be combined with other options of detail" in capsys.readouterr().err
 
 
 def test_the_command_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -224,9 +224,11 @@ def test_a_negative_region_takes_its_likes_out(spectrum) -> None:
     torch.testing.assert_close(diffusion_mask(spectrum, region, negative=region), plain / 2)
     both = diffusion_mask(spectrum, regions(2), negative=other)
     torch.testing.assert_close(both[:, :1], held)
-    with pytest.raises(ValueError, match=r"negative must have 1 channel or the region's 2, got 3; give one for all"):
+    with pytest.raises(
+        ValueError, match=r"negative must have 1 channel or those of region, 2, got 3; give one for all"
+    ):
         diffusion_mask(spectrum, regions(2), negative=regions(3))
-    with pytest.raises(ValueError, match=r"negative must each hold a pixel of positive weight"):
+    with pytest.raises(ValueError, match=r"negative must hold a pixel of positive weight in every mask"):
         diffusion_mask(spectrum, region, negative=torch.zeros_like(region))
 
 
@@ -303,8 +305,8 @@ def test_a_region_like_no_landmark_is_worth_a_warning() -> None:
     image, region = noise(1, 1, 32, 32), torch.zeros(1, 2, 32, 32)
     few = nonlocal_operator(image, photometric_bandwidth=0.03).spectrum()
     best = few.factor[0].square().sum(0).argmax()
-    region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel that resembles none
-    with pytest.warns(UserWarning, match="region 1 is like no landmark, so its mask may take in"):
+    region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel like none
+    with pytest.warns(UserWarning, match="region 1 resembles no landmark, so its mask may include"):
         mask = diffusion_mask(few, region)
     assert (mask > 0.5).double().mean((2, 3))[0, 0] < 0.01
     assert (mask > 0.5).double().mean((2, 3))[0, 1] > 0.9

@@ -52,7 +52,7 @@ def test_autocast_on_a_dtype_that_cannot_work_is_told() -> None:
         # torch refuses to cast to it, warns, and continues without autocast.
         with pytest.warns(UserWarning, match="autocast"), torch.autocast("cpu", dtype=torch.float64):
             torch.testing.assert_close(layer(image()), everything()(image()), atol=0, rtol=0)
-        with pytest.raises(TypeError, match="guide must be of a floating-point dtype"):
+        with pytest.raises(TypeError, match="guide must have a floating-point dtype"):
             layer(image(), guide=image().to(torch.float8_e5m2))
 
 

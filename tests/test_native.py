@@ -303,7 +303,7 @@ class Exhausted:
 def test_without_memory_for_its_buffers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "_library", Exhausted())
     x = random(1, 2, 9)
-    with pytest.raises(MemoryError, match="make the image smaller"):
+    with pytest.raises(MemoryError, match="use a smaller image"):
         nystrom_factor(x, x[:, :, :3], inverse_cholesky(x[:, :, :3]), "diagonal")
 
 

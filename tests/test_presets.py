@@ -72,7 +72,7 @@ def test_an_option_counts_for_more_than_a_name(photo: Path) -> None:
 def test_an_unknown_name_is_told(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["detail", str(photo), str(photo.with_name("out.png")), "--preset", "crips"]) == 2
     complaint = capsys.readouterr().err
-    assert "crips does not exist or is no file, nor is it one of the presets crisp, clear" in complaint
+    assert "crips is neither a file nor one of the presets crisp, clear" in complaint
     assert complaint.count("\n") == 1
     assert main(["presets", "crips"]) == 2
 

@@ -128,7 +128,7 @@ def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
 
 def test_a_warning_names_a_remedy_that_is_not_in_force() -> None:
     factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])
-    with pytest.warns(UserWarning, match="row sums off by up to .*num_landmarks$") as caught:
+    with pytest.warns(UserWarning, match="row sums that differ from 1 by up to .*num_landmarks$") as caught:
         balance(factor, torch.zeros(1, 4), completed=True)
     assert "completion" not in str(caught[0].message)
 

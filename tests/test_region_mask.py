@@ -13,8 +13,8 @@ from nlfilter_torch.edits import matting
 from nlfilter_torch.edits.resizing import enlarged
 from nlfilter_torch.edits.source import InMemory, InMemoryOperator
 from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import box, colour, noise
 from tests.test_strokes import kriging
@@ -76,7 +76,7 @@ def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.Monkey
     rows, columns = np.divmod(np.arange(height * width), width)
     near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) == 1
     squares = np.square(pixels[:, None] - pixels).mean(2)
-    weights = near * (np.exp(-matting.STEEPNESS * squares) + matting.LEAST)
+    weights = near * (np.exp(-matting.STEEPNESS * squares) + matting.MIN_WEIGHT)
     laplacian = np.diag(weights.sum(1)) - weights
     for k in range(2):
         c = trust[0, k].flatten().numpy()
@@ -154,7 +154,7 @@ def test_gradients() -> None:
 @pytest.mark.parametrize("tile_rows", [16, 40])
 def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "CHUNK", 300)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
     monkeypatch.setattr(masks, "SOLVED", 5000)
     image = colour("coffee", 110, 130)
     front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
@@ -176,7 +176,7 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
     functions = matting.solve_linear(image, torch.full_like(rough, 0.5), rough, front, back)
     pixels = image[0].flatten(1).T.numpy()
     rows, columns = np.divmod(np.arange(count), width)
-    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= matting.WINDOW
+    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= matting.WINDOW_RADIUS
     share = near / near.sum(1, keepdims=True)  # weights of pixels in windows, and of windows around a pixel
     smooth = np.zeros((count, count))
     for middle in range(count):
@@ -185,12 +185,12 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
         slopes = np.linalg.inv(some.T @ some / len(inside) + matting.NOISE * np.eye(3)) @ some.T / len(inside)
         values = (pixels - pixels[inside].mean(0)) @ slopes + 1 / len(inside)  # values of every pixel from those inside
         smooth[:, inside] += share[:, [middle]] * values
-    trust = matting.LINEAR_TRUST * (np.square(2 * rough.numpy().ravel() - 1) + 0.01)
-    certain = matting.LINEAR_CERTAIN * (front + back).numpy().ravel()
-    target = trust * rough.numpy().ravel() + matting.LINEAR_CERTAIN * front.numpy().ravel()
+    trust = matting.LINEAR_ROUGH_CONFIDENCE * (np.square(2 * rough.numpy().ravel() - 1) + 0.01)
+    certain = matting.LINEAR_SCRIBBLE_CONFIDENCE * (front + back).numpy().ravel()
+    target = trust * rough.numpy().ravel() + matting.LINEAR_SCRIBBLE_CONFIDENCE * front.numpy().ravel()
     expected = np.linalg.solve(np.diag(1 + trust + certain) - smooth, target)
     found = matting.linear_mask(image - 0.5, functions[:, 0])
-    stretched = (smooth @ expected.clip(0, 1) - matting.DOUBT) / (1 - 2 * matting.DOUBT)
+    stretched = (smooth @ expected.clip(0, 1) - matting.END_MARGIN) / (1 - 2 * matting.END_MARGIN)
     np.testing.assert_allclose(found.flatten(), stretched, atol=1e-5)
 
 

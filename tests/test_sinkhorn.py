@@ -105,8 +105,10 @@ def test_few_sweeps_balance_a_photograph(name: str) -> None:
 
 
 def test_row_sums_that_stay_off_are_told() -> None:
-    factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])  # a negative affinity, as plain Nystrom may produce
-    with pytest.warns(UserWarning, match=r"balancing left row sums off by up to .*completion='diagonal'"):
+    factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])  # a negative affinity, which plain Nystrom produces
+    with pytest.warns(
+        UserWarning, match=r"balancing left row sums that differ from 1 by up to .*completion='diagonal'"
+    ):
         result = balance(factor, torch.zeros(1, 4))
     assert result.scaling.isfinite().all()
     assert (result.scaling > 0).all()

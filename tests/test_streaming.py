@@ -18,9 +18,9 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture
 from nlfilter_torch.tiled.sampling import Draws, KeptColumns, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes
 
@@ -80,7 +80,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 1500)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -244,7 +244,7 @@ def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
 
 
 def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
     options = PLAIN | {"num_landmarks": 30}
@@ -264,9 +264,11 @@ def test_memory_gives_the_size_of_tiles() -> None:
     assert 200 * 85 * 4 * rows[0] < 5 * 10**7 < 200 * 85 * 4 * 4 * rows[0]
     assert rows[0] < rows[1] == rows[2]  # longer tiles are no faster
     assert rows_within(13 * 10**7, masked=True) < rows[1]
-    with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least, but 10 MB may be used; allow more"):
+    with pytest.raises(
+        MemoryError, match=r"source needs at least \d+ MB of memory, but only 10 MB may be used; allow more"
+    ):
         rows_within(10**7)
-    with pytest.raises(MemoryError, match="source needs 7 MB of memory at least, but 0 MB may be used"):
+    with pytest.raises(MemoryError, match="source needs at least 7 MB of memory, but only 0 MB may be used"):
         streamed(cat(60, 80), memory=1000)
 
 

@@ -16,8 +16,8 @@ from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import split_luminance
 from nlfilter_torch.io.photographs import read_photograph
 from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor, tiles
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.scribbles import read_scribbles
-from nlfilter_torch.tiled.sources import Picture
 from tests.test_streaming import FEW, LEVEL, Rows, Shrinking, cat
 
 Array = NDArray[Any]
@@ -28,7 +28,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 300)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
 
 
 def paint(height: int, width: int) -> tuple[Array, Array, Array]:
@@ -161,7 +161,7 @@ def test_a_guide_that_is_kept_changes_nothing() -> None:
 
 
 def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 600)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 600)
     picture = cat(240, 60)
     painted = paint(240, 60)
     settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
@@ -221,7 +221,7 @@ def test_report_tells_every_stage() -> None:
 
 def test_painted_pixels_need_memory() -> None:
     picture, (strokes, mask, _) = cat(180, 240), paint(180, 240)
-    with pytest.raises(MemoryError, match=r"the strokes on source cover \d+ pixels or more .* paint less"):
+    with pytest.raises(MemoryError, match=r"the strokes on source cover at least \d+ pixels .* paint less"):
         read_scribbles(
             Picture(picture),
             0 * mask + 1,
@@ -234,7 +234,7 @@ def test_painted_pixels_need_memory() -> None:
     for edit, reason in ((recoloured, "source needs"), (coloured, "the strokes on source cover")):
         with pytest.raises(MemoryError, match=reason):
             edit(picture, strokes, 0 * mask + 1, memory=7_000_000, num_landmarks=5)
-        with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least"):
+        with pytest.raises(MemoryError, match=r"source needs at least \d+ MB of memory, but"):
             edit(picture, strokes, mask, memory=1_000_000)
 
 
@@ -253,9 +253,9 @@ def test_painted_pixels_need_memory() -> None:
         (
             lambda s, m: (s,),
             {},
-            "strokes must have 3 channels and a stroke_mask, or 4 channels and none, got 3 without",
+            "strokes must have 3 channels with a stroke_mask, or 4 channels without one, got 3 channels without",
         ),
-        (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 with one; add or drop it"),
+        (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 channels with a stroke_mask; add or drop it"),
         (lambda s, m: (s, s), {}, "stroke_mask must have 1 channel, got 3"),
         (lambda s, m: (Shrinking(s, most=100, read=50), m), {}, "strokes must keep its size while it is read"),
         (lambda s, m: (s, m), {"statistics": "some"}, "statistics must be one of"),
@@ -285,7 +285,7 @@ def test_what_only_one_of_them_takes_is_named() -> None:
         stream_recolor(picture, grey(picture), strokes, mask)
     with pytest.raises(ValueError, match=r"strength must be in \[0, 1\]"):
         coloured(picture, strokes, mask, strength=2.0)
-    with pytest.raises(ValueError, match="method must be regression where a picture is worked out by rows, got kmeans"):
+    with pytest.raises(ValueError, match="method must be regression for a picture processed in tiles, got kmeans"):
         coloured(picture, strokes, mask, method="kmeans")
     with pytest.raises(ValueError, match="target must have the height and width of the source, three colours"):
         stream_colorize(picture, grey(picture), strokes, mask)
@@ -310,7 +310,7 @@ LITTLE = "0.014"  # gigabytes: less than the whole picture needs, more than smal
 def photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file of 16 bits, 180x150, beside strokes over it in two files, and a copy in grey."""
     monkeypatch.setattr(sampling, "PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
     picture = skimage.data.chelsea()[20:170, 90:270].astype(np.uint16) * 257
     tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb", tile=(64, 64), compression="zlib")
     tifffile.imwrite(tmp_path / "grey.tif", picture[..., 1], photometric="minisblack")
@@ -373,7 +373,7 @@ def test_what_cannot_be_done_by_rows_leaves_nothing(photo: Path, capsys: pytest.
         ("recolor", "in.tif", ("--strokes", folder / "small.png"), "small.png must be as large as the photograph"),
         ("recolor", "in.tif", ("--strokes", folder / "opaque.png"), "opaque.png has no transparency"),
         ("colorize", "in.tif", ("--strokes", folder / "clear.png"), "clear.png must hold a painted pixel, got none"),
-        ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H alone"),
+        ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H only"),
         ("colorize", "in.tif", ("--region", "1,2,5,4"), "--region must end in a colour"),
     ):
         assert run(verb, folder / source, folder / "out.tif", *options, "--memory", LITTLE) == 2

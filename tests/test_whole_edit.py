@@ -19,8 +19,8 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled import recipe as whole_edit
 from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture
 from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import cat, difference
 from tests.test_streaming import cat as photograph
@@ -112,7 +112,7 @@ def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pyt
     few = by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)  # and so two tiles or more
     assert np.abs(few - by_rows(recipe, rows_of(image), tmp_path)).max() < 1e-5
     monkeypatch.setattr("nlfilter_torch.tiled.source.FINISHED", 20_000)
-    with pytest.raises(MemoryError, match=r"scan.tif needs \d+ MB of memory at least, but 60 MB may be used"):
+    with pytest.raises(MemoryError, match=r"scan.tif needs at least \d+ MB of memory, but only 60 MB may be used"):
         by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)
 
 
@@ -133,7 +133,7 @@ def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
 
 def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 4000)
-    monkeypatch.setattr("nlfilter_torch.tiled.sources.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
     photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
     write_photograph(Photograph(cat().repeat(1, 1, 2, 2), "uint16"), photo)  # more than tiles need
     preset.write_text(Recipe((DETAIL, RECOLOR)).to_json())
@@ -159,7 +159,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("nlfilter_torch.tiled.intermediate.TemporaryFile", lambda **_: Full())
-    sentence = "No space left on device, where one step of the edit leaves 0.0 GB to the next"
+    sentence = "No space left on device, for a temporary file of 0.0 GB between two steps of the edit"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)
     assert raised.value.filename == str(tmp_path)
@@ -168,7 +168,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
 def test_negative_regions_come_with_regions_of_their_number() -> None:
     source = rows_of(cat())
     edited, two, three = np.empty_like(source), np.ones((100, 150, 2), np.float32), np.ones((100, 150, 3), np.float32)
-    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+    with pytest.raises(ValueError, match="negative must be given together with regions, got no regions"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), negative=two)
     with pytest.raises(ValueError, match="negative must have 1 channel or one for each of the 2 regions, got 3"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=three)

@@ -13,8 +13,8 @@ Edit = Annotated[
     typer.Option(
         "--preset",
         metavar="FILE|NAME",
-        help="What the editor saved (`nlfilter-torch app`), what `nlfilter-torch fit` found, or the name of a preset "
-        "(`nlfilter-torch presets`).",
+        help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, or the name of a "
+        "preset (see `nlfilter-torch presets`).",
     ),
 ]
 
@@ -40,8 +40,8 @@ def apply(
     from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.tiled.pictures import Rows
     from nlfilter_torch.tiled.recipe import edit_rows
-    from nlfilter_torch.tiled.sources import Rows
 
     def work(photograph: Photograph) -> Tensor:
         return recipe.apply(photograph.pixels)

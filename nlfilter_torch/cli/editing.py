@@ -18,8 +18,8 @@ from nlfilter_torch.io.photographs import (
     write_photograph,
 )
 from nlfilter_torch.io.rows import StoredPicture, check_place, is_zarr, modest_memory, open_picture, write_picture
+from nlfilter_torch.tiled.pictures import Rows
 from nlfilter_torch.tiled.sampling import Report
-from nlfilter_torch.tiled.sources import Rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics
 
 MOST = 1e6  # gigabytes; upper limit of ``--memory``

@@ -11,9 +11,9 @@ from nlfilter_torch.cli.edits import signature
 from nlfilter_torch.edits.parameters import MASK
 
 if TYPE_CHECKING:
-    from nlfilter_torch.tiled.sources import Rows
+    from nlfilter_torch.tiled.pictures import Rows
 
-GIVE = "give --region X,Y,W,H or --mask FILE: some of what is to be selected, such as --region 190,60,60,60"
+GIVE = "give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60"
 
 
 def mask(
@@ -40,9 +40,9 @@ def mask(
     from nlfilter_torch.io.pfm import PFM, write_pfm
     from nlfilter_torch.io.photographs import Photograph, check_file, check_output, write_photograph
     from nlfilter_torch.io.rows import check_place, open_picture, write_picture
+    from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.scribbles import RegionRows
     from nlfilter_torch.tiled.source import Tiled
-    from nlfilter_torch.tiled.sources import Picture
     from nlfilter_torch.tiled.workers import undivided
 
     if mask is None and not region:
@@ -90,7 +90,9 @@ def mask(
             return
     with open_picture(Path(source), allowed) as picture, stages() as report:
         if floats:
-            raise ValueError(f"{target} takes the whole mask in memory; write a TIFF file, or allow more memory")
+            raise ValueError(
+                f"{target} cannot be written in tiles, since it is a PFM file; write a TIFF file, or raise --memory"
+            )
         plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
         check_place(place, kind, plain, allowed)
         with ExitStack() as files:

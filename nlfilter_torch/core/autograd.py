@@ -96,5 +96,5 @@ class _Refusal(torch.autograd.Function):
     def backward(ctx: Any, *_: Any) -> Gradients:
         raise RuntimeError(
             "the filter must not be differentiated twice with respect to its guide, bandwidths or patch weights; "
-            "detach them, which leaves second derivatives in the image and in alpha"
+            "detach them to take second derivatives with respect to the image and alpha only"
         )

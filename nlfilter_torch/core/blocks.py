@@ -90,8 +90,8 @@ def fold_batch(image: Tensor, batch: int) -> Tensor:
     """
     if image.shape[0] != batch and 1 not in (image.shape[0], batch):
         raise ValueError(
-            f"image must have the operator's batch size, {batch}, or 1, got {image.shape[0]}; "
-            "build the operator from as many guides"
+            f"image must have batch size 1 or that of the operator, {batch}, got {image.shape[0]}; "
+            "build the operator from one guide per image"
         )
     if batch == 1:
         return image.flatten(2).flatten(0, 1).unsqueeze(0)

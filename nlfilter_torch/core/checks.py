@@ -31,7 +31,7 @@ DOMAINS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "not negative": ("at least 0 and finite", lambda v: v >= 0, "pass 0 or more"),
     "share": ("in [0, 1]", lambda v: (v >= 0) & (v <= 1), "clamp it"),
     "below 1": ("in [0, 1)", lambda v: (v >= 0) & (v < 1), "clamp it"),
-    "finite": ("finite", lambda v: v == v, "1.0 changes nothing"),
+    "finite": ("finite", lambda v: v == v, "pass a finite number"),
 }
 
 
@@ -40,14 +40,14 @@ def check_tensor(value: object, name: str, remedy: str = "convert it with torch.
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; {remedy}")
     if value.layout != torch.strided:
-        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call its to_dense()")
+        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call .to_dense()")
 
 
 def check_dtype(tensor: Tensor, name: str, remedy: str, *, values: str = "") -> None:
     """Raise unless ``tensor`` is a tensor of a floating-point dtype; ``values`` is inserted in the message."""
     check_tensor(tensor, name)
     if tensor.dtype not in FLOATING:
-        raise TypeError(f"{name} must be of a floating-point dtype{values}, got {tensor.dtype}; {remedy}")
+        raise TypeError(f"{name} must have a floating-point dtype{values}, got {tensor.dtype}; {remedy}")
 
 
 def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
@@ -61,7 +61,7 @@ def check_image(
 ) -> None:
     """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with pixels; B may be 0 if ``empty``."""
     check_tensor(image, name, "convert it with torch.as_tensor")
-    check_dtype(image, name, "divide integer pixels by their largest value", values=" with values in [0, 1]")
+    check_dtype(image, name, "convert integer pixels and divide by white, such as 255", values=" with values in [0, 1]")
     if image.ndim != 4:
         raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
     if 0 in image.shape[empty:]:
@@ -113,7 +113,7 @@ def warn_of_scale(image: Tensor, name: str) -> None:
     largest = float(image.detach().max())
     if largest > FAR_OUTSIDE:
         warn(
-            f"{name} must be in [0, 1] or near it, got values up to {largest:g}; divide by the value of white, say 255"
+            f"{name} must be in or near [0, 1], got values up to {largest:g}; divide by the value of white, such as 255"
         )
 
 
@@ -135,7 +135,7 @@ def check_patch_size(patch_size: int) -> None:
         raise ValueError(f"patch_size must be odd and at least 1, got {described(patch_size)}; {remedy}")
     if patch_size > LARGEST_PATCH:
         raise ValueError(
-            f"patch_size must be at most {LARGEST_PATCH}, got {described(patch_size)}; reduce the image instead"
+            f"patch_size must be at most {LARGEST_PATCH}, got {described(patch_size)}; downscale the image instead"
         )
 
 
@@ -258,15 +258,15 @@ def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) 
 
 def check_coefficients(coefficients: Tensor, factor: Tensor) -> None:
     """Raise unless coefficients (b, C, M) in float64 fit a factor (B, M, N)."""
-    check_tensor(coefficients, "coefficients", "take spectrum.coefficients of an image")
+    check_tensor(coefficients, "coefficients", "use spectrum.coefficients(image)")
     batch, count, _ = factor.shape
     shape = tuple(coefficients.shape)
     if coefficients.ndim != 3 or shape[2] != count or 0 in shape or (shape[0] != batch and 1 not in (batch, shape[0])):
         raise ValueError(
-            f"coefficients must have shape ({batch}, C, {count}), got {shape}; take spectrum.coefficients of an image"
+            f"coefficients must have shape ({batch}, C, {count}), got {shape}; use spectrum.coefficients(image)"
         )
     if coefficients.dtype != torch.float64:
-        raise TypeError(f"coefficients must be of dtype torch.float64, got {coefficients.dtype}; convert them")
+        raise TypeError(f"coefficients must have dtype torch.float64, got {coefficients.dtype}; convert them")
     check_finite(coefficients, "coefficients")
 
 
@@ -275,7 +275,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
     if not callable(response):
         raise TypeError(
             f"response must be a function of the eigenvalues, got {type(response).__name__}; "
-            "pass one such as torch.sqrt"
+            "pass a function such as torch.sqrt"
         )
     remedy = "return one gain for every eigenvalue"
 
@@ -290,7 +290,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
             fits = False
         if not fits:
             raise ValueError(
-                f"response must return a tensor of the shape {tuple(eigenvalues.shape)} of its argument, "
+                f"response must return a tensor with the shape of its argument, {tuple(eigenvalues.shape)}, "
                 f"got {tuple(gains.shape)}; {remedy}"
             )
         if eigenvalues.shape == support.shape:
@@ -324,7 +324,7 @@ def check_eigenvalues(values: Tensor) -> None:
     largest = float(values.detach().abs().max())
     if largest > LARGEST_EIGENVALUE:
         raise ValueError(
-            f"eigenvalues must be in [0, 1] or near it, got values up to {largest:g}; divide them by the largest"
+            f"eigenvalues must be in or near [0, 1], got values up to {largest:g}; divide by the largest one"
         )
 
 
@@ -334,12 +334,12 @@ def check_features(features: Tensor, name: str, size: int | None = None, *, empt
     if features.ndim != 3 or 0 in features.shape[empty:]:
         raise ValueError(
             f"{name} must have shape (B, D, N) with at least one point, got {tuple(features.shape)}; "
-            "put points last and add the missing dimensions"
+            "move points to the last dimension and add missing ones"
         )
     if size is not None and features.shape[1] != size:
         raise ValueError(
-            f"{name} must have the {size} features of each point that the operator was made from, got "
-            f"{features.shape[1]}; work them out in the same way"
+            f"{name} must have {size} features per point, as those from which the operator was built, got "
+            f"{features.shape[1]}; compute them in the same way"
         )
     check_finite(features, name)
 
@@ -349,13 +349,13 @@ def check_size(size: object, points: int) -> tuple[int, int]:
     if not isinstance(size, tuple | list) or len(size) not in (1, 2) or any(type(length) is not int for length in size):
         raise TypeError(
             f"size must be integers (H, W) or (N,), got {size if isinstance(size, tuple) else described(size)}; "
-            f"pass ({points},), say"
+            f"pass ({points},), for example"
         )
     size = (1, *size)[-2:]
     if size[0] < 1 or size[1] < 1 or size[0] * size[1] != points:
         raise ValueError(
-            f"size must have as many pixels as there are features, {points}, got {size[0]}x{size[1]}; "
-            f"pass ({points},) for points in no order"
+            f"size must have one pixel for each of the {points} points, got {size[0]}x{size[1]}; "
+            f"pass ({points},) for unordered points"
         )
     return (size[0], size[1])
 
@@ -367,12 +367,12 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
     batch, _, points = features.shape
     if tuple(weights.shape) not in ((points,), (1, points), (batch, points)):
         raise ValueError(
-            f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; give one each"
+            f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; pass one each"
         )
     weights = weights.detach().to(features).expand(batch, points).contiguous()
     if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
         allowed, found = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
-        raise ValueError(f"weights must be from {allowed}, got {found}; leave out points that stand for no pixel")
+        raise ValueError(f"weights must be from {allowed}, got {found}; drop points of negligible weight")
     return weights
 
 

@@ -32,7 +32,9 @@ def moved(container: Container, target: Target, dtype: torch.dtype | None = None
     else:
         device = torch.device(target)
     if dtype not in (None, torch.float32, torch.float64):
-        raise TypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}; filters convert images themselves")
+        raise TypeError(
+            f"dtype must be torch.float32 or torch.float64, got {dtype}; filters convert images of other dtypes"
+        )
 
     def move(value: Any, exact: bool) -> Any:
         if isinstance(value, Tensor):

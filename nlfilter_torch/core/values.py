@@ -41,8 +41,8 @@ def refuse_transforms(name: str, *values: object) -> None:
     # These three checks take less than a microsecond.
     if torch._C._is_tracing():
         raise TypeError(
-            f"{name} must not be traced by torch.jit.trace where an operator is built, got a traced tensor; "
-            "use torch.export.export, or trace what a finished operator is applied to"
+            f"{name} must not be traced by torch.jit.trace while an operator is built, got a traced tensor; "
+            "use torch.export.export, or trace only the application of an operator built before"
         )
     if forward_ad._current_level < 0 and peek_interpreter_stack() is None:
         return
@@ -51,11 +51,11 @@ def refuse_transforms(name: str, *values: object) -> None:
             continue
         if is_functorch_wrapped_tensor(value):
             raise TypeError(
-                f"{name} must not be transformed by torch.func (vmap, grad, jvp) where an operator is built, got a "
+                f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
                 "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
             )
         if forward_ad.unpack_dual(value).tangent is not None:
             raise TypeError(
-                f"{name} must have no forward-mode derivative where an operator is built, got a tensor with a tangent; "
-                "take derivatives backward, with torch.autograd.grad"
+                f"{name} must have no forward-mode derivative while an operator is built, got a tensor with a tangent; "
+                "use reverse mode, with torch.autograd.grad"
             )

@@ -17,12 +17,12 @@ from nlfilter_torch.operator.features import blur, blur_margin
 
 # The residual of the eigenvectors is multiplied by a power of W's diagonal part r, with the exponent times this factor:
 # it vanishes where similar pixels exist, remains where none do, such as on a border, and is unchanged at power 0.
-TIMES_RESIDUAL = 10
-LEAST = 1e-4  # lower limit of r
+RESIDUAL_EXPONENT = 10
+MIN_REMAINDER = 1e-4  # lower limit of r
 # Difference of Gaussians on luminance from 0 to 100: scale and weight of the wider one, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones in flat areas and at edges
-FLAT = 1e-12  # lower limit of squared gradients; keeps the derivative of their square root finite
+MIN_SQUARED_GRADIENT = 1e-12  # lower limit of squared gradients; keeps the derivative of their square root finite
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, from which on steps have the steepness CRISP
 
 
@@ -99,7 +99,7 @@ def fit_abstract(
     check_reach(width, "edge_width", source.size)
     ABSTRACT["tones"].check_argument(tones)
     if (edges > 0 or tones is not None) and source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select some")
+        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3")
     options |= {
         "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
         "spatial_bandwidth": nearby(options["spatial_bandwidth"], ABSTRACT["spatial_bandwidth"].share, source.size),
@@ -116,11 +116,13 @@ def fit_abstract(
     coefficients = operator.coefficients(varying)
     captured = synthesize(operator, torch.ones_like, coefficients)
     smoothed = synthesize(operator, lambda eigenvalues: eigenvalues**exponent, coefficients)
-    times = TIMES_RESIDUAL * exponent.to(source.dtype).unsqueeze(2)
-    kept = operator.each(lambda columns: columns.remainder.clamp(LEAST, 1.0).unsqueeze(1) ** times)
+    residual_exponent = RESIDUAL_EXPONENT * exponent.to(source.dtype).unsqueeze(2)
+    residual_gain = operator.each(
+        lambda columns: columns.remainder.clamp(MIN_REMAINDER, 1.0).unsqueeze(1) ** residual_exponent
+    )
 
     def flat(pixels: Pixels) -> Tensor:
-        return mean + smoothed(pixels) + kept(pixels) * (varying(pixels) - captured(pixels))
+        return mean + smoothed(pixels) + residual_gain(pixels) * (varying(pixels) - captured(pixels))
 
     if edges == 0 and tones is None:
         return Fitted(flat)
@@ -148,7 +150,7 @@ def quantize(luminance: Tensor, tones: int) -> Tensor:
 
     step = 1 / (tones - 1)
     nearest = (luminance / step).round() * step
-    gradient = 100 * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=FLAT).sqrt()
+    gradient = 100 * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=MIN_SQUARED_GRADIENT).sqrt()
     steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
     # Steepness is relative to a step, so that transitions look alike for any number of tones.
     return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)

@@ -10,9 +10,9 @@ from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.operator.features import reduce_channels
 
 SAME_SHAPE = 0.02  # largest difference of log aspect ratios at which an edited picture counts as resized
-LIKE = 0.6  # correlation required between a crop and its position
-SEARCHED = 400  # short side in pixels of the reduced picture in which a crop is searched for first
-FAR = 0.1  # largest shift, as a share of the short side
+MIN_CORRELATION = 0.6  # correlation required between a crop and its position
+SEARCH_SIDE = 400  # short side in pixels of the reduced picture in which a crop is searched for first
+MAX_SHIFT = 0.1  # largest shift, as a share of the short side
 
 
 def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:
@@ -42,13 +42,13 @@ def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor
         place, likeness = _place(before, after)
     if resized is not None and _correlation(_grey(before), _grey(resized)) >= likeness:
         return before, resized, f"{edited} is resized from {other[1]}x{other[0]} to {size[1]}x{size[0]}"
-    if likeness < LIKE:
+    if likeness < MIN_CORRELATION:
         raise ValueError(
-            f"{edited} must have the size of {name}, {size[1]}x{size[0]}, or be that picture resized or a part of it, "
-            f"got {other[1]}x{other[0]}; crop both alike"
+            f"{edited} must have the size of {name}, {size[1]}x{size[0]}, or be a resized copy or a crop of it, "
+            f"got {other[1]}x{other[0]}; crop both to the same area"
         )
     part = before[..., place[0] : place[0] + other[0], place[1] : place[1] + other[1]]
-    return part, after, f"{edited} is the part of {name} from row {place[0]}, column {place[1]}"
+    return part, after, f"{edited} is a crop of {name} from row {place[0]}, column {place[1]}"
 
 
 def _grey(image: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
     first, second = _grey(before), _grey(after)
     found = phase_cross_correlation(second.numpy(), first.numpy(), normalization=None)[0]
     down, right = (round(float(shift)) for shift in found)
-    limit = FAR * min(first.shape)
+    limit = MAX_SHIFT * min(first.shape)
     if (down, right) == (0, 0) or max(abs(down), abs(right)) > limit:
         return 0, 0
     likeness = _correlation(*_overlap(first, second, down, right))
@@ -90,7 +90,7 @@ def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
     from skimage.feature import match_template
 
     whole, part = _grey(before), _grey(after)
-    scale = max(1.0, min(whole.shape) / SEARCHED)
+    scale = max(1.0, min(whole.shape) / SEARCH_SIDE)
     small, piece = whole, part
     if scale > 1:
         small, piece = (
@@ -103,14 +103,14 @@ def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
     row, column = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
     if scale == 1:
         return (row, column), float(found.max())
-    reach = math.ceil(2 * scale)  # the position is accurate to a few pixels; search again around it
+    margin = math.ceil(2 * scale)  # the position is accurate to a few pixels; search again around it
     top, left = (
-        min(max(0, round(place * scale) - reach), room)
+        min(max(0, round(place * scale) - margin), room)
         for place, room in zip(
             (row, column), (whole.shape[0] - part.shape[0], whole.shape[1] - part.shape[1]), strict=True
         )
     )
-    near = whole[top : top + part.shape[0] + 2 * reach, left : left + part.shape[1] + 2 * reach]
+    near = whole[top : top + part.shape[0] + 2 * margin, left : left + part.shape[1] + 2 * margin]
     found = match_template(near.numpy(), part.numpy())
     down, right = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
     return (top + down, left + right), float(found.max())

@@ -22,9 +22,9 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
-from nlfilter_torch.edits.components import scribbled_blocks
 from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.parameters import COLORIZE
+from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Source, edited, luminance
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import fit_strokes
@@ -55,7 +55,7 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
-SHARE = 0.5  # weight of the local values on a stroke
+LOCAL_WEIGHT = 0.5  # weight of the local values on a stroke
 
 
 @full_precision
@@ -148,8 +148,8 @@ def fit_colorize(
     COLORIZE["method"].check_argument(method)
     if method == "kmeans" and not source.whole:
         raise ValueError(
-            "method must be regression where a picture is worked out by rows, got kmeans, which takes all pixels at "
-            "once; choose regression, or allow more memory"
+            "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in memory; "
+            "choose regression, or allow more memory"
         )
     COLORIZE["strength"].check_argument(strength, source.batch)
     check_positive(time, "time", source.batch)
@@ -203,6 +203,6 @@ def fit_colorize(
     def coloured(some: Any) -> Tensor:
         grey, alike = luminance(some), far(some) + near(some)
         connected, influence = local(grey, some.first)
-        return merge_luminance(grey, alike + SHARE * (with_green(connected) - influence * alike))
+        return merge_luminance(grey, alike + LOCAL_WEIGHT * (with_green(connected) - influence * alike))
 
     return Fitted(coloured)

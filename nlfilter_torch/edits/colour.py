@@ -11,16 +11,16 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.features import reduce_channels
 
-ROOM = 0.9  # share of its headroom towards white or black that a channel may use
+HEADROOM_SHARE = 0.9  # share of its headroom towards white or black that a channel may use
 LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that rounding does not clip
-CHANNELS = 0.25  # weight of the channel with the least headroom
-SATURATION = 2.0  # limit of the relative growth of saturation, as a multiple of that of luminance
-DARK = 0.02  # lower limit of the luminance that the change of luminance is divided by
-STEEPEST = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
-LEAST = 1e-9
+CHANNEL_WEIGHT = 0.25  # weight of the channel with the least headroom
+MAX_SATURATION_GAIN = 2.0  # limit of the relative growth of saturation, as a multiple of that of luminance
+MIN_LUMINANCE = 0.02  # lower limit of the luminance that the change of luminance is divided by
+MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
+EPSILON = 1e-9
 LIGHTNESS = 0.3  # weight of lightness relative to hue and saturation: a fold in a red cloth is still red
-CONVERTED = 8192  # pixels converted at once by one thread
-VECTOR = 64  # a multiple of the SIMD width in floats
+CHUNK = 8192  # pixels converted at once by one thread
+VECTOR_LENGTH = 64  # a multiple of the SIMD width in floats
 Limits = Literal["soft", "none"]
 
 
@@ -110,17 +110,17 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
         return torch.cat([moved, before, after * (1 - after)], dim=1)
 
     moved, before, room = mean(shifts).chunk(3, dim=1)
-    curve = ((moved - brighter * before) / room.clamp(min=LEAST)).clamp(-STEEPEST, STEEPEST)
+    curve = ((moved - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
 
     def chromas(image: Tensor, change: Tensor) -> Tensor:
         if change.shape[1] == image.shape[1]:
             return image.new_zeros(len(image), 2, *image.shape[2:])
         scale, more = _saturation(image, _curved(image, change, curve))
-        chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=LEAST).sqrt()
+        chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
         return torch.cat([-scale * chroma, more * chroma], dim=1)
 
     lost, gained = mean(chromas).chunk(2, dim=1)
-    return Balance(curve, (lost / gained.clamp(min=LEAST)).clamp(max=1.0))
+    return Balance(curve, (lost / gained.clamp(min=EPSILON)).clamp(max=1.0))
 
 
 def balance_in_memory(image: Tensor, change: Tensor, brighter: float | Tensor = 0.0) -> Balance:
@@ -135,8 +135,8 @@ def _before(image: Tensor, change: Tensor) -> Tensor:
 
 def _ends(planes: Tensor) -> tuple[Tensor, Tensor]:
     """Return the lowest and highest values that planes may take."""
-    low = torch.minimum(((1 - ROOM) * planes).clamp(min=LEVEL), planes)
-    high = 1 - torch.minimum(((1 - ROOM) * (1 - planes)).clamp(min=LEVEL), 1 - planes)
+    low = torch.minimum(((1 - HEADROOM_SHARE) * planes).clamp(min=LEVEL), planes)
+    high = 1 - torch.minimum(((1 - HEADROOM_SHARE) * (1 - planes)).clamp(min=LEVEL), 1 - planes)
     return low, torch.maximum(high, planes)
 
 
@@ -145,11 +145,11 @@ def _limited(image: Tensor, change: Tensor) -> Tensor:
     before = _before(image, change)
     up = change >= 0
     low, high = _ends(before)
-    room = torch.where(up, high - before, before - low).clamp(min=LEAST)
+    room = torch.where(up, high - before, before - low).clamp(min=EPSILON)
     if change.shape[1] != image.shape[1]:
         low, high = _ends(image)
         least = torch.where(up, (high - image).amin(1, keepdim=True), (image - low).amin(1, keepdim=True))
-        room = room.pow(1 - CHANNELS) * least.clamp(min=LEAST).pow(CHANNELS)
+        room = room.pow(1 - CHANNEL_WEIGHT) * least.clamp(min=EPSILON).pow(CHANNEL_WEIGHT)
     moved = -room * torch.expm1(-torch.where(up, change, -change) / room)
     return torch.where(up, moved, -moved)
 
@@ -172,7 +172,9 @@ def _saturation(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
         The required decrease, from -1 to 0, and the possible increase, from 0 to 1, both (B, 1, H, W).
     """
     share, luminance = _share(image, moved), reduce_channels(image, "luminance")
-    relative = SATURATION * (moved.abs() / luminance.clamp(min=DARK)).clamp(max=1 / SATURATION)
+    relative = MAX_SATURATION_GAIN * (moved.abs() / luminance.clamp(min=MIN_LUMINANCE)).clamp(
+        max=1 / MAX_SATURATION_GAIN
+    )
     return share.clamp(max=0.0), torch.minimum(share.clamp(min=0.0), relative)
 
 
@@ -181,7 +183,7 @@ def _share(image: Tensor, moved: Tensor) -> Tensor:
     luminance, chroma = split_luminance(image)
     after, (low, high) = luminance + moved, _ends(image)
     room = torch.where(chroma > 0, high - after, after - low).clamp(min=0.0)
-    share = (room / chroma.abs().clamp(min=LEAST)).amin(1, keepdim=True) - 1
+    share = (room / chroma.abs().clamp(min=EPSILON)).amin(1, keepdim=True) - 1
     return torch.where(moved == 0, torch.zeros_like(share), share)
 
 
@@ -213,7 +215,7 @@ def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 MAX_COLOURS = 16
-ALIKE = 0.05  # chroma difference in units of RGB below which strokes have the same colour
+SAME_COLOUR = 0.05  # chroma difference in units of RGB below which strokes have the same colour
 
 
 def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -276,7 +278,7 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
     leaders: list[Tensor] = []
     while len(leaders) < MAX_COLOURS and bool((numbers < 0).any()):
         leader = paint[:, (numbers < 0).nonzero()[0]]  # (3, 1)
-        numbers[(numbers < 0) & ((paint - leader).norm(dim=0) < ALIKE)] = len(leaders)
+        numbers[(numbers < 0) & ((paint - leader).norm(dim=0) < SAME_COLOUR)] = len(leaders)
         leaders.append(leader)
     left = numbers < 0
     if bool(left.any()):
@@ -315,8 +317,8 @@ def colour_guide(image: Tensor) -> Tensor:
 
     # Powers round differently in the scalar remainder at the end of a tensor, or of a thread's part of it.
     parts = []
-    for part in image.clamp(0.0, 1.0).flatten(2).split(CONVERTED, dim=2):
-        full = F.pad(part, (0, -part.shape[2] % VECTOR)).unsqueeze(2).contiguous()
+    for part in image.clamp(0.0, 1.0).flatten(2).split(CHUNK, dim=2):
+        full = F.pad(part, (0, -part.shape[2] % VECTOR_LENGTH)).unsqueeze(2).contiguous()
         parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
     lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
     return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)

@@ -70,7 +70,7 @@ class Parameter:
         high: largest value.
         unit: unit of the value.
         domain: values that the function accepts, if these are more than the range; see :meth:`check_argument`.
-        zero: effect of the value 0, for errors.
+        zero_meaning: effect of the value 0, for errors.
         optional: whether None is allowed.
         words: words allowed in place of a number.
         choices: possible values of a choice.
@@ -78,8 +78,8 @@ class Parameter:
             a value differs from it.
         argument: name of the function's argument, if it differs.
         share: for distances, the share of the short side that None stands for; 0 is no limit.
-        least: minimum in pixels of a length given in hundredths of the short side.
-        former: former names in files, each with a factor or a function that converts its values; names of the same
+        min_pixels: minimum in pixels of a length given in hundredths of the short side.
+        former_names: in files, each with a factor or a function that converts its values; names of the same
             unit are also accepted as options.
         metavar: placeholder of a value in the help, if it is not that of the unit.
         slider: the editor's slider.
@@ -95,15 +95,15 @@ class Parameter:
     high: float = 0.0
     unit: Unit = ""
     domain: Domain | None = None
-    zero: str = ""
+    zero_meaning: str = ""
     optional: bool = False
     words: tuple[str, ...] = ()
     choices: tuple[str, ...] = ()
     idle: Any = ...
     argument: str = ""
     share: float = 0.0
-    least: float = 0.0
-    former: tuple[tuple[str, float | Callable[[float], float]], ...] = ()
+    min_pixels: float = 0.0
+    former_names: tuple[tuple[str, float | Callable[[float], float]], ...] = ()
     metavar: str | None = None
     slider: Slider | None = None
     is_option: bool = True
@@ -131,7 +131,7 @@ class Parameter:
             "count": f"a whole number {span}",
             "odd": f"an odd number {span}",
             "choice": f"{', '.join(named[:-1])} or {''.join(named[-1:])}",
-            "sliders": f"a list of {self.length or f'2 to {MAX_SLIDERS}'} numbers, none beyond {GAINS[1]:.0f}",
+            "sliders": f"a list of {self.length or f'2 to {MAX_SLIDERS}'} numbers {span}",
         }[self.kind]
         alternatives = [f'"{word}"' for word in self.words] + ["null"] * self.optional
         return ", or ".join([text, *alternatives])
@@ -178,7 +178,7 @@ class Parameter:
         if self.unit == "lab":
             return value / 100
         if self.unit == "%":
-            return max(value / 100 * min(size), self.least)
+            return max(value / 100 * min(size), self.min_pixels)
         return value / stride if self.unit == "px" and self.kind == "number" else value
 
     def pixels(self, given: float | None, size: tuple[int, int]) -> float:
@@ -204,7 +204,7 @@ class Parameter:
             if batch is None:
                 checks.check_number(value, name, "pass a float or None" if self.unit == "%" else "pass a float")
             if self.domain is not None:
-                checks.check_values(value, name, self.domain, batch, self.zero)
+                checks.check_values(value, name, self.domain, batch, self.zero_meaning)
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class Edit:
         parameters: parameters of the edit itself, then those of its filter.
         hint: sentence shown in the editor.
         brushes: what strokes can mean, each with its label in the editor; ``colour`` stands for any colour.
-        needs: whether the edit has no effect without strokes.
+        requires_strokes: whether the edit has no effect without strokes.
         coloured: whether the edit turns a grey photograph into a colour one.
     """
 
@@ -226,7 +226,7 @@ class Edit:
     parameters: tuple[Parameter, ...]
     hint: str = ""
     brushes: tuple[tuple[str, str], ...] = ()
-    needs: bool = False
+    requires_strokes: bool = False
     coloured: bool = False
 
     def __iter__(self) -> Iterator[Parameter]:
@@ -258,7 +258,7 @@ def parse_json(text: str, name: str, remedy: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
-        raise ValueError(f"{name} is no preset: {reason}; {remedy}") from error
+        raise ValueError(f"{name} is not a preset: {reason}; {remedy}") from error
 
 
 def shown(value: Any) -> str:

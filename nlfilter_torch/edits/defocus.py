@@ -18,7 +18,7 @@ Aperture = Literal["disc", "gaussian"]
 # A mask below BLURRED counts as background, above SHARP as subject. A blurred part of the subject is more disturbing
 # than a sharp part of the background, so uncertain pixels stay sharp and the reach is larger than for other regions.
 BLURRED, SHARP, REACH = 0.15, 0.4, 0.72
-LEAST = 1e-5  # weight of the subject in the blur of the background
+SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
 
 
 @full_precision
@@ -92,20 +92,20 @@ def fit_defocus(
 ) -> Fitted:
     """:func:`defocus` for any source."""
     if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
     DEFOCUS["aperture"].check_argument(aperture)
     DEFOCUS["radius"].check_argument(radius)
-    reach = float(DEFOCUS["radius"].pixels(radius, source.size))
-    check_reach(reach, "radius", source.size)
+    blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
+    check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
     options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
     spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
     found = fit_regions(source, [scribbles], [], reach=REACH, spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, masks: Tensor) -> Tensor:
-        return blur_behind(image, focus_of(masks), reach, aperture)
+        return blur_behind(image, focus_of(masks), blur_radius, aperture)
 
-    return Fitted(found.masks, finish, _kernel_radius(reach, aperture))
+    return Fitted(found.masks, finish, _kernel_radius(blur_radius, aperture))
 
 
 def focus_of(mask: Tensor) -> Tensor:
@@ -122,7 +122,7 @@ def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture)
         radius: radius of the blur.
         aperture: see :func:`defocus`.
     """
-    behind = (1 - focus).square() + LEAST  # LEAST matters only where there is no background nearby
+    behind = (1 - focus).square() + SUBJECT_WEIGHT  # SUBJECT_WEIGHT matters only where there is no background nearby
     sums = _convolve(torch.cat([image * behind, behind], dim=1), _kernel(radius, aperture).to(image))
     blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
     return torch.where(focus == 1, image, blurred)
@@ -135,8 +135,8 @@ def _kernel_radius(radius: float, aperture: Aperture) -> int:
 
 def _kernel(radius: float, aperture: Aperture) -> Tensor:
     """Compute a square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
-    reach = _kernel_radius(radius, aperture)
-    axis = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    half_width = _kernel_radius(radius, aperture)
+    axis = torch.arange(-half_width, half_width + 1, dtype=torch.float64)
     squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
     if aperture == "disc":
         kernel = (radius + 0.5 - squared.sqrt()).clamp(0.0, 1.0)
@@ -148,7 +148,7 @@ def _kernel(radius: float, aperture: Aperture) -> Tensor:
 def _convolve(planes: Tensor, kernel: Tensor) -> Tensor:
     """Convolve planes (B, C, H, W) with a symmetric kernel (k, k), with zeros outside the image."""
     height, width = planes.shape[-2:]
-    reach = kernel.shape[0] // 2
-    size = (height + 2 * reach, width + 2 * reach)
+    half_width = kernel.shape[0] // 2
+    size = (height + 2 * half_width, width + 2 * half_width)
     product = torch.fft.rfft2(planes, s=size) * torch.fft.rfft2(kernel, s=size)
-    return torch.fft.irfft2(product, s=size)[..., reach : reach + height, reach : reach + width]
+    return torch.fft.irfft2(product, s=size)[..., half_width : half_width + height, half_width : half_width + width]

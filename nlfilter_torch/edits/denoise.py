@@ -25,7 +25,7 @@ Method = Literal["network", "rule"]
 
 GUIDE_BLUR = 0.7  # pixels; without the blur, pixels would be similar by their noise
 ORDER = 2
-QUIET = 0.1 / 255  # noise level below what 8 bits resolve; the image is returned unchanged
+NEGLIGIBLE_NOISE = 0.1 / 255  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
 @full_precision
@@ -103,7 +103,7 @@ def fit_denoise(
     check_count(options["num_landmarks"], "num_landmarks")
     unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
     if unknown:
-        raise TypeError(f"denoise takes no argument {unknown[0]}; see its documentation for those it takes")
+        raise TypeError(f"denoise has no argument {unknown[0]}; see its documentation for the valid ones")
     is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
     if not isinstance(noise_level, Noise) and not is_map:
         DENOISE["noise_level"].check_argument(noise_level, source.batch)
@@ -112,38 +112,42 @@ def fit_denoise(
     if method == "network":
         return _by_network(source, noise_level, strength)
     if is_map:
-        raise ValueError("noise_level must be a number or (B,) for the rule, got a map; use the network")
+        raise ValueError(
+            "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
+        )
     level = noise_level.level if isinstance(noise_level, Noise) else torch.as_tensor(noise_level, dtype=source.dtype)
     return _by_rule(source, level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1), **options)
 
 
 @cache
-def _read(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
+def _trained_network(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
     return NonlocalDenoiser.trained(device=device, dtype=dtype).requires_grad_(False)
 
 
 def _network(image: Tensor) -> NonlocalDenoiser:
     """Return the trained network with frozen weights, read once per device and dtype."""
-    read = _read.__wrapped__ if is_fake(image) else _read  # fake weights must not be cached
+    read = _trained_network.__wrapped__ if is_fake(image) else _trained_network  # fake weights must not be cached
     return read(image.device, image.dtype)
 
 
 def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
     """Fit denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
     if isinstance(noise, Tensor) and noise.ndim == 4 and not source.whole:
-        raise ValueError("noise_level must be a number for a picture in tiles, got a map; denoise it in memory")
+        raise ValueError(
+            "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
+        )
 
     def finish(image: Tensor, _: Tensor) -> Tensor:
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
-        level = torch.where(level < QUIET, torch.zeros_like(level), level)
+        level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
         return image - _network(image).estimate_in_tiles(image, level, turns=1)
 
     return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
 
 
 def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Tensor | None, **options: Any) -> Fitted:
-    assumed = level.clamp(min=QUIET)
+    assumed = level.clamp(min=NEGLIGIBLE_NOISE)
     options |= {
         "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
         "spatial_bandwidth": nearby(options["spatial_bandwidth"], DENOISE["spatial_bandwidth"].share, source.size),
@@ -153,17 +157,17 @@ def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Te
     operator = source.operator(Guide(options, blur=GUIDE_BLUR))
     layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
     energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of planes (B, ORDER, H, W)
-    noise = assumed.square().reshape(-1, 1) * _passed_noise(operator, source.size[0] * source.size[1])  # (B, ORDER)
+    noise = assumed.square().reshape(-1, 1) * _noise_in_layers(operator, source.size[0] * source.size[1])  # (B, ORDER)
 
     def cleaned(pixels: Pixels) -> Tensor:
         kept = (1 - noise[..., None, None].to(pixels.image) / energy(pixels)[:, -1].clamp(min=1e-12)).clamp(0.0, 1.0)
         weighed = weigh_layers(layers(pixels), torch.cat([kept, torch.ones_like(kept[:, :1])], dim=1))
-        return torch.where((level < QUIET).reshape(-1, 1, 1, 1), pixels.image, weighed)
+        return torch.where((level < NEGLIGIBLE_NOISE).reshape(-1, 1, 1, 1), pixels.image, weighed)
 
     return Fitted(cleaned)
 
 
-def _passed_noise(operator: Operator, pixels: int) -> Tensor:
+def _noise_in_layers(operator: Operator, pixels: int) -> Tensor:
     """Variance (B, ORDER) of unit white noise in each detail layer ``W^i (I - W)``, mean over pixels.
 
     Outside the span of the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.

@@ -23,7 +23,7 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 
-CALM = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
+VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
 TINY = 1e-12
 
 
@@ -143,7 +143,7 @@ def fit_detail(
         check_weight(residual, "residual", source.batch)
     if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
-        raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
+        raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
     sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit
@@ -184,7 +184,7 @@ def fit_detail(
         if regions is None:
             if not isinstance(threshold, Tensor) and threshold == 0:
                 return Fitted(lambda pixels: sum_of(added_and_rest(pixels, sliders)))
-            return Fitted(lambda pixels: added_and_rest(pixels, sliders), limited, blur_margin(CALM))
+            return Fitted(lambda pixels: added_and_rest(pixels, sliders), limited, blur_margin(VARIANCE_SIGMA))
 
         def weights(of: Any, name: str) -> Any:
             return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
@@ -198,7 +198,7 @@ def fit_detail(
             changes = torch.cat([added_and_rest(pixels, row) for row in rows], dim=1)
             return blend_changes(changes, masks.masks(pixels))
 
-        return Fitted(blended, limited, blur_margin(CALM))
+        return Fitted(blended, limited, blur_margin(VARIANCE_SIGMA))
 
     brighter: Tensor | None = None
     if regions is not None:
@@ -261,7 +261,7 @@ def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> T
 def activity(image: Tensor) -> Tensor:
     """Local variance (B, 1, H, W) of the luminance of an image."""
     grey = reduce_channels(image, "luminance").mean(1, keepdim=True)
-    mean, square = blur(torch.cat([grey, grey.square()], dim=1), CALM).chunk(2, dim=1)
+    mean, square = blur(torch.cat([grey, grey.square()], dim=1), VARIANCE_SIGMA).chunk(2, dim=1)
     return (square - mean.square()).clamp(min=0)
 
 

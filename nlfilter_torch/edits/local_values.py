@@ -22,9 +22,10 @@ from nlfilter_torch.operator.features import pad_border
 
 SOLVED = 1 << 14  # pixels
 # Limits of the variance that squared differences of luminance are divided by, and least weight of a neighbour.
-LEAST_VARIANCE, MOST_VARIANCE, LEAST = 0.007**2, 0.042**2, 1e-5
-FIXED = 1e3  # weight of the value of a scribbled pixel
-REACH = 1.0  # distance at which the influence falls to 1/e in flat areas, relative to the square root of the area
+MIN_VARIANCE, MAX_VARIANCE, MIN_WEIGHT = 0.007**2, 0.042**2, 1e-5
+SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
+# Distance at which the influence falls to 1/e in flat areas, relative to the square root of the area.
+DECAY_DISTANCE = 1.0
 TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-10}
 
 
@@ -53,10 +54,12 @@ class LocalValues:
         blocks = places // width // step * columns + places % width // step
         weighted = torch.cat([values * weights, weights], dim=1)
         sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
-        sums = sums.unflatten(2, (rows, columns)) * (FIXED / step**2)
+        sums = sums.unflatten(2, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
-        anchor = sums[:, -1:] + 3 / (REACH**2 * rows * columns)
-        links = neighbour_weights(guide, lambda squared: torch.exp(-squared) + LEAST, variance=local_variance(guide))
+        anchor = sums[:, -1:] + 3 / (DECAY_DISTANCE**2 * rows * columns)
+        links = neighbour_weights(
+            guide, lambda squared: torch.exp(-squared) + MIN_WEIGHT, variance=local_variance(guide)
+        )
         solved = solve_neighbours(links, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
         return LocalValues(solved, guide, step, width)
 
@@ -78,18 +81,18 @@ class LocalValues:
         height, width = own.shape[2:]
         if self.step == 1:
             return self.values[:, :, top : top + height, left : left + width]
-        rows = self._between(top, height, self.guide.shape[2], own)
-        columns = self._between(left, width, self.guide.shape[3], own)
+        rows = self._two_nearest(top, height, self.guide.shape[2], own)
+        columns = self._two_nearest(left, width, self.guide.shape[3], own)
         total, weight = torch.zeros(()), torch.zeros(())
         for row, row_share in rows:
             for column, column_share in columns:
                 guide, values = (planes[:, :, row][..., column] for planes in (self.guide, self.values))
-                alike = torch.exp((own - guide).square() / -MOST_VARIANCE) + LEAST
+                alike = torch.exp((own - guide).square() / -MAX_VARIANCE) + MIN_WEIGHT
                 share = row_share.unsqueeze(1) * column_share * alike
                 total, weight = total + share * values, weight + share
         return total / weight
 
-    def _between(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
+    def _two_nearest(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Indices (count,) of the blocks before and after pixels along an axis, with linear weights (count,)."""
         position = (torch.arange(first, first + count, device=like.device) + 0.5) / self.step - 0.5
         before = position.floor()
@@ -107,4 +110,4 @@ def local_variance(guide: Tensor) -> Tensor:
     """Variance over 3x3 pixels, clamped to the limits, (B, 1, H, W)."""
     moments = F.avg_pool2d(pad_border(torch.cat([guide, guide.square()], dim=1), 1), 3, stride=1)
     mean, square = moments.split(1, dim=1)
-    return (square - mean.square()).clamp(LEAST_VARIANCE, MOST_VARIANCE)
+    return (square - mean.square()).clamp(MIN_VARIANCE, MAX_VARIANCE)

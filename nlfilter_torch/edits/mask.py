@@ -18,31 +18,32 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import LIGHTNESS, colour_guide, nearby
-from nlfilter_torch.edits.components import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import enlarged
+from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 
 SOLVED = 1 << 17  # pixels
-CHROMA = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
-AROUND, GRAIN, TEXTURE = 2.0, 1.5, 3.0  # Gaussians, in pixels: surrounding colour, grain, average of its strength
-TEXTURED = 1.5  # weight of texture
-PLANES = 9  # channels of the guide
-FLOATS = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
+CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
+# Gaussians, in pixels: surrounding colour, grain, average of its strength.
+SURROUND_SIGMA, GRAIN_SIGMA, TEXTURE_SIGMA = 2.0, 1.5, 3.0
+TEXTURE_WEIGHT = 1.5
+NUM_CHANNELS = 9  # channels of the guide
+FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 SMOOTHNESS = 0.25  # of the regression
-FRAME = 64  # approximate number of points along the upper or left border of a picture
+FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
-TRUST, CERTAIN = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
-COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
-ODD = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
+ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
+NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
+SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
 TINY = 1e-6
 
 
-MARGIN = max(blur_margin(AROUND), blur_margin(GRAIN) + blur_margin(TEXTURE))
+MARGIN = max(blur_margin(SURROUND_SIGMA), blur_margin(GRAIN_SIGMA) + blur_margin(TEXTURE_SIGMA))
 
 
 def lab_of(image: Tensor) -> Tensor:
@@ -55,12 +56,12 @@ def region_guide(image: Tensor) -> Tensor:
     """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of grain and of both gradients."""
     lab = lab_of(image)
     lightness = lab[:, :1]
-    colours = lab * lab.new_tensor([LIGHTNESS, CHROMA, CHROMA]).view(1, 3, 1, 1)
+    colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
     padded = pad_border(lightness, 1)
     rows, columns = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    grain = torch.cat([lightness - blur(lightness, GRAIN), rows / 2, columns / 2], dim=1)
-    strength = (blur(grain.square(), TEXTURE) + 1e-8).sqrt()  # the derivative of the root is finite
-    return torch.cat([colours, blur(colours, AROUND), TEXTURED * strength], dim=1)
+    grain = torch.cat([lightness - blur(lightness, GRAIN_SIGMA), rows / 2, columns / 2], dim=1)
+    strength = (blur(grain.square(), TEXTURE_SIGMA) + 1e-8).sqrt()  # the derivative of the root is finite
+    return torch.cat([colours, blur(colours, SURROUND_SIGMA), TEXTURE_WEIGHT * strength], dim=1)
 
 
 @full_precision
@@ -147,7 +148,7 @@ class Regions:
     scribbles: list[Scribbles]
 
     @property
-    def around(self) -> Tensor:
+    def background_weights(self) -> Tensor:
         """Largest weight of a background scribble of each region, (B, K)."""
         return torch.stack([marked.weights[:, 1].amax(1) for marked in self.scribbles], dim=1)
 
@@ -184,7 +185,7 @@ def select_regions(
     Further arguments are those of :func:`region_mask`.
     """
     if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
     inside = source.regions(scribbles, names[0])
     others = [] if background is None else source.regions(background, names[1])
     if len(others) not in (0, 1, len(inside)):
@@ -193,10 +194,10 @@ def select_regions(
             "add or drop some"
         )
     found = fit_regions(source, inside, others, **options)
-    if others and bool((found.around.detach() <= 0).any()):
+    if others and bool((found.background_weights.detach() <= 0).any()):
         raise ValueError(
             f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
-            "paint beside them, or leave it out"
+            "paint outside them, or omit it"
         )
     return found
 
@@ -229,7 +230,7 @@ def fit_regions(
     check_count(options["num_landmarks"], "num_landmarks")
     blocks = math.ceil(source.stride * math.sqrt(source.size[0] * source.size[1] / SOLVED))  # in the photograph
     step = blocks if source.stride == 1 else max(1.0, blocks / source.stride)
-    small = source.blocks(step, FLOATS + options["num_landmarks"])
+    small = source.blocks(step, FLOATS_PER_PIXEL + options["num_landmarks"])
     marks = [blocks_of(marked, small, source.size[1], step) for marked in both]
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
@@ -237,7 +238,7 @@ def fit_regions(
             check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
             spatial_bandwidth = spatial_bandwidth / step
         options["spatial_bandwidth"] = nearby(spatial_bandwidth, MASK["spatial_bandwidth"].share, small.size)
-    operator = small.operator(Guide(options, region_guide, MARGIN, PLANES, spectral=True, sampled=True))
+    operator = small.operator(Guide(options, region_guide, MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
     frame, colours = operator.at(places), small.colours(places)
     rough = []
@@ -285,7 +286,7 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
 def frame_places(size: tuple[int, int]) -> Tensor:
     """Indices (n,), ascending, of pixels spaced along the borders of a picture, one pixel inside where possible."""
     height, width = size
-    spacing = max(1, (height + width) // FRAME)
+    spacing = max(1, (height + width) // FRAME_POINTS)
     top, left = min(1, height - 1), min(1, width - 1)
     rows, columns = torch.arange(top, height, spacing), torch.arange(left, width, spacing)
     lines = [(top + 0 * columns, columns), (height - 1 - top + 0 * columns, columns)]
@@ -304,14 +305,14 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
         others: colours (B, C, k) of the other pixels.
         bandwidth: photometric bandwidth of the regression.
     """
-    every = max(1, scribbled.shape[2] // COMPARED)
+    every = max(1, scribbled.shape[2] // NUM_COMPARED)
     some, counted = (t[..., ::every] for t in (scribbled, weights.detach() > 0))
     scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
     left, right = (lab_of(t.unsqueeze(2)).squeeze(2) for t in (others, some))
     squares = (left.unsqueeze(3) - right.unsqueeze(2)).square().mean(1) / scale.square()  # (B, k, n)
     counted = counted.to(others).unsqueeze(1)
     share = (torch.exp(-squares) * counted).sum(2) / counted.sum(2).clamp(min=1.0)
-    return (share / ODD).clamp(max=1.0).unsqueeze(1)
+    return (share / SIMILAR_SHARE).clamp(max=1.0).unsqueeze(1)
 
 
 def _regression(
@@ -353,6 +354,8 @@ def fit_borders(image: Tensor, likely: Tensor, front: Tensor, back: Tensor) -> T
     bound = math.tanh(CONTRAST / 2)
     rough = (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)  # 0 and 1 stay as they are
     painted = front + back
-    target = (rough * TRUST + front * CERTAIN) / (TRUST + painted * CERTAIN)
-    start = solve_mask(image, target, TRUST + painted * CERTAIN)
+    target = (rough * ROUGH_CONFIDENCE + front * SCRIBBLE_CONFIDENCE) / (
+        ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE
+    )
+    start = solve_mask(image, target, ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE)
     return solve_linear(image, start, rough, front, back)

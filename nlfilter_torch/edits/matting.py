@@ -20,17 +20,18 @@ STEPS = (2, 4, 8)  # Jacobi steps per level, finest first; the last number is fo
 COARSEST = 48  # minimum short side of the coarsest level, in pixels
 LEVELS = 4  # maximum number of reduced levels
 STEEPNESS = 300.0  # decay of the weights with the mean squared difference of the channels
-LEAST = 1e-4  # smallest weight
-REFINED, CONTRAST = 2, 0.03  # rounds of refinement; colour difference at which it is half trusted
-BESIDE = 4  # radius over which the colours on each side of a border are averaged, in pixels of the coarsest level
+MIN_WEIGHT = 1e-4
+REFINEMENT_ROUNDS, CONTRAST = 2, 0.03  # rounds of refinement; colour difference at which it is half trusted
+SIDE_RADIUS = 4  # radius over which the colours on each side of a border are averaged, in pixels of the coarsest level
 KNOWN = 0.02  # share of nearby pixels on one side at which the colour of that side is half trusted
 TINY = 1e-4  # smallest weight of a pixel on either side
 REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
-WINDOW, NOISE = 2, 1e-5  # radius of the windows in which masks are linear in colour; variance of noise
+WINDOW_RADIUS, NOISE = 2, 1e-5  # radius of the windows in which masks are linear in colour; variance of noise
 LINEAR_LEVELS, LINEAR_STEPS = 2, 8  # of the second solve: levels of the pyramid, steps on each
-DOUBT = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
+END_MARGIN = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
 SLOWEST = 0.03  # smallest eigenvalue that the steps of the second solve damp
-LINEAR_TRUST, LINEAR_CERTAIN = 3e-3, 10.0  # confidence in a rough mask of 0 or 1, and in scribbles
+# Confidence of the second solve in a rough mask of 0 or 1, and in scribbles.
+LINEAR_ROUGH_CONFIDENCE, LINEAR_SCRIBBLE_CONFIDENCE = 3e-3, 10.0
 
 
 def pyramid_levels(short: int) -> int:
@@ -64,7 +65,7 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
         area = scale * 4**level
         target, trust = area * target, area * trust
         found = target / trust if found is None else doubled(found, some)
-        weights = neighbour_weights(colours, lambda squared: torch.exp(steepness * squared) + LEAST)
+        weights = neighbour_weights(colours, lambda squared: torch.exp(steepness * squared) + MIN_WEIGHT)
         found = jacobi(found, target, trust, weights, steps_on(level, levels))
     assert found is not None  # for mypy
     return found.clamp(0.0, 1.0)
@@ -150,15 +151,15 @@ def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
 
 def window_means(planes: Tensor) -> Tensor:
     """Means over the window around each pixel, cut off at the borders of the picture."""
-    size = 2 * WINDOW + 1
-    for axis, pad in ((2, (0, 0, WINDOW, WINDOW)), (3, (WINDOW, WINDOW))):
+    size = 2 * WINDOW_RADIUS + 1
+    for axis, pad in ((2, (0, 0, WINDOW_RADIUS, WINDOW_RADIUS)), (3, (WINDOW_RADIUS, WINDOW_RADIUS))):
         length = planes.shape[axis]
         padded = F.pad(planes, pad)
         total = padded.narrow(axis, 0, length).clone()  # shifted sums: F.avg_pool2d takes several times as long
         for shift in range(1, size):
             total += padded.narrow(axis, shift, length)
         place = torch.arange(length, device=planes.device)
-        count = (place + WINDOW).clamp(max=length - 1) - (place - WINDOW).clamp(min=0) + 1
+        count = (place + WINDOW_RADIUS).clamp(max=length - 1) - (place - WINDOW_RADIUS).clamp(min=0) + 1
         planes = total.mul_(1 / count.to(planes).view(-1, *[1] * (3 - axis)))
     return planes
 
@@ -173,10 +174,10 @@ def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, bac
         front: weights of foreground scribbles, (B, K, H, W).
         back: weights of background scribbles, (B, K, H, W).
     """
-    trust = LINEAR_TRUST * ((2 * rough - 1).square() + 0.01)
+    trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
     levels = min(LINEAR_LEVELS - 1, pyramid_levels(min(image.shape[-2:])))
-    certain = LINEAR_CERTAIN * (front + back)
-    planes = torch.cat([image, trust * rough + LINEAR_CERTAIN * front, trust + certain, start], dim=1)
+    certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
+    planes = torch.cat([image, trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
     count = rough.shape[1]
     found: Tensor | None = None
     for level, some in reversed(list(enumerate(halved(planes, levels)))):
@@ -191,7 +192,7 @@ def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, bac
     assert found is not None  # for mypy
     functions = torch.stack([model.fit(mask.clamp(0.0, 1.0)) for mask in found.split(1, 1)], dim=1)
     slopes, rest = functions.split([image.shape[1], 1], dim=2)
-    return torch.cat([slopes, rest - DOUBT], dim=2) / (1 - 2 * DOUBT)
+    return torch.cat([slopes, rest - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)
 
 
 def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
@@ -253,10 +254,10 @@ def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
     planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
     coarse = F.avg_pool2d(planes, step)
-    size = 2 * BESIDE + 1
+    size = 2 * SIDE_RADIUS + 1
     # Separable box sums; pixels outside the picture do not count.
-    sums = F.avg_pool2d(coarse, (size, 1), 1, (BESIDE, 0))
-    sums = F.avg_pool2d(sums, (1, size), 1, (0, BESIDE))
+    sums = F.avg_pool2d(coarse, (size, 1), 1, (SIDE_RADIUS, 0))
+    sums = F.avg_pool2d(sums, (1, size), 1, (0, SIDE_RADIUS))
     means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
     least = sums[:, :2].amin(1, keepdim=True)
     found = torch.cat([means.flatten(1, 2), least / (least + KNOWN)], dim=1)
@@ -268,6 +269,6 @@ def colours_beside(image: Tensor, mask: Tensor) -> Sides:
 
 def refine_mask(image: Tensor, mask: Tensor) -> Tensor:
     """Refine a mask (B, 1, H, W) by the colours beside its borders, which are computed anew in each round."""
-    for _ in range(REFINED):
+    for _ in range(REFINEMENT_ROUNDS):
         mask = colours_beside(image, mask).refine(image, mask)
     return mask

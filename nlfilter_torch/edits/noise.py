@@ -10,15 +10,15 @@ from nlfilter_torch.core.checks import check_image
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.source import InMemory, Source
 
-WINDOW = 9  # side of a window in pixels
-WINDOWS = 6144  # number of windows
-FLAT = 0.06  # share of the windows in which noise is measured: those with the smallest slopes
-SHADES = 6  # groups of windows by brightness, for noise that depends on it
+WINDOW_SIZE = 9  # side of a window in pixels
+NUM_WINDOWS = 6144
+FLAT_SHARE = 0.06  # share of the windows in which noise is measured: those with the smallest slopes
+BRIGHTNESS_GROUPS = 6  # groups of windows by brightness, for noise that depends on it
 MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
-DOUBLE = 1.1  # ratio to the expected variance above which a group is assumed to contain texture
-BETTER = 0.15  # decrease of the squared relative errors that is required of a dependence on brightness
-DARK = 0.02  # least ratio of the variance in the dark to the growth of variance up to white
-SMALLEST = 1e-12  # variance
+TEXTURE_RATIO = 1.1  # ratio to the expected variance above which a group is assumed to contain texture
+MIN_IMPROVEMENT = 0.15  # decrease of the squared relative errors that is required of a dependence on brightness
+MIN_FLOOR_RATIO = 0.02  # least ratio of the variance in the dark to the growth of variance up to white
+MIN_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -96,38 +96,38 @@ def _measured(source: Source) -> Tensor:
     clipped = (windows == 0).logical_or(windows == 1).any(3).any(2)
     slopes = torch.where(clipped, torch.inf, _slopes(windows))
     level, _ = _level(response, slopes, light)
-    shades, variances = [], []
-    for group in light.argsort(1).tensor_split(SHADES, dim=1):
+    brightness, variances = [], []
+    for group in light.argsort(1).tensor_split(BRIGHTNESS_GROUPS, dim=1):
         if group.shape[1] == 0:
             continue  # fewer windows than groups
         inside = group[..., None].expand(-1, -1, response.shape[2])
-        found, shade = _level(response.gather(1, inside), slopes.gather(1, group), light.gather(1, group))
-        shades.append(shade)
+        found, mean_light = _level(response.gather(1, inside), slopes.gather(1, group), light.gather(1, group))
+        brightness.append(mean_light)
         variances.append(found.square())
-    floor, gain = _line(torch.stack(shades, dim=1), torch.stack(variances, dim=1))
+    floor, gain = _fit_line(torch.stack(brightness, dim=1), torch.stack(variances, dim=1))
     even = gain == 0
     return torch.stack([torch.where(even, level.square(), floor), gain, light.mean(1)])
 
 
 def _windows(source: Source) -> Tensor:
-    """Return windows (B, C * n, WINDOW, WINDOW) at random positions, the same in memory and in tiles."""
+    """Return windows (B, C * n, WINDOW_SIZE, WINDOW_SIZE) at random positions, the same in memory and in tiles."""
     height, width = source.size
-    rows, columns = max(1, height - WINDOW + 1), max(1, width - WINDOW + 1)
+    rows, columns = max(1, height - WINDOW_SIZE + 1), max(1, width - WINDOW_SIZE + 1)
     generator = torch.Generator().manual_seed(0)
-    if rows * columns <= WINDOWS:
+    if rows * columns <= NUM_WINDOWS:
         corners = torch.arange(rows * columns)
     else:
-        corners = torch.randint(rows * columns, (WINDOWS,), generator=generator)
-    inside = torch.arange(WINDOW)
+        corners = torch.randint(rows * columns, (NUM_WINDOWS,), generator=generator)
+    inside = torch.arange(WINDOW_SIZE)
     down = _mirrored(corners // columns, inside, height)
     across = _mirrored(corners % columns, inside, width)
     places, order = (down[:, :, None] * width + across[:, None, :]).flatten().sort()
     colours = source.colours(places)
-    return colours[:, :, order.argsort().to(colours.device)].unflatten(2, (-1, WINDOW, WINDOW)).flatten(1, 2)
+    return colours[:, :, order.argsort().to(colours.device)].unflatten(2, (-1, WINDOW_SIZE, WINDOW_SIZE)).flatten(1, 2)
 
 
 def _mirrored(corners: Tensor, inside: Tensor, length: int) -> Tensor:
-    """Indices of rows or columns (n, WINDOW), with reflection in pictures smaller than a window."""
+    """Indices of rows or columns (n, WINDOW_SIZE), with reflection in pictures smaller than a window."""
     places = (corners[:, None] + inside) % max(1, 2 * length - 2)
     return torch.minimum(places, 2 * length - 2 - places)
 
@@ -148,19 +148,19 @@ def _slopes(windows: Tensor) -> Tensor:
 
 def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
     """Noise level (B,) from responses (B, n, r) in windows with the smallest slopes (B, n), and their brightness."""
-    count = max(1, min(slopes.shape[1], max(20, int(FLAT * slopes.shape[1]))))
+    count = max(1, min(slopes.shape[1], max(20, int(FLAT_SHARE * slopes.shape[1]))))
     least = slopes.argsort(1)[:, :count]
     found = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
     return found.flatten(1).median(1).values / MEDIAN, light.gather(1, least).mean(1)
 
 
-def _line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+def _fit_line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Fit floor and gain (B,), not negative, to variances (B, K) over brightness (B, K).
 
     The gain is 0 unless it reduces the error enough. Texture only adds variance, so points above the line have less
     weight.
     """
-    variance = variance.clamp(min=SMALLEST)
+    variance = variance.clamp(min=MIN_VARIANCE)
     weight = torch.ones_like(variance)
     for _ in range(10):
         scale = weight / variance.square()
@@ -174,8 +174,8 @@ def _line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
             torch.where(gain <= 0, 0.0, torch.where(floor <= 0, rising / square, gain)),
         )
         expected = floor[:, None] + gain[:, None] * light
-        weight = torch.where(variance > DOUBLE * expected, 0.2, 1.0).to(variance)
+        weight = torch.where(variance > TEXTURE_RATIO * expected, 0.2, 1.0).to(variance)
     even = (constant / ones)[:, None]
     errors = [((found - variance) / variance).square().mul(weight).sum(1) for found in (even, expected)]
-    worth = errors[0] - errors[1] > BETTER
-    return torch.where(worth, floor.maximum(DARK * gain), even[:, 0]), torch.where(worth, gain, 0.0)
+    depends = errors[0] - errors[1] > MIN_IMPROVEMENT
+    return torch.where(depends, floor.maximum(MIN_FLOOR_RATIO * gain), even[:, 0]), torch.where(depends, gain, 0.0)

@@ -65,9 +65,9 @@ def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tenso
         wanted: length of the resized axis.
     """
     scale = length / wanted
-    reach = 2 * max(scale, 1.0)  # radius of the kernel
-    first = max(0, math.floor((places.start + 0.5) * scale - reach))
-    last = min(length, math.ceil((places.stop - 0.5) * scale + reach))
+    kernel_radius = 2 * max(scale, 1.0)
+    first = max(0, math.floor((places.start + 0.5) * scale - kernel_radius))
+    last = min(length, math.ceil((places.stop - 0.5) * scale + kernel_radius))
     centres = (torch.arange(places.start, places.stop, dtype=torch.float64) + 0.5) * scale - 0.5
     weights = cubic((torch.arange(first, last) - centres[:, None]) / max(scale, 1.0))
     return slice(first, last), weights / weights.sum(1, keepdim=True)
@@ -95,7 +95,9 @@ def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[i
         size: (h, w) of the part.
     """
     if step != round(step):
-        across = (_between(first, n, step, m) for first, n, m in zip(corner, size, blocks.shape[-2:], strict=True))
+        across = (
+            _linear_weights(first, n, step, m) for first, n, m in zip(corner, size, blocks.shape[-2:], strict=True)
+        )
         rows, columns = (weights.to(blocks) for weights in across)
         return rows @ blocks @ columns.mT
     step = round(step)
@@ -107,7 +109,7 @@ def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[i
     return part[:, :, corner[0] - low * step :, corner[1] - left * step :][:, :, : size[0], : size[1]]
 
 
-def _between(first: int, count: int, step: float, blocks: int) -> Tensor:
+def _linear_weights(first: int, count: int, step: float, blocks: int) -> Tensor:
     """Weights (count, blocks) of the blocks along an axis for ``count`` pixels from ``first`` on."""
     position = ((torch.arange(first, first + count, dtype=torch.float64) + 0.5) / step - 0.5).clamp(0, blocks - 1)
     distance = (position.unsqueeze(1) - torch.arange(blocks, dtype=torch.float64)).abs()

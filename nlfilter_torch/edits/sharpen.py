@@ -91,7 +91,7 @@ def fit_sharpen(
 
     def change(viewed: Source) -> Fitted:
         check_reach(guide_blur, "guide_blur", viewed.size)
-        operator = viewed.operator(Guide(options, look=grey, blur=guide_blur))
+        operator = viewed.operator(Guide(options, transform=grey, blur=guide_blur))
         changed = polynomial(operator, luminance, 3, None)
         return Fitted(lambda pixels: changed(pixels, sliders))
 

@@ -18,11 +18,11 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.pixels import Fitted as Fitted
 from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
 from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
@@ -41,8 +41,8 @@ class Guide:
 
     Attributes:
         options: of :func:`nonlocal_operator`.
-        look: function that computes the guide from an image (B, C, H, W); None uses the image itself.
-        reach: radius in pixels of the neighbourhood that ``look`` depends on.
+        transform: function that computes the guide from an image (B, C, H, W); None uses the image itself.
+        radius: radius in pixels of the neighbourhood that ``transform`` depends on.
         planes: number of channels of the guide; None is that of the image.
         blur: standard deviation in pixels of the Gaussian blur of the guide.
         spectral: whether the edit uses the spectrum.
@@ -52,8 +52,8 @@ class Guide:
     """
 
     options: Mapping[str, Any]
-    look: Callable[[Tensor], Tensor] | None = None
-    reach: int = 0
+    transform: Callable[[Tensor], Tensor] | None = None
+    radius: int = 0
     planes: int | None = None
     blur: float = 0.0
     spectral: bool = False
@@ -63,7 +63,7 @@ class Guide:
     @property
     def margin(self) -> int:
         """Radius in pixels of the neighbourhood that the guide at a pixel depends on."""
-        return self.reach + self.blur_margin
+        return self.radius + self.blur_margin
 
     @property
     def blur_margin(self) -> int:
@@ -72,7 +72,7 @@ class Guide:
 
     def __call__(self, image: Tensor) -> Tensor:
         """Compute the guide of an image (B, C, H, W) of any size."""
-        guide = image if self.look is None else self.look(image)
+        guide = image if self.transform is None else self.transform(image)
         if self.blur_margin == 0:
             return guide
         return blur(guide, self.blur)
@@ -151,7 +151,7 @@ class Source(Protocol):
     def all(self, fitted: "Fitted") -> Tensor:
         """Result (B, C, H, W) of an edit at all pixels, for pictures that are small enough."""
 
-    def held(self, fitted: "Fitted") -> "Fitted":
+    def cached(self, fitted: "Fitted") -> "Fitted":
         """Compute the result of an edit and keep it in memory, if there is room for it."""
 
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
@@ -187,30 +187,30 @@ class InMemory:
 
     Args:
         image: (B, C, H, W), float32 or float64.
-        kept: cache of its operators, by their options; None caches nothing.
+        cache: cache of its operators, by their options; None caches nothing.
         stride: sampling step of the image relative to the photograph, in pixels along each axis.
     """
 
     first = 0
     whole = True
 
-    def __init__(self, image: Tensor, kept: dict[Any, Any] | None = None, stride: float = 1) -> None:
-        self.image, self.kept, self.stride, self.dtype = image, kept, stride, image.dtype
+    def __init__(self, image: Tensor, cache: dict[Any, Any] | None = None, stride: float = 1) -> None:
+        self.image, self.cache, self.stride, self.dtype = image, cache, stride, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """Build, or take from the cache, :func:`nonlocal_operator` of the guide."""
         key = (
-            guide.look,
+            guide.transform,
             guide.blur,
             *((name, value) for name, value in sorted(guide.options.items()) if name != "generator"),
         )
-        if self.kept is not None and key in self.kept:
-            return cast(InMemoryOperator, self.kept[key])
+        if self.cache is not None and key in self.cache:
+            return cast(InMemoryOperator, self.cache[key])
         operator = InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
-        if self.kept is not None and not any(isinstance(value, Tensor) for value in guide.options.values()):
-            self.kept[key] = operator
+        if self.cache is not None and not any(isinstance(value, Tensor) for value in guide.options.values()):
+            self.cache[key] = operator
         return operator
 
     def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
@@ -244,8 +244,8 @@ class InMemory:
         """Reduce the image by :func:`block_means`."""
         if step == 1:
             return self
-        kept = None if self.kept is None else self.kept.setdefault(("blocks", step), {})
-        return InMemory(block_means(self.image, step), kept)
+        cache = None if self.cache is None else self.cache.setdefault(("blocks", step), {})
+        return InMemory(block_means(self.image, step), cache)
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Resize weights."""
@@ -259,7 +259,7 @@ class InMemory:
         planes = fitted.pixels(self)
         return planes if fitted.finish is None else fitted.finish(self.image, planes)
 
-    def held(self, fitted: "Fitted") -> "Fitted":
+    def cached(self, fitted: "Fitted") -> "Fitted":
         """Compute the result of an edit and keep it in memory."""
         planes = self.all(fitted)
         return Fitted(lambda _: planes)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
 # Defaults in files of the format without a list of steps, which left out values that change nothing.
-BEFORE: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
+FORMER_DEFAULTS: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
 
 
 @dataclass(frozen=True, init=False)
@@ -44,7 +44,9 @@ class Step:
         declared = EDITS[edit]
         unknown = values.keys() - {parameter.name for parameter in declared}
         if unknown:
-            raise TypeError(f"{edit} has no parameter {min(unknown)}; it has {', '.join(p.name for p in declared)}")
+            raise TypeError(
+                f"{edit} has no parameter {min(unknown)}; its parameters are {', '.join(p.name for p in declared)}"
+            )
         given = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
         for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(given))):
             object.__setattr__(self, name, value)
@@ -86,7 +88,7 @@ class Step:
 
     def changes(self) -> bool:
         """Whether the step has any effect."""
-        if self.declared.needs:
+        if self.declared.requires_strokes:
             return bool(self.painted(self.declared.words[0]))
         acting = [p for p in self.declared if p.idle is not ...]
         return any(not p.is_idle(self[p.name]) for p in acting) or (
@@ -128,22 +130,24 @@ class Step:
         return f"{indent}{{\n{lines}\n{indent}}}"
 
     @staticmethod
-    def from_entries(edit: str, entries: Any, place: str, *, bare: bool = False, before: bool = False) -> "Step":
+    def from_entries(
+        edit: str, entries: Any, place: str, *, whole_file: bool = False, former_format: bool = False
+    ) -> "Step":
         """Create a step from parsed JSON.
 
         Args:
             edit: name of the edit.
             entries: JSON object of the step.
             place: description of where it was found, for errors.
-            bare: whether the file holds nothing else, so that ``place`` is the file.
-            before: whether the file has the former format, without a list of steps.
+            whole_file: whether the file holds nothing else, so that ``place`` is the file.
+            former_format: whether the file has the former format, without a list of steps.
 
         Raises:
             ValueError: if an entry is unknown or invalid.
         """
         if not isinstance(entries, dict):
-            raise ValueError(f"{place} must hold entries in braces, got {shown(entries)}; correct it")
-        declared, values = EDITS[edit], dict(BEFORE.get(edit, {})) if before else {}
+            raise ValueError(f"{place} must be a JSON object, got {shown(entries)}; correct it")
+        declared, values = EDITS[edit], dict(FORMER_DEFAULTS.get(edit, {})) if former_format else {}
         strokes: tuple[Stroke, ...] = ()
         for entry, value in entries.items():
             if entry == "strokes" and declared.brushes:
@@ -152,13 +156,13 @@ class Step:
             found = _find(declared, entry)
             if found is None:
                 names = [*(p.name for p in declared), *(["strokes"] if declared.brushes else [])]
-                raise ValueError(f"{place} must hold no other entries than {', '.join(names)}, got {entry}; remove it")
+                raise ValueError(f"{place} must have no entries other than {', '.join(names)}, got {entry}; remove it")
             parameter, factor = found
             converted = value
             if is_within(value, -1e300, 1e300) and factor != 1:
                 converted = factor(value) if callable(factor) else value * factor
             if not parameter.is_valid(converted):
-                where = f"{'in' if bare else 'of'} {place}"
+                where = f"{'in' if whole_file else 'of'} {place}"
                 raise ValueError(f"{entry} {where} must be {parameter.wanted}, got {shown(value)}; correct it")
             values[parameter.name] = tuple(map(float, converted)) if isinstance(converted, list) else converted
         step = Step(edit, strokes, **values)
@@ -170,7 +174,7 @@ class Step:
 def _find(declared: Edit, entry: str) -> tuple[Parameter, float | Callable[[float], float]] | None:
     """Find the parameter with the name of an entry, and the factor or function that converts its value."""
     for parameter in declared:
-        factors: dict[str, float | Callable[[float], float]] = {parameter.name: 1.0, **dict(parameter.former)}
+        factors: dict[str, float | Callable[[float], float]] = {parameter.name: 1.0, **dict(parameter.former_names)}
         if entry in factors:
             return parameter, factors[entry]
     return None

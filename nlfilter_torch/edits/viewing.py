@@ -28,8 +28,8 @@ from nlfilter_torch.edits.resizing import interpolation, resized
 from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
-PASSED = 4  # radius in pixels of the kernel that enlarging and reducing again amounts to
-FAINT = (2 / 255) ** 2  # variance of brightness below which its slope is attenuated towards 0
+ROUND_TRIP_RADIUS = 4  # radius in pixels of the kernel that enlarging and reducing again amounts to
+FAINT_VARIANCE = (2 / 255) ** 2  # variance of brightness below which its slope is attenuated towards 0
 
 
 def viewed_size(size: tuple[int, int], megapixels: float) -> tuple[int, int]:
@@ -58,7 +58,7 @@ class Reducible(Protocol):
     def resized(self, size: tuple[int, int]) -> Any:
         """Reduce the picture to a smaller size."""
 
-    def held(self, fitted: Fitted) -> Fitted:
+    def cached(self, fitted: Fitted) -> Fitted:
         """Compute the result of an edit and keep it in memory, if there is room for it."""
 
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
@@ -89,8 +89,8 @@ def fit_change(
     def balanced(of: Any, fitted: Fitted) -> tuple[Fitted, Balance | None]:
         if limits == "none" or brighter is None:
             return fitted, None
-        held = of.held(fitted)
-        return held, balance_of(lambda function: of.mean_of(held, function), brighter)
+        cached = of.cached(fitted)
+        return cached, balance_of(lambda function: of.mean_of(cached, function), brighter)
 
     small = viewed_size(source.size, size)
     reduced: Any = source if small == source.size else source.resized(small)
@@ -174,21 +174,21 @@ def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:
 
     Approximate at borders, and for a fractional stride.
     """
-    kernel = _passed(stride).to(planes)
-    reach = len(kernel) // 2
-    padded = F.pad(planes, (reach,) * 4, mode="replicate").flatten(0, 1).unsqueeze(1)
+    kernel = _round_trip_kernel(stride).to(planes)
+    radius = len(kernel) // 2
+    padded = F.pad(planes, (radius,) * 4, mode="replicate").flatten(0, 1).unsqueeze(1)
     rows = F.conv2d(padded, kernel.view(1, 1, -1, 1))
     return F.conv2d(rows, kernel.view(1, 1, 1, -1)).view_as(planes)
 
 
 @lru_cache(maxsize=8)
-def _passed(stride: float) -> Tensor:
-    """Kernel (2 PASSED + 1,) of :func:`enlarged_and_reduced` along an axis, averaged over the phases."""
+def _round_trip_kernel(stride: float) -> Tensor:
+    """Kernel (2 ROUND_TRIP_RADIUS + 1,) of :func:`enlarged_and_reduced` along an axis, averaged over the phases."""
     length, places = 64, range(28, 36)
     large = round(length * stride)
     used, down = interpolation(places, large, length)
     rows = torch.stack([weights @ _up(used, length, large) for weights in down])  # (8, 64)
-    around = [rows[i, place - PASSED : place + PASSED + 1] for i, place in enumerate(places)]
+    around = [rows[i, place - ROUND_TRIP_RADIUS : place + ROUND_TRIP_RADIUS + 1] for i, place in enumerate(places)]
     found = torch.stack(around).mean(0)
     return (found + found.flip(0)) / (2 * found.sum())
 
@@ -206,4 +206,4 @@ def slope(before: Tensor, change: Tensor) -> Tensor:
         return F.avg_pool2d(pad_border(planes, 2), 5, 1)
 
     together = mean(before * change) - mean(before) * mean(change)
-    return together / ((mean(before.square()) - mean(before).square()).clamp(min=0.0) + FAINT)
+    return together / ((mean(before.square()) - mean(before).square()).clamp(min=0.0) + FAINT_VARIANCE)

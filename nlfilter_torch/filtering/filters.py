@@ -77,10 +77,11 @@ def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
     check_alpha(alpha)
     entries = alpha.shape[-1] if alpha.ndim <= 2 else alpha.shape[1]
     if entries != layers.shape[1]:
-        raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; change one of them")
+        raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; add or drop some")
     if alpha.ndim > 1 and alpha.shape[0] != layers.shape[0] and 1 not in (alpha.shape[0], layers.shape[0]):
         raise ValueError(
-            f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; repeat it"
+            f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; "
+            "pass one row per image"
         )
     if alpha.ndim == 4:
         check_same_size(alpha, (layers.shape[-2], layers.shape[-1]), "alpha", "image")
@@ -215,7 +216,7 @@ def spectral_filter(
         check_same_size(image, spectrum.size, "image", "spectrum")
         batch, landmarks, _ = spectrum.factor.shape
         shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
-        check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
+        check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
     if isinstance(residual, int | float) and residual == 0:
         return as_given(spectrum.synthesize(response, coefficients), image)
     rho = torch.as_tensor(spectrum.among.copy_to_group(residual)).to(spectrum.root).reshape(-1, 1)

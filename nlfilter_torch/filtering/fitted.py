@@ -114,7 +114,9 @@ class FittedFilter:
         check_pair(origin, "origin")
         check_pair(halo, "halo")
         if sum(halo) >= size[0]:
-            raise ValueError(f"halo must leave a row of the image's {size[0]}, got {tuple(halo)}; pass a taller tile")
+            raise ValueError(
+                f"halo must leave at least one of the image's {size[0]} rows, got {tuple(halo)}; pass a taller tile"
+            )
         if guide is not None:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
@@ -180,8 +182,8 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     check_image(image, "image")
     if operator.factor.shape[0] != 1 or image.shape[0] != 1:
         raise ValueError(
-            f"image must be one image, as the operator's must, got {image.shape[0]} and {operator.factor.shape[0]}; "
-            "fit one filter for each"
+            f"image and operator must have batch size 1, got {image.shape[0]} and {operator.factor.shape[0]}; "
+            "fit one filter per image"
         )
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)

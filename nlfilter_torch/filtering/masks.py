@@ -111,7 +111,7 @@ def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
             few = places[:: 1 + len(places) // CHECKED]
             if len(few) > 0 and columns[:, few].square().sum(0).mean() < CAPTURED:
                 warn(
-                    f"region {number} is like no landmark, so its mask may take in other pixels like none; "
+                    f"region {number} resembles no landmark, so its mask may include other pixels that resemble none; "
                     "raise num_landmarks or photometric_bandwidth"
                 )
 
@@ -120,8 +120,8 @@ def check_negative(count: int, regions: int) -> None:
     """Raise unless there is one negative region for all regions, or one for each."""
     if count not in (1, regions):
         raise ValueError(
-            f"negative must have 1 channel or the region's {regions}, got {count}; give one for all regions or one for "
-            "each"
+            f"negative must have 1 channel or those of region, {regions}, got {count}; give one for all regions "
+            "or one for each"
         )
 
 
@@ -162,7 +162,7 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
     if not is_hidden(flat) and bool((total <= 0).any()):
         raise ValueError(
-            f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
+            f"{name} must hold a pixel of positive weight in every mask, got an empty one; paint or select some pixels"
         )
     return flat / total
 

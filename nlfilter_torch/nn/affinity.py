@@ -80,13 +80,13 @@ class NonlocalAffinity(Learnable):
             check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
             if "photometric_bandwidth" in names:
                 raise ValueError(
-                    "photometric_bandwidth must be a number to learn from, got 'auto'; "
+                    "photometric_bandwidth must be a number if it is learned, got 'auto'; "
                     "pass the mean of estimate_bandwidth over a few guides"
                 )
         if spatial_bandwidth is None and "spatial_bandwidth" in names:
             raise ValueError(
-                "spatial_bandwidth must be a number of pixels to learn from, got None; "
-                "a third of the image's height is a start"
+                "spatial_bandwidth must be a number of pixels if it is learned, got None; "
+                "start with a third of the image's height"
             )
         self.start_positive("photometric_bandwidth", photometric_bandwidth, names, other=str)
         self.start_positive("spatial_bandwidth", spatial_bandwidth, names, other=type(None))

@@ -118,7 +118,7 @@ class NonlocalDenoiser(nn.Module):
     def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int) -> Tensor:
         """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype."""
         if turns not in (1, 2, 4):
-            raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is quickest")
+            raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
         quarters = range(0, 4, 4 // turns)
 
         def mean(tile: Tensor, levels: Tensor) -> Tensor:
@@ -185,7 +185,7 @@ def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tens
         check_same_size(noise, (image.shape[-2], image.shape[-1]), name, "image")
         if noise.shape[1] not in (1, image.shape[1]):
             raise ValueError(
-                f"{name} must have 1 channel or those of the image, {image.shape[1]}, got {noise.shape[1]}; select one"
+                f"{name} must have 1 channel or as many as the image, {image.shape[1]}, got {noise.shape[1]}; select 1"
             )
         check_values(noise.flatten(), name, "not negative", noise.numel())
         return noise.to(image).expand(image.shape[0], -1, -1, -1)

@@ -125,7 +125,7 @@ def check_learn(learn: Collection[str], choices: Sequence[str], called: str = "l
     unknown = sorted(map(repr, names.difference(choices)))
     if unknown:
         raise ValueError(
-            f"{called} must name {', '.join(map(repr, choices))} or none of them, got {', '.join(unknown)}; "
+            f"{called} must hold only names from {', '.join(map(repr, choices))}, got {', '.join(unknown)}; "
             "choose from these"
         )
     return names

@@ -98,7 +98,8 @@ def _sliders(alpha: Any) -> Tensor:
         return torch.as_tensor(alpha, dtype=torch.get_default_dtype()).detach().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise TypeError(
-            f"alpha must be numbers or rows of equal length of them, got {described(alpha)}; pass (1.0, 1.0, 1.0, 1.0)"
+            f"alpha must be numbers or rows of numbers of equal length, got {described(alpha)}; "
+            "pass (1.0, 1.0, 1.0, 1.0)"
         ) from None
 
 

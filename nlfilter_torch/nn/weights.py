@@ -23,8 +23,8 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         content = path.read_bytes()
     except OSError as error:
         raise FileNotFoundError(
-            f"weights must be a safetensors file, but {path} cannot be read: {error.strerror}; install the "
-            "package anew, or name another file"
+            f"weights must be a safetensors file, but {path} cannot be read: {error.strerror}; reinstall "
+            "the package, or choose another file"
         ) from None
     try:
         end = LENGTH + int.from_bytes(content[:LENGTH], "little")
@@ -32,13 +32,13 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         header.pop("__metadata__", None)
         found = {name: _tensor(entry, memoryview(content)[end:]) for name, entry in header.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"weights must be a whole safetensors file, but {path} is damaged: {error}") from None
+        raise ValueError(f"weights must be a complete safetensors file, but {path} is damaged: {error}") from None
     for name, shape in shapes.items():
         got = tuple(found[name].shape) if name in found else None
         if got != shape:
             raise ValueError(
                 f"weights must hold {name} of shape {shape}, but {path} has {'none' if got is None else got}; "
-                "they are of another layer"
+                "they belong to another layer"
             )
     return {name: found[name] for name in shapes}
 

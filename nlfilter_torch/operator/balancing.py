@@ -75,7 +75,7 @@ def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dty
         remedy = "raise photometric_bandwidth or num_landmarks" + (
             ", or use completion='diagonal'" if not completed else ""
         )
-        warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
+        warn(f"balancing left row sums that differ from 1 by up to {residual.max().item():.1e}; {remedy}")
 
 
 def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:

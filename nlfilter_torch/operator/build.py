@@ -48,7 +48,7 @@ class Construction:
 
     def __post_init__(self) -> None:
         """Raise an error for an invalid option."""
-        remedy = "choose one of these, and pass how many there are as num_landmarks"
+        remedy = "choose one of these, and pass the number of landmarks as num_landmarks"
         check_choice(self.landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
         check_choice(self.completion, "completion", ("diagonal", "none"))
         check_count(self.num_landmarks, "num_landmarks")
@@ -56,7 +56,7 @@ class Construction:
             check_number(self.tolerance, "tolerance", "pass a float or None")
             check_positive(self.tolerance, "tolerance")
         if self.generator is not None:
-            check_instance(self.generator, torch.Generator, "generator", "make one with torch.Generator()")
+            check_instance(self.generator, torch.Generator, "generator", "create one with torch.Generator()")
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:

@@ -53,12 +53,13 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
         )
     if len(patch_weights) > LARGEST_PATCH:
         raise ValueError(
-            f"patch_weights must have at most {LARGEST_PATCH} rows, got {len(patch_weights)}; reduce the image instead"
+            f"patch_weights must have at most {LARGEST_PATCH} rows, got {len(patch_weights)}; "
+            "downscale the image instead"
         )
     check_finite(patch_weights, "patch_weights")
     if not is_hidden(patch_weights) and not bool((patch_weights >= 0).all() & (patch_weights.sum() > 0)):
         raise ValueError(
-            "patch_weights must be non-negative with a positive sum, got others; take their softmax or square"
+            "patch_weights must be non-negative with a positive sum, got other values; take their softmax or square"
         )
     return patch_weights / patch_weights.sum()
 

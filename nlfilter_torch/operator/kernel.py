@@ -75,7 +75,7 @@ class Kernel:
         """
         if self.features is None:
             raise ValueError(
-                "operator must come from nonlocal_operator to be applied to other guides, got one made from features; "
+                "operator must be built by nonlocal_operator to be applied to other guides, got one from features; "
                 "use operator.at(features)"
             )
         return self.features

@@ -200,7 +200,8 @@ class NonlocalOperator:
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
-                f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
+                f"the operator must have at most {DENSE_LIMIT} pixels for a dense matrix, got {pixels}; "
+                "use a smaller image"
             )
         scaled = self.factor * self.scaling.unsqueeze(1)  # scaled first: without completion U^T U may underflow
         return weighted(scaled.mT @ scaled, self.weights) + torch.diag_embed(self.remainder)

@@ -26,9 +26,9 @@ from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.operator import TiledOperator, first_plane
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture
 from nlfilter_torch.tiled.sampling import CHUNK, KeptColumns, Pilot
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import GuidePicture, Picture
 from nlfilter_torch.tiled.statistics import Block, Sums
 from nlfilter_torch.tiled.tiles import Passes
 
@@ -145,7 +145,7 @@ class Frame(Tiled):
         references = self.answer(reduced)
         return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
 
-    def held(self, fitted: Fitted) -> Fitted:
+    def cached(self, fitted: Fitted) -> Fitted:
         """Return the edit unchanged: stored planes would be those of the frame, but means are over the references."""
         return fitted
 
@@ -216,8 +216,8 @@ def film_steps(recipe: Recipe) -> tuple[Step, ...]:
         ValueError: if a step has or needs strokes.
     """
     for step in recipe.steps:
-        if step.strokes or step.declared.needs:
-            raise ValueError(f"edits of a film must be without strokes, got {step.edit} with some; remove that step")
+        if step.strokes or step.declared.requires_strokes:
+            raise ValueError(f"edits of a film must not have strokes, got {step.edit} with strokes; remove that step")
     return tuple(
         step.changed(spatial_bandwidth="none" if "none" in step.declared["spatial_bandwidth"].words else FAR)
         if step["spatial_bandwidth"] is None

@@ -17,8 +17,8 @@ from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.pictures import GuidePicture, Tile
 from nlfilter_torch.tiled.sampling import Draws, KeptColumns, Pilot, Report, over_all, patches_at, scaled_patches, visit
-from nlfilter_torch.tiled.sources import GuidePicture, Tile
 from nlfilter_torch.tiled.statistics import (
     CONVERGED,
     Block,

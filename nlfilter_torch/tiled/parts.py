@@ -20,9 +20,9 @@ from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture, RowSource
 from nlfilter_torch.tiled.sampling import KeptColumns
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import GuidePicture, Picture, RowSource
 from nlfilter_torch.tiled.strokes import by_rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics
 from nlfilter_torch.tiled.workers import in_order

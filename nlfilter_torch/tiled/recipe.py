@@ -7,8 +7,8 @@ from nlfilter_torch.edits.applying import fit_step
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.intermediate import intermediate
+from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture, Rows, RowSource
 from nlfilter_torch.tiled.strokes import by_rows
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
 from nlfilter_torch.tiled.workers import undivided

@@ -27,7 +27,7 @@ from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.tiled.sources import GuidePicture, Picture, Tile
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
 from nlfilter_torch.tiled.workers import in_order, undivided
 

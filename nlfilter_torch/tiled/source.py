@@ -10,16 +10,16 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.components import Scribbles
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import Read, resized_parts
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source, block_means
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
+from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.sampling import KeptColumns, take_pilot, visit
 from nlfilter_torch.tiled.scribbles import RegionRows, check_room, floats_of_scribbled, read_scribbles
-from nlfilter_torch.tiled.sources import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, pixels_kept, rows_that_fit
 from nlfilter_torch.tiled.workers import Result, in_order, undivided
 
@@ -195,7 +195,7 @@ class Tiled:
         rows = np.concatenate([values for _, values in self.rows(fitted, plain=True)])
         return torch.from_numpy(rows).permute(2, 0, 1)[None]
 
-    def held(self, fitted: Fitted) -> Fitted:
+    def cached(self, fitted: Fitted) -> Fitted:
         """Compute the planes of an edit and keep them in memory, if small; else they are recomputed on every use."""
         if self.picture.pixels * self.channels * self.dtype.itemsize > HELD * self.passes.memory:
             return fitted
@@ -266,7 +266,7 @@ class Tiled:
         needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
         if needed > self.passes.memory:
             raise MemoryError(
-                f"{self.picture.name} needs {needed / 1e6:.0f} MB of memory at least, but "
+                f"{self.picture.name} needs at least {needed / 1e6:.0f} MB of memory, but only "
                 f"{self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
         return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
@@ -373,8 +373,8 @@ class Tiled:
         most = self.passes.memory // row - 2 * fitted.margin
         if self.size[0] > most and most < fitted.step:
             raise MemoryError(
-                f"{self.picture.name} needs {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory at least, "
-                f"but {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+                f"{self.picture.name} needs at least {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory, "
+                f"but only {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
         rows = max(rows, (1 if self.passes.tile_rows else 4) * fitted.margin)
         if (1 + workers) * row * (rows + 2 * fitted.margin) > self.passes.memory:

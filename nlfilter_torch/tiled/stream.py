@@ -10,9 +10,9 @@ from nlfilter_torch.edits.colorize import fit_colorize
 from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.edits.parameters import COLORIZE, DETAIL, RECOLOR
 from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.tiled.pictures import Picture, RowSource, RowTarget
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.sources import Picture, RowSource, RowTarget
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
 from nlfilter_torch.tiled.workers import undivided
 

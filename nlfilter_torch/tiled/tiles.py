@@ -12,8 +12,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.pictures import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.tiled.sampling import Report
-from nlfilter_torch.tiled.sources import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
@@ -123,9 +123,9 @@ def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False
     picture, shape, what = Picture(source), tuple(source.shape), "the shape of the source"
     if coloured:
         shape = (*picture.size, 3 if picture.samples in (1, 3) else 4)
-        what = "the height and width of the source, three colours, and transparency where that has it"
+        what = "the height and width of the source, three colours, and its transparency if it has one"
     if tuple(target.shape) != shape:
-        raise ValueError(f"target must have {what}, {shape}, got {tuple(target.shape)}; make one of that shape")
+        raise ValueError(f"target must have {what}, {shape}, got {tuple(target.shape)}; pass one of that shape")
 
 
 def fill(target: RowTarget, rows: Rows) -> None:
@@ -172,8 +172,8 @@ def rows_that_fit(
     least = bytes_needed(picture, passes, planes, num_landmarks, held)
     if max(row, least) > passes.memory:
         raise MemoryError(
-            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {passes.memory / 1e6:.0f} MB "
-            "may be used; allow more, or use fewer landmarks"
+            f"{picture.name} needs at least {max(row, least) / 1e6:.0f} MB of memory, but only "
+            f"{passes.memory / 1e6:.0f} MB may be used; allow more, or use fewer landmarks"
         )
     tiles, together = 1 + passes.workers(num_landmarks), passes.rows_together(picture.size[1]) * picture.size[1]
     taken = picture.dtype.itemsize * held + (tiles - 1) * bytes_at_hand(together, num_landmarks)

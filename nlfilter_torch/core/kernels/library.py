@@ -176,7 +176,7 @@ def threads(factor: Tensor) -> int:
 def run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:
     """Run a kernel on ``count`` pixels, or images."""
     if getattr(_library, f"nlfilter_{name}")(level, threads, count, *arguments):
-        raise MemoryError("no memory is left for the buffers of a few rows; make the image smaller")
+        raise MemoryError("not enough memory for buffers of a few rows; use a smaller image")
 
 
 def run_on_factor(name: str, factor: Tensor, *arguments: int | float | None) -> None:
