@@ -44,13 +44,6 @@ class Tally:
     failures: dict[str, str] = field(default_factory=dict)
     left: int = 0
 
-    def add(self, other: "Tally") -> None:
-        """Add the files of another tally."""
-        self.done += other.done
-        self.skipped += other.skipped
-        self.failures |= other.failures
-        self.left += other.left
-
 
 def pictures(folder: Path, what: str = "photographs") -> list[Path]:
     """The image files of a folder, by name.
