@@ -83,6 +83,7 @@ QUICK := \
 	'tables --long-side 32' \
 	'masks --quick' \
 	'recolor --quick' \
+	'compilation --quick --only export' \
 	'memory --side 128 --repeats 1' \
 	'fuzz --cases 20'
 

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,20 +12,16 @@ import numpy as np
 import psutil
 import pytest
 import skimage.data
-import torch.distributed as dist
 from PIL import Image
 
 from nlfilter_torch.cli import folders, main
 from nlfilter_torch.cli.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
-from nlfilter_torch.core.ranks import Ranks, connected_ranks
 from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.io.photographs import open_beside
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
 ROOT = Path(__file__).parents[1]
 PATIENCE = 120  # seconds, on a machine that is busy with other things
-needs_gloo = pytest.mark.skipif(
-    not dist.is_available() or not dist.is_gloo_available(), reason="this torch has no gloo"
-)
 
 
 def fill(folder: Path, count: int, broken: tuple[int, ...] = (), side: int = 48) -> None:
@@ -101,89 +96,60 @@ def test_two_hundred_killed_in_the_middle(tmp_path: Path) -> None:
     assert abs(np.asarray(Image.open(target / "008.png")) - alone).max() <= 1  # rounding depends on threads
 
 
+@pytest.mark.client("Dask", "edits folders: `nlfilter-torch batch --cluster`")
 @pytest.mark.slow
-@needs_gloo
-def test_ranks_share_the_folder(tmp_path: Path) -> None:
-    """The same command under torchrun edits no picture twice, and a broken picture does not stop the other rank."""
-    source, target = tmp_path / "in", tmp_path / "out"
-    fill(source, 12, broken=(0,))
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    run = subprocess.run(
-        [*launch, *command(source, target, "--workers", 1)[1:]],
-        cwd=ROOT,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE,
-    )
-    assert run.returncode == 1
-    assert run.stdout.splitlines() == [f"11 edited, 0 there already, 1 failed, in {target}", "failed: 000.png"]
-    assert len(finished(target)) == 11
-
-
-def test_shares_are_a_partition() -> None:
-    items = list(range(17))
-    for size in (1, 2, 3, 20):
-        shares = [Ranks(rank, size).share(items) for rank in range(size)]
-        assert sorted(item for share in shares for item in share) == items
-        assert max(map(len, shares)) - min(map(len, shares)) <= 1
-    assert Ranks(1, 3).all_gather("own") == ["own"]
-
-
-def meet_and_die(rank: str, word: str) -> None:
-    """One of two ranks; the second one dies before the end."""
-    with connected_ranks() as ranks:
-        if rank == "1":
-            os._exit(9)
-        try:
-            ranks.all_gather(word)
-        except OSError as error:
-            sys.stdout.write(str(error))
-
-
-@pytest.mark.slow
-@needs_gloo
-def test_a_rank_that_dies_is_named() -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    script = "import sys; from tests.test_batch import meet_and_die; meet_and_die(*sys.argv[1:])"
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, "-c", script, str(rank), "word"],
-            cwd=ROOT,
-            env=environment(RANK=rank, WORLD_SIZE=2, MASTER_ADDR="127.0.0.1", MASTER_PORT=port),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
+def test_a_cluster_of_which_a_worker_is_killed(tmp_path: Path) -> None:
+    """Dask gives the file of a dead worker to another one; broken files are named, and those there are left alone."""
+    distributed = pytest.importorskip("distributed")
+    paths = plain_files(tmp_path / "in", 6)
+    prepare(paths, tmp_path / "out", {})
+    (tmp_path / "out" / "5.png").write_text("before")
+    tally, told = Tally(), list[str]()
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        edit_folder(
+            paths,
+            tmp_path / "out",
+            die_once_in_a_cluster,
+            workers=1,
+            threads=1,
+            cluster=cluster.scheduler_address,
+            tell=told.append,
+            begin=lambda name: None,
+            tally=tally,
         )
-        for rank in range(2)
-    ]
-    said = [process.communicate(timeout=PATIENCE)[0] for process in ranks]
-    assert said[0] == "rank 1 of 2 died or did not answer; start the same command again to do the rest"
+    assert (tally.done, tally.skipped, tally.left) == (4, 1, 0)
+    assert told == ["2.png: KeyError: 'what'"]
+    assert (tmp_path / "in" / "died").exists()
+    assert (tmp_path / "out" / "5.png").read_text() == "before"
+    assert sorted(finished(tmp_path / "out")) == ["0.png", "1.png", "3.png", "4.png", "5.png"]
 
 
-@pytest.mark.parametrize(("rank", "size"), [("2", "2"), ("x", "2"), ("0", "0"), ("-1", "2")])
-def test_wrong_ranks(monkeypatch: pytest.MonkeyPatch, rank: str, size: str) -> None:
-    monkeypatch.setenv("RANK", rank)
-    monkeypatch.setenv("WORLD_SIZE", size)
-    with pytest.raises(ValueError, match="unset them, or start with torchrun"), connected_ranks():
-        pass
+def die_once_in_a_cluster(source: str, target: str) -> None:
+    """An edit that kills its process over the first file that it is called for, and cannot do another."""
+    mark = Path(source).with_name("died")
+    if Path(source).stem == "1" and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if Path(source).stem == "2":
+        raise KeyError("what")
+    Path(target).write_bytes(Path(source).read_bytes())
 
 
-def test_ranks_without_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The rank variables of a scheduler are enough to share the work; each rank reports its own files."""
-    monkeypatch.delenv("MASTER_ADDR", raising=False)
-    monkeypatch.setenv("RANK", "1")
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    with connected_ranks() as ranks:
-        assert ranks == Ranks(1, 2)
+@pytest.mark.parametrize("workers", [(), ("--workers", 2)])
+def test_a_cluster_that_does_not_answer(
+    workers: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    fill(tmp_path / "in", 1)
+    monkeypatch.setattr(folders, "CONNECTING", 0.2)
+    sentence = refused(capsys, tmp_path / "in", tmp_path / "out", "--cluster", "tcp://127.0.0.1:9", *workers)
+    wanted = "--workers are those of the cluster" if workers else "--cluster must be the address of a Dask scheduler"
+    assert wanted in sentence
 
 
 def copy_or_fail(source: str, target: str) -> None:
     """An edit whose process dies on some files and raises an unexpected error on others."""
-    if Path(source).stem in ("1", "4"):
+    if Path(source).stem == "1":
         os.kill(os.getpid(), signal.SIGKILL)
     if Path(source).stem == "2":
         raise KeyError("what")
@@ -194,10 +160,10 @@ def die(source: str, target: str) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def tally_of(paths: list[Path], target: Path, edit: folders.Edit) -> tuple[Tally, list[str]]:
+def tally_of(paths: list[Path], target: Path, edit: folders.Edit, workers: int = 1) -> tuple[Tally, list[str]]:
     tally, told = Tally(), list[str]()
     prepare(paths, target, {})
-    edit_folder(paths, target, edit, workers=1, threads=1, tell=told.append, begin=lambda name: None, tally=tally)
+    edit_folder(paths, target, edit, workers=workers, threads=1, tell=told.append, begin=lambda name: None, tally=tally)
     return tally, told
 
 
@@ -210,13 +176,12 @@ def plain_files(folder: Path, count: int) -> list[Path]:
 
 @pytest.mark.slow
 def test_a_worker_that_dies_and_an_error_are_reported(tmp_path: Path) -> None:
-    paths = plain_files(tmp_path / "in", 6)
-    tally, told = tally_of(paths, tmp_path / "out", copy_or_fail)
+    """The file of a worker that died with it is done."""
+    paths = plain_files(tmp_path / "in", 5)
+    tally, told = tally_of(paths, tmp_path / "out", copy_or_fail, workers=2)
     assert (tally.done, tally.skipped, tally.left) == (3, 0, 0)
-    assert list(tally.failures) == ["1.png", "2.png", "4.png"]
-    assert told[0].startswith("1.png: the process that worked on it died")
-    assert told[1] == "2.png: KeyError: 'what'"
-    assert sorted(finished(tmp_path / "out")) == ["0.png", "3.png", "5.png"]
+    assert sorted(told) == [f"1.png: {folders.DIED}", "2.png: KeyError: 'what'"]
+    assert sorted(finished(tmp_path / "out")) == ["0.png", "3.png", "4.png"]
 
 
 @pytest.mark.slow
@@ -229,8 +194,9 @@ def test_workers_that_all_die_end_the_work(tmp_path: Path) -> None:
 
 
 def wait_for_ever(source: str, target: str) -> None:
-    Path(target).touch()
-    time.sleep(1000)
+    with open_beside(Path(target)):
+        Path(source).with_suffix(".begun").touch()
+        time.sleep(1000)
 
 
 def run_for_ever(folder: str, target: str) -> None:
@@ -238,22 +204,32 @@ def run_for_ever(folder: str, target: str) -> None:
 
 
 @pytest.mark.slow
-def test_workers_end_with_the_process_that_hired_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_process_that_hired_them(number: signal.Signals, tmp_path: Path) -> None:
+    """After an interrupt, which a terminal sends to all of them, no half file is left."""
     plain_files(tmp_path / "in", 2)
     script = "import sys; from tests.test_batch import run_for_ever; run_for_ever(*sys.argv[1:])"
-    process = subprocess.Popen([sys.executable, "-c", script, tmp_path / "in", tmp_path / "out"], cwd=ROOT)
+    arguments = [sys.executable, "-c", script, tmp_path / "in", tmp_path / "out"]
+    process = subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, start_new_session=True)
     until = time.monotonic() + PATIENCE
-    while not (tmp_path / "out" / "0.png").exists():
+    while not (tmp_path / "in" / "0.begun").exists():
         assert time.monotonic() < until
         time.sleep(0.01)
     children = psutil.Process(process.pid).children(recursive=True)
     assert children
-    process.kill()
-    process.wait()
+    if number == signal.SIGKILL:
+        process.kill()
+    else:
+        os.killpg(process.pid, number)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == -number
     _, alive = psutil.wait_procs(children, timeout=PATIENCE)
     for child in alive:
         child.kill()
     assert not alive
+    if number == signal.SIGINT:
+        assert errors.endswith(b"KeyboardInterrupt\n")
+        assert [path.name for path in (tmp_path / "out").iterdir()] == [RECORD]
 
 
 def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,25 +248,24 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A preset and options reach the edit and the record file; cores are divided among workers and local ranks."""
+    """A preset and options reach the edit and the record; cores are shared among workers."""
     fill(tmp_path / "in", 9)
     seen = {}
     monkeypatch.setattr(
         "nlfilter_torch.cli.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args)
     )
     monkeypatch.setattr("nlfilter_torch.cli.batch._cores", lambda: 12)
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     arguments = ["batch", str(tmp_path / "in"), str(tmp_path / "out"), "--preset", "smooth", "--seed", "5"]
     assert main([*arguments, "--workers", "2", "--memory", "8"]) == 0
-    assert (seen["workers"], seen["threads"]) == (2, 3)
+    assert (seen["workers"], seen["threads"]) == (2, 6)
     settings = seen["args"][2].keywords
-    assert settings.pop("memory") == 2.0  # of two ranks with two workers each
+    assert settings.pop("memory") == 4.0  # of two workers
     smooth = PRESETS["smooth"]
     assert settings["alpha"] == "0,0,0,1"
     assert (settings["bandwidth"], settings["seed"]) == (f"{smooth.bandwidth:g}", 5)
     assert json.loads((tmp_path / "out" / RECORD).read_text()) == settings
     assert main(arguments) == 0
-    assert (seen["workers"], seen["threads"]) == (6, 1)
+    assert (seen["workers"], seen["threads"]) == (9, 1)
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

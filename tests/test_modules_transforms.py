@@ -71,13 +71,14 @@ def test_the_whole_layer_compiles_as_one_graph() -> None:
     )
     torch.compiler.reset()
     fast = torch.compile(layer, backend="aot_eager", fullgraph=True)
-    picture = image().requires_grad_()
+    picture, second = (image(seed).to(memory_format=torch.channels_last).requires_grad_() for seed in (0, 1))
     expected, found = layer(picture), fast(picture)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert found.stride() == expected.stride() == picture.stride()
     gradients = [torch.autograd.grad(y.square().mean(), [picture, *layer.parameters()]) for y in (found, expected)]
     for ours, theirs in zip(*gradients, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5 * theirs.abs().max().item())
-    torch.testing.assert_close(fast(image(1)), layer(image(1)), atol=1e-5, rtol=0)
+    torch.testing.assert_close(fast(second), layer(second), atol=1e-5, rtol=0)
 
 
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")

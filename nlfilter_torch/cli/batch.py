@@ -36,6 +36,14 @@ Workers = Annotated[
     ),
 ]
 
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="The scheduler of a Dask cluster, such as tcp://host:8786, whose workers edit the photographs in place of "
+        "this machine. They have one thread each and see the folders under the same names. Needs the extra cluster.",
+    ),
+]
 
 Preset = Annotated[
     str | None,
@@ -55,17 +63,18 @@ def batch(
     seed: options.Seed = 0,
     preset: Preset = None,
     workers: Workers = None,
+    cluster: Cluster = None,
     memory: options.Memory = None,
     **given: Any,
 ) -> None:
     """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
 
     A file that cannot be edited is reported and the others are done; the exit status is 1 then. After an interruption
-    the same command does what is left. The workers share --memory.
+    the same command does what is left. The workers share --memory; those of a cluster have as much each.
 
     All like one: `nlfilter-torch batch shots edited --preset look.json`
 
-    On several machines that share the folders: `torchrun ... -m nlfilter_torch batch shots edited --preset look.json`
+    On several machines that share the folders: `nlfilter-torch batch shots edited --cluster tcp://host:8786`
     """
     step_of(EDITS["detail"], given)
 
@@ -73,10 +82,15 @@ def batch(
     from nlfilter_torch.cli.folders import Tally, edit_folder, pictures, prepare
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.core.checks import check_patch_size
-    from nlfilter_torch.core.ranks import connected_ranks
     from nlfilter_torch.io.rows import free_memory
 
     check_patch_size(given["patch_size"])
+    if cluster is not None and workers is not None:
+        raise ValueError(f"--workers are those of the cluster, got {workers} and {cluster}; leave out one of them")
+    if cluster is not None:  # whose workers run in other folders
+        folder, target = folder.absolute(), target.absolute()
+        if preset is not None and preset not in PRESETS:
+            preset = str(Path(preset).absolute())
     shared = allowed_memory(memory) if memory is not None else free_memory()
     settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
@@ -90,36 +104,30 @@ def batch(
             )
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=preset)
     paths = pictures(folder)
-    with connected_ranks() as ranks:
-        prepare(paths, target, settings)
-        share, tally, total, interrupted = ranks.share(paths), Tally(), Tally(), False
-        cores = max(1, _cores() // ranks.local)
-        count = min(workers or cores, len(share)) or 1
-        room = shared / (count * ranks.local) / 1e9
-        try:
-            with steps(len(share), lines=False) as begin:  # files that fail are told by lines
-                edit_folder(
-                    share,
-                    target,
-                    partial(edit, memory=room),
-                    workers=count,
-                    threads=max(1, cores // count),
-                    tell=_tell,
-                    begin=begin,
-                    tally=tally,
-                )
-        except KeyboardInterrupt:
-            interrupted = True
-            _tell("the same command does the rest")
-        for part in ranks.all_gather(tally):
-            total.add(part)
-        if ranks.rank == 0 or ranks.group is None:
-            _summarise(total, target)
-        # The first rank to end with status 1 ends the others, which may still have to say something.
-        ranks.all_gather(None)
+    prepare(paths, target, settings)
+    tally, interrupted = Tally(), False
+    count = min(workers or _cores(), len(paths))
+    room = shared / count / 1e9 if cluster is None else memory
+    try:
+        with steps(len(paths), lines=False) as begin:  # files that fail are told by lines
+            edit_folder(
+                paths,
+                target,
+                partial(edit, memory=room),
+                workers=count,
+                threads=max(1, _cores() // count),
+                cluster=cluster,
+                tell=_tell,
+                begin=begin,
+                tally=tally,
+            )
+    except KeyboardInterrupt:
+        interrupted = True
+        _tell("the same command does the rest")
+    _summarise(tally, target)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
-    if total.failures or total.left:
+    if tally.failures or tally.left:
         raise typer.Exit(1)
 
 

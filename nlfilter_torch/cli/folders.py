@@ -1,31 +1,29 @@
-"""A folder of photographs edited by worker processes, on one machine or, by their ranks, on several.
+"""A folder of photographs edited by worker processes: those of joblib on this machine, or those of a Dask cluster.
 
-Needs the ``cli`` extra. A file is done when the output folder has a file of its name, since a name appears only when
-its file is complete (:func:`~nlfilter_torch.io.photographs.open_beside`). An interrupted run continues when it is
-started again.
+Needs the ``cli`` extra, and ``cluster`` for a cluster. A file is done when the output folder has a file of its name,
+since a name appears only when its file is complete (:func:`~nlfilter_torch.io.photographs.open_beside`). An interrupted
+run continues when it is started again.
 """
 
 import contextlib
 import io
 import json
-import multiprocessing
 import os
-import signal
-import threading
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import LifoQueue
+from typing import Any
 
-import torch
-
+from nlfilter_torch.cli.workers import be_worker
 from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, remove_stale
 
+CONNECTING = 30  # seconds for a cluster to answer
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
 DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the files
+
+DIED = "the process that worked on it died; give it more memory, by fewer --workers, or look at the file"
 
 Edit = Callable[[str, str], object]  # from the name of the input to that of the output; can be pickled
 
@@ -45,13 +43,6 @@ class Tally:
     skipped: int = 0
     failures: dict[str, str] = field(default_factory=dict)
     left: int = 0
-
-    def add(self, other: "Tally") -> None:
-        """Add the files of another tally."""
-        self.done += other.done
-        self.skipped += other.skipped
-        self.failures |= other.failures
-        self.left += other.left
 
 
 def pictures(folder: Path, what: str = "photographs") -> list[Path]:
@@ -102,6 +93,7 @@ def edit_folder(
     *,
     workers: int,
     threads: int,
+    cluster: str | None = None,
     tell: Callable[[str], None],
     begin: Callable[[str], None],
     tally: Tally,
@@ -112,105 +104,134 @@ def edit_folder(
         paths: image files, all in one folder.
         target: folder for the edited files, which keep their names.
         edit: edits one of them in a worker; its errors and warnings are reported.
-        workers: number of processes.
+        workers: number of processes on this machine.
         threads: of each process.
+        cluster: address of the scheduler of a Dask cluster, whose workers see the folders under the same names and have
+            one thread each; None is this machine.
         tell: called with a sentence for every failure and warning, as they happen.
         begin: called with the name of every file that ended.
         tally: updated as each file ends, so that it is correct after an interrupt too.
     """
-    remove_stale(target, {path.name for path in paths})
+    names = {path.name for path in paths}
+    remove_stale(target, names)
     jobs = [path for path in paths if not (target / path.name).exists()]
     tally.skipped += len(paths) - len(jobs)
     tally.left += len(jobs)
+    if not jobs:
+        return
     deaths = 0
-    with contextlib.closing(_outcomes(jobs, target, edit, workers=min(workers, len(jobs)), threads=threads)) as ended:
+    with (
+        contextlib.ExitStack() as afterwards,
+        _pool(cluster, min(workers, len(jobs)), threads) as workers,
+        contextlib.closing(_outcomes(jobs, target, edit, workers)) as ended,
+    ):
+        afterwards.callback(remove_stale, target, names)  # of workers that were ended by an interrupt
         for path, outcome in ended:
             begin(path.name)
             tally.left -= 1
-            deaths = deaths + 1 if isinstance(outcome, BrokenProcessPool) else 0
+            deaths = deaths + 1 if outcome == DIED else 0
             if isinstance(outcome, list):
                 tally.done += 1
                 for note in outcome:
                     tell(f"note: {path.name}: {note}")
                 continue
-            sentence = _sentence(outcome)
-            tally.failures[path.name] = sentence
-            tell(sentence if path.name in sentence else f"{path.name}: {sentence}")
+            tally.failures[path.name] = outcome
+            tell(outcome if path.name in outcome else f"{path.name}: {outcome}")
             if deaths >= DEATHS * workers:
                 tell(f"{deaths} workers died one after the other; no other file is begun")
                 return
 
 
-def _outcomes(
-    jobs: Sequence[Path], target: Path, edit: Edit, *, workers: int, threads: int
-) -> Generator[tuple[Path, list[str] | Exception]]:
-    """Each job with its warnings or its error, as they end.
+@contextlib.contextmanager
+def _pool(cluster: str | None, workers: int, threads: int) -> Iterator[int]:
+    """Have joblib work in these processes, or in those of a cluster; gives their number."""
+    import joblib
 
-    Every worker is a pool of its own: when one dies, its file is known and the others continue.
-    """
+    if cluster is None:
+        from joblib.externals.loky import get_reusable_executor
 
-    def hire() -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(threads,))
-
-    idle: LifoQueue[ProcessPoolExecutor] = LifoQueue()
-    for _ in range(workers):
-        idle.put(hire())
-
-    def run(path: Path) -> list[str]:
-        worker = idle.get()
+        # With one, joblib would work in this process, which must outlive the files; a second one stays idle then.
+        options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
         try:
-            return worker.submit(_work, edit, str(path), str(target / path.name)).result()
-        except BrokenProcessPool:
-            worker.shutdown()
-            worker = hire()
-            raise
+            with (
+                joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options),
+                warnings.catch_warnings(),
+            ):
+                warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
+                yield workers
         finally:
-            idle.put(worker)
-
-    lanes = ThreadPoolExecutor(max(workers, 1))
+            get_reusable_executor().shutdown()
+        return
     try:
-        futures: dict[Future[list[str]], Path] = {lanes.submit(run, path): path for path in jobs}
-        for future in as_completed(futures):
-            error = future.exception()
-            if error is not None and not isinstance(error, Exception):
-                raise error
-            yield futures[future], future.result() if error is None else error
-    finally:
-        lanes.shutdown(cancel_futures=True)  # files that were begun are finished
-        while not idle.empty():
-            idle.get().shutdown()
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError("--cluster needs the extra cluster; install nlfilter-torch[cluster]") from error
+    try:
+        client = Client(cluster, timeout=CONNECTING)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"--cluster must be the address of a Dask scheduler, got {cluster}; {error}") from error
+    with client, joblib.parallel_config("dask", client=client, wait_for_workers_timeout=CONNECTING):
+        yield joblib.effective_n_jobs()
 
 
-def _begin(threads: int) -> None:
-    """Initialise a worker."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the main process handles them
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
-    torch.set_num_threads(threads)
-    # An idle worker would not notice that the main process was killed, and would wait for ever.
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _outcomes(jobs: Sequence[Path], target: Path, edit: Edit, workers: int) -> Generator[tuple[Path, list[str] | str]]:
+    """Each job with its warnings or why it failed, as they end.
+
+    When a worker dies, joblib ends the others, too. Files are begun in their order, so that one of the first that have
+    not ended is the cause. Each of these is then worked on alone.
+    """
+    from joblib import Parallel, delayed
+
+    def run(paths: Sequence[Path]) -> Generator[tuple[Path, list[str] | str]]:
+        calls = [delayed(_work)(edit, path, target / path.name) for path in paths]
+        return Parallel(return_as="generator_unordered", pre_dispatch=workers, batch_size=1)(calls)
+
+    def alone(path: Path) -> tuple[Path, list[str] | str]:
+        if (target / path.name).exists():  # it had ended
+            return path, []
+        if workers > 1:
+            try:
+                (outcome,) = run([path])
+            except Exception as error:
+                if not _is_death(error):
+                    raise
+            else:
+                return outcome
+        return path, DIED
+
+    waiting = dict.fromkeys(jobs)
+    while waiting:
+        try:
+            with contextlib.closing(run(list(waiting))) as ended:
+                for path, outcome in ended:
+                    del waiting[path]
+                    yield path, outcome
+        except Exception as error:
+            if not _is_death(error):
+                raise
+            for path in list(waiting)[:workers]:
+                del waiting[path]
+                yield alone(path)
 
 
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+def _is_death(error: Exception) -> bool:
+    """Whether a worker died; Dask tries a file on several of them before it says so."""
+    return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
 
 
-def _work(edit: Edit, source: str, target: str) -> list[str]:
-    """Edit one file in a worker; return its warnings."""
+def _work(edit: Edit, source: Path, target: Path) -> tuple[Path, list[str] | str]:
+    """Edit one file in a worker; return its name, and its warnings or why it failed."""
     with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(io.StringIO()):
         warnings.simplefilter("always", UserWarning)
-        edit(source, target)
-    return [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+        try:
+            edit(str(source), str(target))
+        except Exception as error:
+            return source, _sentence(error)
+    return source, [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
 
 
 def _sentence(error: Exception) -> str:
     """Why a file could not be edited."""
-    if isinstance(error, BrokenProcessPool):
-        return "the process that worked on it died; give it more memory, by fewer --workers, or look at the file"
     if isinstance(error, ValueError | OSError | MemoryError):
         return " ".join(str(error).split())
     return " ".join(f"{type(error).__name__}: {error}".split())

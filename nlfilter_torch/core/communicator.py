@@ -12,6 +12,8 @@ these gradients up, and so does that of :meth:`Communicator.copy_to_group`, to w
 """
 
 from collections.abc import Callable
+from contextlib import suppress
+from datetime import timedelta
 from itertools import accumulate
 from typing import Any
 
@@ -20,7 +22,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import Gradients, once_differentiable
-from nlfilter_torch.core.ranks import name_the_missing
+
+ANSWERING = timedelta(seconds=10)  # for the remaining ranks to say that they are alive
 
 
 class Communicator:
@@ -287,4 +290,24 @@ def _exchange(call: Callable[[], object], group: Any) -> None:
     try:
         call()
     except RuntimeError as error:
-        raise ConnectionError(f"{name_the_missing(group)}; start all ranks again") from error
+        raise ConnectionError(f"{_name_the_missing(group)}; start all ranks again") from error
+
+
+def _name_the_missing(group: Any) -> str:
+    """Name the ranks of a group that are gone, after a call between them failed; takes at most :data:`ANSWERING`.
+
+    The call fails on all remaining ranks. Each of them sets a key in the store that connected the group.
+    """
+    ranks = dist.get_process_group_ranks(group)
+    keys = {rank: f"nlfilter/{group.group_name}/{rank} is here" for rank in ranks}
+    try:
+        store = dist.distributed_c10d._get_default_store()
+        store.set(keys[dist.get_rank()], "")
+        with suppress(RuntimeError):  # DistStoreError, where some are missing
+            store.wait(list(keys.values()), ANSWERING)
+        missing = [str(rank) for rank, key in keys.items() if not store.check([key])]
+    except RuntimeError:  # the store ends with the process that holds it
+        return "rank 0, or the process in which the ranks had met, died"
+    if not missing:
+        return "the connection between ranks broke, though all of them are alive"
+    return f"rank{'s' * (len(missing) > 1)} {', '.join(missing)} of {len(ranks)} died or did not answer"
