@@ -17,6 +17,7 @@ from nlfilter_torch import FittedLook, Look, apply_look, enhance, fit_look
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.alignment import align
 from nlfilter_torch.edits.applying import apply_step
+from nlfilter_torch.edits.look_pixels import EditedPhotograph
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.look import bands_of, tone_curve
@@ -222,6 +223,22 @@ def test_a_sampled_pair_and_a_whole_one_have_the_same_look() -> None:
     assert sliders.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
     curve = one(fit_look([(large, in_bytes(large**0.7))], step=FEW))
     assert explained(large, large**0.7, curve.apply(large)) > 0.99
+
+
+def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.filtering.look_fit.MOST", 2000)
+    monkeypatch.setattr("nlfilter_torch.edits.look_pixels.MOST", 2000)
+    photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
+    found = photograph.regions_of_sample()
+    assert found is not None
+    (some,) = found
+    assert some.layers.shape == (4, 2000)
+    assert float(some.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
+    exact = photograph.layers[:, some.places]
+    assert torch.allclose(some.layers.sum(0), exact.sum(0), atol=1e-5)
+    assert bool(((some.layers - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
+    masks = torch.ones(1, *CAT.shape[-2:])
+    assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
 
 
 def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:

@@ -156,7 +156,7 @@ def bands_of(image: Tensor) -> Iterator[Tensor]:
 def _blur(image: Tensor, dim: int, step: int) -> Tensor:
     """Along one axis by the weights 1, 4, 6, 4, 1 of pixels ``step`` apart, which ends 2 steps inside the borders."""
     a, b, c, d, e = (image.narrow(dim, i * step, image.shape[dim] - 4 * step) for i in range(5))
-    return (a + e) / 16 + (b + d) / 4 + c * 0.375
+    return (a + e).mul_(1 / 16).add_(b, alpha=0.25).add_(d, alpha=0.25).add_(c, alpha=0.375)
 
 
 def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:

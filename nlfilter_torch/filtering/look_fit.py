@@ -220,9 +220,9 @@ def _choose(
         products = [_products(sums, spread) for sums in folds]
         grams, crosses = (torch.stack(values) for values in zip(*products, strict=True))
         without, aims = grams.sum(0) - grams, crosses.sum(0) - crosses
-        ridged = torch.stack(
-            [torch.stack([gram + _penalty(gram, parts, layout, ridge, stiff) for gram in without]) for ridge in ridges]
-        )
+        penalties = [_penalties(gram, parts, layout) for gram in without]
+        free, bent = (torch.stack(some) for some in zip(*penalties, strict=True))
+        ridged = torch.stack([without + ridge * free + max(ridge, stiff) * bent for ridge in ridges])
         solved = torch.linalg.solve(ridged + _floor(without), aims.expand(len(ridges), -1, -1))
         changes = torch.einsum("rfp,fpq,rfq->rf", solved, grams, solved)
         changes = changes - 2 * torch.einsum("rfp,fp->rf", solved, crosses)
@@ -247,7 +247,8 @@ def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: flo
     """
     spread = layout.spread(parts)
     gram, cross = _products(sums, spread)
-    return spread @ _solve(gram + _penalty(gram, parts, layout, ridge, stiff) + _floor(gram), cross, parts, layout)
+    free, bent = _penalties(gram, parts, layout)
+    return spread @ _solve(gram + ridge * free + max(ridge, stiff) * bent + _floor(gram), cross, parts, layout)
 
 
 def simplest(found: dict[Parts, Found]) -> Found:
@@ -261,24 +262,31 @@ def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:
     return gram, torch.einsum("cfp,cf->p", spread, sums.cross)
 
 
-def _penalty(gram: Tensor, parts: Parts, layout: Layout, ridge: float, stiff: float) -> Tensor:
-    """Weights (P, P) of the distance of parameters from the identity, relative to what the columns weigh."""
-    penalty = torch.diag(ridge * gram.diagonal())
+def _penalties(gram: Tensor, parts: Parts, layout: Layout) -> tuple[Tensor, Tensor]:
+    """Weights (P, P) of the distance of parameters from the identity, relative to what the columns weigh.
+
+    Those of tone curves and saturation are apart.
+    """
+    free, bent = torch.diag(gram.diagonal()), torch.zeros_like(gram)
     start = 0
-    bent = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
+    curved = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
     for part in parts:
-        curves, length = bent.get(part, (0, 0))
+        curves, length = curved.get(part, (0, 0))
         for _ in range(curves):
             place = slice(start, start + length)
-            straight = torch.eye(length, dtype=gram.dtype)
-            bends = straight.diff(n=2, dim=0)
-            level = max(ridge, stiff) * gram.diagonal()[place].mean()
-            rough = ROUGHNESS[part]
-            penalty[place, place] = level * (rough * bends.mT @ bends + straight)
+            free[place, place] = 0.0
+            bent[place, place] = gram.diagonal()[place].mean() * _distance(length, ROUGHNESS[part])
             start += length
         if not curves:
             start += layout.lengths[part] * (3 if part == "matrix" else 1)
-    return penalty
+    return free, bent
+
+
+def _distance(length: int, rough: float) -> Tensor:
+    """Weights (K, K) of a curve's bends and of its distance from the identity."""
+    straight = torch.eye(length, dtype=torch.float64)
+    bends = straight.diff(n=2, dim=0)
+    return rough * bends.mT @ bends + straight
 
 
 def _floor(gram: Tensor) -> Tensor:
