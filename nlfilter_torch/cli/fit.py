@@ -56,6 +56,7 @@ CALLED = {
     "curves": "a tone curve for each channel",
     "matrix": "colours",
     "saturation": "saturation",
+    "local": "local contrast",
 }
 
 

@@ -46,8 +46,8 @@ class FittedLook:
 
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
-        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, ``matrix`` and
-            ``saturation``.
+        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, ``matrix``,
+            ``saturation`` and ``local``.
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
         explained: the same two for every choice of parts that was tried.
@@ -71,8 +71,8 @@ class FittedLook:
         curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands")}
-        saturation = torch.tensor(self.step["saturation"])
-        return {**named, "curves": curves, "matrix": matrix, "saturation": saturation}
+        rest = {name: torch.tensor(self.step[name]) for name in ("saturation", "local")}
+        return {**named, "curves": curves, "matrix": matrix, **rest}
 
     def to_json(self) -> str:
         """A file for ``nlfilter-torch apply``: a recipe of one step."""
@@ -99,7 +99,7 @@ def fit_look(
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
             or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own. Read once.
         parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``curves``,
-            ``matrix`` and ``saturation``.
+            ``matrix``, ``saturation`` and ``local`` (local contrast).
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -196,6 +196,7 @@ class _Region:
             blue=blue,
             matrix=_rounded(matrix.flatten()),
             saturation=_rounded(1 + values["saturation"][0]),
+            local=_rounded(values["local"][0]),
         )
 
 

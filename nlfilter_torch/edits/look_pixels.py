@@ -14,7 +14,8 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
-from nlfilter_torch.filtering.look import bands_of
+from nlfilter_torch.filtering.local_tone import LocalCurves
+from nlfilter_torch.filtering.look import bands_of, local_curves
 from nlfilter_torch.filtering.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
 from nlfilter_torch.operator.build import nonlocal_operator, sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -31,6 +32,7 @@ class SomePixels:
         before: (3, P).
         after: (3, P).
         bands: of the photograph before the edit, (3, 7, P).
+        local: changes of its luminance by local tone curves, (4, P).
         layers: of its luminance, (k+1, P).
         weights: (3, P).
     """
@@ -39,12 +41,13 @@ class SomePixels:
     before: Tensor
     after: Tensor
     bands: Tensor
+    local: Tensor
     layers: Tensor
     weights: Tensor
 
     def sums(self, layout: Layout, parts: list[Tensor]) -> list[Sums]:
         """Sums over parts (P',) of them."""
-        columns = columns_of(self.before, self.bands, self.layers, layout)
+        columns = columns_of(self.before, self.bands, self.local, self.layers, layout)
         change = self.after - self.before
         return [sums_of(columns[..., some], change[:, some], self.weights[:, some]) for some in parts]
 
@@ -100,6 +103,11 @@ class EditedPhotograph:
         return [*bands[:-1], bands[-1] - self.luminance.mean()]
 
     @cached_property
+    def local(self) -> LocalCurves:
+        """Local tone curves before the edit."""
+        return local_curves(self.luminance)
+
+    @cached_property
     def layers(self) -> Tensor:
         """Of luminance before the edit, (k+1, N)."""
         operator = nonlocal_operator(self.luminance, **self.options, generator=self.generator)
@@ -146,5 +154,7 @@ class EditedPhotograph:
     def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> SomePixels:
         share = float((weights.amax(0) > 0).sum()) / len(places)
         bands = torch.stack([band[:, places] for band in self.bands], dim=1)
+        rows, columns = places // self.size[1], places % self.size[1]
+        local = self.local.at(self.luminance.flatten(1)[:, places], rows, columns)[0]
         before, after = self.before[:, places], self.after[:, places]
-        return SomePixels(places, before, after, bands, layers, weights[:, places] * share)
+        return SomePixels(places, before, after, bands, local, layers, weights[:, places] * share)

@@ -2,9 +2,9 @@
 
 A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
 channel a tone curve's hat functions, the three colours, the distance from the largest of them at each saturation, the
-bands of blurs and the layers of the filter. Which parts a look has, and how strong a ridge keeps them close to the
-identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A curve is kept from falling by a
-least-squares problem with bounds.
+bands of blurs, the changes by local tone curves and the layers of the filter. Which parts a look has, and how strong a
+ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A
+curve is kept from falling by a least-squares problem with bounds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,6 +14,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from nlfilter_torch.filtering.local_tone import LIMITS
 from nlfilter_torch.filtering.look import BLURS, below_largest, saturation_hats
 
 Parts = tuple[str, ...]
@@ -29,14 +30,21 @@ CHOICES: tuple[Parts, ...] = (
     ("tone", "matrix"),
     ("bands", "matrix"),
     ("curves",),
+    ("local",),
     ("tone", "bands"),
+    ("tone", "local"),
     ("alpha", "bands"),
     ("curves", "matrix", "saturation"),
     ("tone", "matrix", "bands"),
+    ("tone", "bands", "local"),
+    ("alpha", "bands", "local"),
+    ("tone", "matrix", "bands", "local"),
     ("alpha", "tone", "matrix", "saturation"),
     ("alpha", "tone", "matrix", "saturation", "bands"),
     ("curves", "matrix", "saturation", "bands"),
     ("alpha", "curves", "matrix", "saturation", "bands"),
+    ("alpha", "tone", "matrix", "saturation", "bands", "local"),
+    ("alpha", "curves", "matrix", "saturation", "bands", "local"),
 )
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Weight of a curve's bends beside that of its distance from the identity, all that counts for factors of saturation.
@@ -69,6 +77,7 @@ class Layout:
             "matrix": 3,
             "saturation": self.factors,
             "bands": BLURS + 1,
+            "local": len(LIMITS),
             "alpha": self.sliders,
         }
 
@@ -139,22 +148,23 @@ def sample(weights: Tensor) -> Tensor:
     return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
 
 
-def columns_of(image: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
+def columns_of(image: Tensor, bands: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
     """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
         image: pixels (3, P) before the edit.
-        local: their bands, (3, 7, P).
+        bands: of them, (3, 7, P).
+        local: changes by local tone curves, (4, P).
         layers: of luminance, (k+1, P).
         layout: of the columns.
     """
     colours = image.double()  # the columns nearly depend on each other
     knots = torch.arange(layout.knots).to(colours).view(-1, 1)
     hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
-    spread = [values.double().expand(3, -1, -1) for values in (colours, layers)]
+    spread = [values.double().expand(3, -1, -1) for values in (colours, local, layers)]
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    return torch.cat([hats, spread[0], below, local.double(), spread[1]], dim=1)
+    return torch.cat([hats, spread[0], below, bands.double(), *spread[1:]], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
