@@ -468,6 +468,33 @@ def test_the_command_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, caps
     assert "--preview shows a single look, but --mask asks for 1" in capsys.readouterr().err
 
 
+def test_looks_of_regions_are_put_where_their_masks_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, out, rows, look, one, other, odd = (
+        str(tmp_path / f"{name}.png") for name in ("a", "b", "out", "rows", "look", "left", "right", "odd")
+    )
+    left = (torch.arange(100) < 50).float().expand(1, 1, 80, 100)
+    edited = torch.where(left > 0, CAT**0.6, apply_look(CAT, matrix=SEPIA))
+    for path, image in ((before, CAT), (after, edited), (one, left), (other, 1 - left), (odd, left[..., :70])):
+        write_photograph(Photograph(image), Path(path))
+    look = look.replace(".png", ".json")
+    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", one, "--mask", other]) == 0
+    first, second = (look.replace(".json", f"-{i}.json") for i in (1, 2))
+    regions = ["--preset", first, "--mask", one, "--preset", second, "--mask", other]
+    assert main(["apply", before, out, *regions]) == 0
+    found, target = read_photograph(Path(out)).pixels, read_photograph(Path(after)).pixels
+    assert explained(CAT, target, found) > 0.98
+    assert main(["apply", before, rows, *regions, "--memory", "0.001"]) == 0
+    assert (read_photograph(Path(rows)).pixels - found).abs().max() <= 1.01 / 255
+    assert main(["apply", before, out, "--preset", first, "--mask", one]) == 0
+    found = read_photograph(Path(out)).pixels
+    assert torch.equal(found[..., 50:], read_photograph(Path(before)).pixels[..., 50:])
+    assert main(["apply", before, out, "--preset", first, "--preset", second, "--mask", one]) == 2
+    assert "--mask must come once for each --preset, got 1 for 2" in capsys.readouterr().err
+    for memory in ([], ["--memory", "0.001"]):
+        assert main(["apply", before, out, "--preset", first, "--mask", odd, *memory]) == 2
+        assert "must have the size of" in capsys.readouterr().err
+
+
 def test_the_command_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before, after, look = (tmp_path / name for name in ("a.png", "b.png", "look.json"))
     write_photograph(Photograph(CAT), before)
