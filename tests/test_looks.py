@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import skimage.color
 import skimage.data
+import skimage.exposure
 import torch
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from nlfilter_torch import FittedLook, Look, apply_look, enhance, fit_look
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.alignment import align
 from nlfilter_torch.edits.applying import apply_step
+from nlfilter_torch.edits.look_pixels import EditedPhotograph
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.look import bands_of, tone_curve
@@ -31,6 +33,7 @@ BENT = tuple((i / 16) ** 0.7 for i in range(17))
 FEW = Step("look", landmarks=40)
 VIVID = (1.3, 1.2, 1.1, 1.05, 1.0)
 BANDS = (1.5, 1.0, 1.3, 1.0, 1.0, 0.8, 1.1)
+LOCAL = (0.2, 0.3, -0.1, 0.2)
 
 
 def rgb(name: str, rows: slice, columns: slice) -> Tensor:
@@ -89,12 +92,54 @@ def test_the_parts_are_what_they_say() -> None:
     )
 
 
+def test_local_contrast_is_the_clipped_histogram_of_the_blocks_around() -> None:
+    image = CAT[:, :, :77, :90].double()  # blocks of 5 pixels, 16 by 18, the last of 2 rows
+    found = apply_look(image, local=(0.0, 1.0, 0.0, 0.0)) - image
+    light = (image * torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(1, 3, 1, 1)).sum(1)[0].numpy()
+    hats = np.maximum(1 - np.abs(light * 16 - np.arange(17)[:, None, None]), 0)
+
+    def curve(row: int, column: int) -> np.ndarray:  # of the block with that number
+        total, count = np.zeros(17), 0.0
+        for i, weight in ((-1, 1), (0, 2), (1, 1)):
+            for j, other in ((-1, 1), (0, 2), (1, 1)):
+                if row + i >= 0 and column + j >= 0:
+                    block = hats[:, 5 * (row + i) : 5 * (row + i + 1), 5 * (column + j) : 5 * (column + j + 1)]
+                    total += weight * other * block.sum((1, 2))
+                    count += weight * other * block[0].size
+        clipped = np.minimum(total / count, 2 / 17)
+        clipped += (1 - clipped.sum()) / 17
+        return clipped.cumsum() - clipped / 2 - np.linspace(0, 1, 17)
+
+    for row, column in ((0, 0), (2, 2), (40, 33), (76, 89), (74, 12)):
+        down, right = min(max((row + 0.5) / 5 - 0.5, 0), 15), min(max((column + 0.5) / 5 - 0.5, 0), 17)
+        near = [(int(down) + i, int(right) + j) for i in (0, 1) for j in (0, 1)]
+        shares = [(1 - abs(down - i)) * (1 - abs(right - j)) for i, j in near]
+        blended = sum(share * curve(i, j) for share, (i, j) in zip(shares, near, strict=True) if share > 0)
+        change = np.interp(light[row, column], np.linspace(0, 1, 17), blended)
+        assert found[0, :, row, column].tolist() == pytest.approx([change] * 3, abs=1e-6)
+    even = torch.full((1, 3, 5, 40), 0.5)  # a short side of fewer pixels than blocks
+    assert torch.isfinite(apply_look(even, local=LOCAL)).all()
+
+
+def test_adaptive_equalisation_is_explained_on_another_photograph() -> None:
+    def equalized(image: Tensor) -> Tensor:
+        found = skimage.exposure.equalize_adapthist(image[0].permute(1, 2, 0).numpy(), clip_limit=0.1)
+        return in_bytes(torch.from_numpy(found).permute(2, 0, 1)[None].float())
+
+    pairs = [(image, equalized(image)) for image in (CAT, CUP, SUIT)]
+    shares = []
+    for parts in (("curves", "bands", "local"), ("curves", "bands")):
+        found = one(fit_look(pairs[:2], parts=parts, step=FEW))
+        shares.append(explained(*pairs[2], found.apply(SUIT)))
+    assert shares[0] > 0.7 > 0.4 > shares[1]
+
+
 @pytest.mark.parametrize("viewing", [0.0, 0.004])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_tiles_are_the_image_in_memory(viewing: float, channels: int, tmp_path: Path) -> None:
     step = Step(
-        "look", alpha=ALPHA, bands=BANDS, red=BENT, green=BENT, blue=BENT, matrix=SEPIA, saturation=VIVID, amount=0.8,
-        landmarks=30, viewing_size=viewing,
+        "look", alpha=ALPHA, bands=BANDS, red=BENT, green=BENT, blue=BENT, matrix=SEPIA, saturation=VIVID, local=LOCAL,
+        amount=0.8, landmarks=30, viewing_size=viewing,
     )  # fmt: skip
     image = CAT[:, :channels]
     whole = apply_step(step, image)
@@ -113,13 +158,15 @@ def test_gradients_reach_image_and_look() -> None:
     matrix = torch.tensor(SEPIA, dtype=torch.float64, requires_grad=True)
     vivid = torch.tensor(VIVID, dtype=torch.float64, requires_grad=True)
 
-    def look(image: Tensor, bands: Tensor, curve: Tensor, matrix: Tensor, vivid: Tensor) -> Tensor:
-        parts = {"red": curve, "green": curve, "blue": BENT, "matrix": matrix, "saturation": vivid}
+    local = torch.tensor(LOCAL, dtype=torch.float64, requires_grad=True)
+
+    def look(image: Tensor, bands: Tensor, curve: Tensor, matrix: Tensor, vivid: Tensor, local: Tensor) -> Tensor:
+        parts = {"red": curve, "green": curve, "blue": BENT, "matrix": matrix, "saturation": vivid, "local": local}
         return apply_look(image, bands=bands, **parts).sum(1)
 
     with torch.no_grad():
         image.add_(1e-3)  # away from the knots of the curve, where it has no derivative
-    assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid), fast_mode=True)
+    assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid, local), fast_mode=True)
     apply_look(image, alpha=alpha, num_landmarks=20).square().mean().backward()
     assert alpha.grad is not None
     assert bool((alpha.grad != 0).all())
@@ -224,6 +271,22 @@ def test_a_sampled_pair_and_a_whole_one_have_the_same_look() -> None:
     assert explained(large, large**0.7, curve.apply(large)) > 0.99
 
 
+def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.filtering.look_fit.MOST", 2000)
+    monkeypatch.setattr("nlfilter_torch.edits.look_pixels.MOST", 2000)
+    photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
+    found = photograph.regions_of_sample()
+    assert found is not None
+    (some,) = found
+    assert some.layers.shape == (4, 2000)
+    assert float(some.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
+    exact = photograph.layers[:, some.places]
+    assert torch.allclose(some.layers.sum(0), exact.sum(0), atol=1e-5)
+    assert bool(((some.layers - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
+    masks = torch.ones(1, *CAT.shape[-2:])
+    assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
+
+
 def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
     dark = in_bytes(0.1 + 0.25 * CAT)
     found = one(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
@@ -323,6 +386,7 @@ def test_bad_pairs_are_refused_in_a_sentence(pairs: list[object], message: str) 
         ({"red": (0.0, 1.0)}, "red, green and blue must be equally many"),
         ({"bands": (1.0, 1.0)}, "bands must have the shape"),
         ({"alpha": (1.0,)}, "alpha must have the shape"),
+        ({"local": (1.0,)}, "local must have the shape"),
     ],
 )
 def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: str) -> None:
@@ -402,6 +466,33 @@ def test_the_command_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, caps
     assert (tmp_path / "look-1.json").exists()
     assert main(["fit", before, after, look, "--mask", mask, "--preview", str(tmp_path / "seen.png")]) == 2
     assert "--preview shows a single look, but --mask asks for 1" in capsys.readouterr().err
+
+
+def test_looks_of_regions_are_put_where_their_masks_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, out, rows, look, one, other, odd = (
+        str(tmp_path / f"{name}.png") for name in ("a", "b", "out", "rows", "look", "left", "right", "odd")
+    )
+    left = (torch.arange(100) < 50).float().expand(1, 1, 80, 100)
+    edited = torch.where(left > 0, CAT**0.6, apply_look(CAT, matrix=SEPIA))
+    for path, image in ((before, CAT), (after, edited), (one, left), (other, 1 - left), (odd, left[..., :70])):
+        write_photograph(Photograph(image), Path(path))
+    look = look.replace(".png", ".json")
+    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", one, "--mask", other]) == 0
+    first, second = (look.replace(".json", f"-{i}.json") for i in (1, 2))
+    regions = ["--preset", first, "--mask", one, "--preset", second, "--mask", other]
+    assert main(["apply", before, out, *regions]) == 0
+    found, target = read_photograph(Path(out)).pixels, read_photograph(Path(after)).pixels
+    assert explained(CAT, target, found) > 0.98
+    assert main(["apply", before, rows, *regions, "--memory", "0.001"]) == 0
+    assert (read_photograph(Path(rows)).pixels - found).abs().max() <= 1.01 / 255
+    assert main(["apply", before, out, "--preset", first, "--mask", one]) == 0
+    found = read_photograph(Path(out)).pixels
+    assert torch.equal(found[..., 50:], read_photograph(Path(before)).pixels[..., 50:])
+    assert main(["apply", before, out, "--preset", first, "--preset", second, "--mask", one]) == 2
+    assert "--mask must come once for each --preset, got 1 for 2" in capsys.readouterr().err
+    for memory in ([], ["--memory", "0.001"]):
+        assert main(["apply", before, out, "--preset", first, "--mask", odd, *memory]) == 2
+        assert "must have the size of" in capsys.readouterr().err
 
 
 def test_the_command_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

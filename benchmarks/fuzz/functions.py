@@ -272,7 +272,8 @@ FUNCTIONS = {
         {"image": _image(1, 3)},
         FILTER
         | {"alpha": lambda scene: 4 * scene.noise(scene.order + 1), "bands": lambda scene: 2 * scene.noise(7)}
-        | {"matrix": lambda scene: scene.noise(9), "amount": _number(0, 2)},
+        | {"matrix": lambda scene: scene.noise(9), "amount": _number(0, 2)}
+        | {"local": lambda scene: scene.noise(4)},
     ),
     "fit_look": Function(
         _fitted_look,

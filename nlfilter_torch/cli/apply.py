@@ -8,13 +8,22 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.edits.presets import find_recipe
 
-Edit = Annotated[
-    str,
+Edits = Annotated[
+    list[str],
     typer.Option(
         "--preset",
         metavar="FILE|NAME",
         help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, or the name of a "
-        "preset (see `nlfilter-torch presets`).",
+        "preset (see `nlfilter-torch presets`). May be given several times, each with a --mask.",
+    ),
+]
+Masks = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--mask",
+        metavar="FILE",
+        help="A grey picture of the size of the photograph, white where the --preset of the same number applies; the "
+        "rest stays unchanged.",
     ),
 ]
 
@@ -22,7 +31,8 @@ Edit = Annotated[
 def apply(
     source: options.Source,
     target: options.Target,
-    preset: Edit,
+    preset: Edits,
+    mask: Masks = None,
     depth: options.OutputDepth = None,
     memory: options.Memory = None,
     full: options.Full = False,
@@ -32,30 +42,52 @@ def apply(
     Photographs larger than memory are edited in tiles.
 
     Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
+
+    Two looks that `nlfilter-torch fit` found for regions: `nlfilter-torch apply in.jpg out.jpg --preset look-1.json
+    --mask sky.png --preset look-2.json --mask ground.png`
     """
-    recipe = find_recipe(preset)
+    recipes, masks = [find_recipe(name) for name in preset], mask or []
+    if len(masks) != len(recipes) and (masks or len(recipes) > 1):
+        raise ValueError(
+            f"--mask must come once for each --preset, got {len(masks)} for {len(recipes)}; "
+            "say where each of them holds, or give one preset alone"
+        )
 
     from torch import Tensor
 
     from nlfilter_torch.cli import editing
     from nlfilter_torch.cli.editing import Job
+    from nlfilter_torch.edits.detail import blend_edited
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.tiled.pictures import Rows
-    from nlfilter_torch.tiled.recipe import edit_rows
+    from nlfilter_torch.tiled.recipe import edit_regions, edit_rows
 
     def work(photograph: Photograph) -> Tensor:
-        return recipe.apply(photograph.pixels)
+        if not masks:
+            return recipes[0].apply(photograph.pixels)
+        shares = editing.read_masks(masks, source, photograph.size)
+        return blend_edited(photograph.pixels, [recipe.apply(photograph.pixels) for recipe in recipes], shares)
 
     def by_rows(job: Job) -> Rows:
-        return edit_rows(job.passes(full, Path(target).parent), job.picture.rows, recipe, source)
+        passes = job.passes(full, Path(target).parent)
+        if not masks:
+            return edit_rows(passes, job.picture.rows, recipes[0], source)
+        found = [job.open(path) for path in masks]
+        for path, one in zip(masks, found, strict=True):
+            if tuple(one.shape[:2]) != job.size:
+                raise ValueError(
+                    f"{path} must have the size of {source}, {job.size[1]}x{job.size[0]}, got "
+                    f"{one.shape[1]}x{one.shape[0]}; resize it"
+                )
+        return edit_regions(passes, job.picture.rows, recipes, [one.rows for one in found], source)
 
     editing.edit_file(
         source,
         target,
         depth,
         work,
-        bytes_per_pixel=recipe.bytes_per_pixel,
+        bytes_per_pixel=max(recipe.bytes_per_pixel for recipe in recipes) + 16 * len(masks),
         memory=memory,
         by_rows=by_rows,
-        coloured=recipe.gives_colour,
+        coloured=any(recipe.gives_colour for recipe in recipes),
     )

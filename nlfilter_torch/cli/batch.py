@@ -102,7 +102,7 @@ def batch(
                 f"--{beside[0].replace('_', '-')} is an option of detail, but {preset} holds another edit; "
                 "leave it out, or write it into the file"
             )
-        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=preset)
+        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[preset])
     paths = pictures(folder)
     prepare(paths, target, settings)
     tally, interrupted = Tally(), False

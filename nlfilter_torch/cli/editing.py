@@ -1,10 +1,11 @@
 """The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from nlfilter_torch.cli import options
@@ -18,6 +19,7 @@ from nlfilter_torch.io.photographs import (
     write_photograph,
 )
 from nlfilter_torch.io.rows import StoredPicture, check_place, is_zarr, modest_memory, open_picture, write_picture
+from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.tiled.pictures import Rows
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.tiles import Passes, Statistics
@@ -42,6 +44,20 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int)
         return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=memory)
     except TooLarge:
         return None
+
+
+def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | None = None) -> Tensor:
+    """Masks (1, K, H, W) from the luminance of files, which are to have the size of one another, or that (H, W)."""
+    found = [reduce_channels(read_photograph(path).pixels, "luminance") for path in paths]
+    height, width = found[0].shape[-2:] if size is None else size
+    for path, one in zip(paths, found, strict=True):
+        if tuple(one.shape[-2:]) != (height, width):
+            like = paths[0] if size is None else of
+            raise ValueError(
+                f"{path} must have the size of {like}, {width}x{height}, got {one.shape[-1]}x{one.shape[-2]}; "
+                f"resize it to that of {of}"
+            )
+    return torch.cat(found, dim=1)
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,7 +30,7 @@ Masks = Annotated[
         "--mask",
         metavar="FILE",
         help="A grey picture, white in a region that has a look of its own; as often as there are regions. The files "
-        "are numbered then. For one pair.",
+        "are numbered then, and `nlfilter-torch apply` takes them, each with its --mask. For one pair.",
     ),
 ]
 Preview = Annotated[
@@ -56,6 +56,7 @@ CALLED = {
     "curves": "a tone curve for each channel",
     "matrix": "colours",
     "saturation": "saturation",
+    "local": "local contrast",
 }
 
 
@@ -81,6 +82,7 @@ def fit(
     """
     step = step_of(EDITS["look"], given)
 
+    from nlfilter_torch.cli.editing import read_masks
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.fit_look import fit_look
     from nlfilter_torch.io.photographs import check_file, open_beside
@@ -105,7 +107,7 @@ def fit(
                 images = _read(*pair, memory)
                 if judged and not first:
                     first.append(images)
-                yield (*images, *([] if not mask else [_masks(mask, pair[0])]))
+                yield (*images, *([] if not mask else [read_masks(mask, pair[0])]))
 
         found = fit_look(pairs(), order=layers - 1, step=step)
         begin("Judging")
@@ -159,20 +161,6 @@ def _read(before: Path, after: Path, memory: int) -> "tuple[Tensor, Tensor]":
         raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
     check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
     return image, edited
-
-
-def _masks(paths: Sequence[Path], of: Path) -> "Tensor":
-    """Masks (1, K, H, W) from files."""
-    import torch
-
-    from nlfilter_torch.io.photographs import read_photograph
-    from nlfilter_torch.operator.features import reduce_channels
-
-    found = [reduce_channels(read_photograph(path).pixels, "luminance") for path in paths]
-    for path, one in zip(paths, found, strict=True):
-        if one.shape != found[0].shape:
-            raise ValueError(f"{path} must have the size of {paths[0]}; resize it to that of {of}")
-    return torch.cat(found, dim=1)
 
 
 def _explained(before: "Tensor", after: "Tensor", found: "Tensor") -> float:

@@ -1,5 +1,6 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -244,6 +245,13 @@ def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
     rest = (1 - shares.sum(1, keepdim=True)).clamp(min=0.0)
     apart = changes.unflatten(1, (masks.shape[1] + 1, -1))
     return (torch.cat([shares, rest], dim=1).unsqueeze(2) * apart).sum(1)
+
+
+def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tensor:
+    """The image (B, C, H, W), edited in K ways (B, C', H, W) where the masks (B, K, H, W) are 1."""
+    before = image.expand(-1, max(one.shape[1] for one in edited), -1, -1)
+    changes = [one - before for one in edited]
+    return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)
 
 
 def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:

@@ -2,22 +2,20 @@
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_order, check_photograph, check_same_size
-from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.applying import apply_step, seeded
-from nlfilter_torch.edits.detail import options_of
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.look_parameters import KNOTS, SATURATIONS, STRAIGHT
+from nlfilter_torch.edits.look_pixels import EditedPhotograph, SomePixels
 from nlfilter_torch.edits.recipe import in_file
-from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.viewing import viewed_size
-from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL, fit_layers
-from nlfilter_torch.filtering.look import NAMES, bands_of
+from nlfilter_torch.filtering.fit import fit_layers
+from nlfilter_torch.filtering.look import NAMES
 from nlfilter_torch.filtering.look_fit import (
     CHOICES,
     RIDGES,
@@ -26,22 +24,18 @@ from nlfilter_torch.filtering.look_fit import (
     Parts,
     Sums,
     choose,
-    columns_of,
     fit_parts,
-    sample,
     simplest,
-    sums_of,
 )
 from nlfilter_torch.nn.parameters import check_learn
-from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
 
 Pair = tuple[Tensor, ...]
 FOLDS = 5  # into which pairs are put
 SQUARES = 3  # parts along each side of a picture that are left out in turn if there is one pair
 STIFF, STIFF_ALONE = 3e-3, 1e-2  # least ridge of tone curves and saturation, of several pairs and of one
-INSIDE = 0.9  # of a mask, from where on a pixel counts for its region
 SLIDERS_ONLY = 0.98  # share that sliders explain of a pair for which they are found to the last digit
+LIKELY = 0.95  # such a share by the layers of a sample of the pixels
 ALIKE = 0.5  # correlation of the luminance before and after an edit; less do not belong together
 SHADES = 256
 
@@ -52,8 +46,8 @@ class FittedLook:
 
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
-        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, ``matrix`` and
-            ``saturation``.
+        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, ``matrix``,
+            ``saturation`` and ``local``.
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
         explained: the same two for every choice of parts that was tried.
@@ -77,8 +71,8 @@ class FittedLook:
         curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands")}
-        saturation = torch.tensor(self.step["saturation"])
-        return {**named, "curves": curves, "matrix": matrix, "saturation": saturation}
+        rest = {name: torch.tensor(self.step[name]) for name in ("saturation", "local")}
+        return {**named, "curves": curves, "matrix": matrix, **rest}
 
     def to_json(self) -> str:
         """A file for ``nlfilter-torch apply``: a recipe of one step."""
@@ -105,7 +99,7 @@ def fit_look(
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
             or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own. Read once.
         parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``curves``,
-            ``matrix`` and ``saturation``.
+            ``matrix``, ``saturation`` and ``local`` (local contrast).
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -202,6 +196,7 @@ class _Region:
             blue=blue,
             matrix=_rounded(matrix.flatten()),
             saturation=_rounded(1 + values["saturation"][0]),
+            local=_rounded(values["local"][0]),
         )
 
 
@@ -270,45 +265,28 @@ def _add(
     generator: torch.Generator | None,
 ) -> None:
     """Add the sums of an image (3, H, W) before and after an edit."""
-    dtype = working_dtype(before)
-    before, after = before.to(dtype), after.to(dtype)
-    free = ((after > 0) & (after < 1)).to(dtype)
-    size = (before.shape[-2], before.shape[-1])
-    viewed = viewed_size(size, step["viewing_size"])
-    levels = after * 255
-    rounding = HALF_LEVEL if bool(((levels - levels.round()).abs() < OFF_LEVEL).all()) else 0.0
-    if viewed != size:
-        before, after, free = (resize(planes[None], viewed)[0] for planes in (before, after, free))
-        masks = None if masks is None else resize(masks[None].to(before), viewed)[0]
-        free, rounding = (free > 0.99).to(dtype), 0.0
-    luminance = reduce_channels(before[None], "luminance")
-    operator = nonlocal_operator(luminance, **options_of(step, viewed), generator=generator or seeded())
     layout = regions[0].layout
-    layers = detail_layers(operator, luminance, order=layout.sliders - 1)[0, :, 0].flatten(1)
-    bands = torch.stack([band[0].flatten(1) for band in bands_of(before[None])], dim=1)
-    bands[:, -1] -= luminance.mean()
-    before, after, free = (planes.flatten(1) for planes in (before, after, free))
-    for region, inside in zip(regions, [None] if masks is None else masks, strict=True):
-        weights = free
-        if inside is not None:
-            weights = free * ((inside.to(dtype).flatten() - INSIDE) / (1 - INSIDE)).clamp(0, 1)
-        places = sample(weights.amax(0))
-        if len(places) == 0:
-            raise ValueError("masks must hold a pixel that is not clipped in every region, got none; select some")
-        share = float((weights.amax(0) > 0).sum()) / len(places)
-        some = _Pixels(before[:, places], after[:, places], layers[:, places], weights[:, places] * share)
-        columns = columns_of(some.before, bands[..., places], some.layers, layout)
-        change = some.after - some.before
-        whole = sums_of(columns, change, some.weights)
-        if number == 0:
-            square = _squares(places, viewed[1])
-            inner = [(square == i).nonzero().squeeze(1) for i in range(SQUARES**2)]
-            region.squares = [sums_of(columns[..., i], change[:, i], some.weights[:, i]) for i in inner if len(i) > 0]
+    photograph = EditedPhotograph(before, after, masks, step, layout.sliders - 1, generator)
+    divided = number == 0
+
+    def sums(pixels: SomePixels) -> list[Sums]:
+        square = _squares(pixels.places, photograph.size[1]) if divided else torch.zeros_like(pixels.places)
+        return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
+
+    found = photograph.regions_of_sample()
+    known = None if found is None else [sums(pixels) for pixels in found]
+    if found is None or known is None or _of_sliders(reduce(Sums.__add__, known[0]), layout, LIKELY):
+        found = photograph.regions()
+        known = [sums(pixels) for pixels in found]
+    for region, pixels, parts in zip(regions, found, known, strict=True):
+        whole = reduce(Sums.__add__, parts)
+        if divided:
+            region.squares = parts
         if len(region.folds) < FOLDS:
             region.folds.append(whole)
         else:
             region.folds[number % FOLDS] = region.folds[number % FOLDS] + whole
-        _add_sliders(region, some, whole, rounding)
+        _add_sliders(region, pixels, whole, photograph.rounding)
 
 
 def _squares(places: Tensor, width: int) -> Tensor:
@@ -320,28 +298,16 @@ def _squares(places: Tensor, width: int) -> Tensor:
     return rows * SQUARES + columns
 
 
-@dataclass(frozen=True)
-class _Pixels:
-    """Some pixels of a pair.
-
-    Attributes:
-        before: (3, P).
-        after: (3, P).
-        layers: of luminance before, (k+1, P).
-        weights: (3, P).
-    """
-
-    before: Tensor
-    after: Tensor
-    layers: Tensor
-    weights: Tensor
+def _of_sliders(sums: Sums, layout: Layout, share: float) -> bool:
+    """Whether sliders explain such a share of the change."""
+    return sums.explained(fit_parts(sums, ("alpha",), layout, RIDGES[0])) >= share
 
 
-def _add_sliders(region: _Region, pixels: _Pixels, sums: Sums, rounding: float) -> None:
+def _add_sliders(region: _Region, pixels: SomePixels, sums: Sums, rounding: float) -> None:
     """Add sliders of least squares to which rounding of the edited picture is no error."""
     if region.sliders is None:
         return
-    if sums.explained(fit_parts(sums, ("alpha",), region.layout, RIDGES[0])) < SLIDERS_ONLY:
+    if not _of_sliders(sums, region.layout, SLIDERS_ONLY):
         region.sliders = None
         return
     # Sliders add the same to every channel, each of which is rounded by itself.

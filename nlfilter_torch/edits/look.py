@@ -1,4 +1,4 @@
-"""A look: detail sliders, gains of blurs, tone curves, a colour matrix and saturation, as found by :func:`fit_look`."""
+"""A look: sliders of detail and blurs, tone curves, colours and local contrast, as found by :func:`fit_look`."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -11,8 +11,10 @@ from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.look_parameters import LOOK
+from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change
+from nlfilter_torch.filtering.local_tone import LocalCurves, shades
 from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise
 from nlfilter_torch.operator.features import reduce_channels
 
@@ -30,6 +32,7 @@ def apply_look(
     blue: Numbers = LOOK.defaults["blue"],
     matrix: Numbers = LOOK.defaults["matrix"],
     saturation: Numbers = LOOK.defaults["saturation"],
+    local: Numbers = LOOK.defaults["local"],
     amount: float | Tensor = LOOK.defaults["amount"],
     viewing_size: float = LOOK.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
@@ -50,6 +53,8 @@ def apply_look(
         matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
         saturation: how many times as far each channel is to be from the largest one of its pixel, (K,) or (B, K), for
             colours whose saturation in HSV is at equal steps from 0 to 1.
+        local: how much of the change of luminance that equalises the histogram around each pixel is added, under limits
+            of contrast of 1.5, 2, 3 and 5, (4,) or (B, 4); 0 is none. Blocks are a sixteenth of the short side.
         amount: a number or a tensor of shape () or (B,); 1 is the look, 0 the image.
         viewing_size: in megapixels; the details of a larger image are those of its reduction to this size; 0 is the
             size of the image.
@@ -82,6 +87,7 @@ def apply_look(
         blue=blue,
         matrix=matrix,
         saturation=saturation,
+        local=local,
         amount=amount,
         viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
@@ -101,6 +107,7 @@ def fit_look_edit(
     blue: Numbers,
     matrix: Numbers,
     saturation: Numbers,
+    local: Numbers,
     amount: float | Tensor,
     viewing_size: float,
     photometric_bandwidth: float | Tensor | str,
@@ -113,8 +120,9 @@ def fit_look_edit(
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
     LOOK["amount"].check_argument(amount, source.batch)
     LOOK["viewing_size"].check_argument(viewing_size)
-    given = {"alpha": alpha, "bands": bands, "saturation": saturation, "red": red, "green": green, "blue": blue}
-    sliders, gains, factors, *channels = (_numbers(value, name, source) for name, value in given.items())
+    given = {"alpha": alpha, "bands": bands, "saturation": saturation, "local": local}
+    given |= {"red": red, "green": green, "blue": blue}
+    sliders, gains, factors, strengths, *channels = (_numbers(value, name, source) for name, value in given.items())
     if len({channel.shape[-1] for channel in channels}) > 1:
         lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
         raise ValueError(f"red, green and blue must be equally many numbers, got {lengths}; add or drop some")
@@ -125,6 +133,7 @@ def fit_look_edit(
         raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
     colours = colours.unflatten(-1, (3, 3))
     parts = {"alpha": sliders, "bands": gains, "curves": curves, "matrix": colours, "saturation": factors}
+    parts["local"] = strengths
     for name, value in parts.items():
         check_part(value, name, source.batch)
     strength = torch.as_tensor(amount).to(source.dtype).reshape(-1, 1, 1, 1)
@@ -151,16 +160,34 @@ def fit_look_edit(
 
     fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
 
+    equalized = _local_change(source, strengths) if acts(strengths, 0.0) else None
+
     def result(image: Tensor, moved: Tensor) -> Tensor:
         coloured = image.expand(-1, 3, -1, -1)
         shown = pointwise(coloured, curves, colours, factors) - coloured
         shown = reduce_channels(shown, "luminance") if image.shape[1] == 1 else shown
         return image + strength * (moved - image + shown)
 
+    def planes(pixels: Pixels) -> Tensor:
+        """The change of some pixels, and that of local contrast as a plane more."""
+        moved = fitted.pixels(pixels)
+        return moved if equalized is None else torch.cat([moved, equalized(pixels)], dim=1)
+
+    def finished(image: Tensor, found: Tensor) -> Tensor:
+        moved = found if equalized is None else found[:, :-1]
+        shown = result(image, moved if fitted.finish is None else fitted.finish(image, moved))
+        return shown if equalized is None else shown + strength * found[:, -1:]
+
     if fitted.finish is None:
-        return Fitted(lambda pixels: result(pixels.image, fitted.pixels(pixels)))
-    finish = fitted.finish
-    return Fitted(fitted.pixels, lambda image, found: result(image, finish(image, found)), fitted.margin)
+        return Fitted(lambda pixels: finished(pixels.image, planes(pixels)))
+    return Fitted(planes, finished, fitted.margin)
+
+
+def _local_change(source: Source, strengths: Tensor) -> Planes:
+    """The change of luminance (B, 1, h, W) by local tone curves."""
+    curves = LocalCurves.of(source.size, lambda step: source.reduced(lambda pixels: shades(luminance(pixels)), step))
+    weighed = curves.weighed(strengths)
+    return lambda pixels: weighed.rectangle(luminance(pixels), corner(pixels))
 
 
 def _numbers(value: Numbers, name: str, source: Source) -> Tensor:

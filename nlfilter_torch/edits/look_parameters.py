@@ -58,6 +58,16 @@ LOOK = Edit(
             idle=(1.0,) * SATURATIONS,
             metavar="A,B,...,E",
         ),
+        sliders(
+            "local",
+            (0.0,) * 4,
+            "Local contrast: how much of the change of brightness that equalises the histogram around each pixel is "
+            "added, under limits of contrast of 1.5, 2, 3 and 5. 0 is none.",
+            unit="",
+            idle=(0.0,) * 4,
+            metavar="A,B,C,D",
+            length=4,
+        ),
         gain(
             "amount",
             1.0,

@@ -1,4 +1,4 @@
-"""A look: sliders of the filter and of blurs, tone curves, a colour matrix and saturation, added up.
+"""A look: sliders of the filter and of blurs, tone curves, a colour matrix, saturation and local contrast, added up.
 
 Each part gives a change of the image, and the result is the image plus all changes, so that it is linear in every
 parameter but the image: looks are fitted to edits by least squares.
@@ -7,18 +7,20 @@ parameter but the image: looks are fitted to edits by least squares.
 from collections.abc import Iterator
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_tensor
 from nlfilter_torch.filtering.filters import polynomial_filter
+from nlfilter_torch.filtering.local_tone import LIMITS, LocalCurves, shades
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 DARKEST = 1 / 255  # that has a saturation
-NAMES = ("alpha", "bands", "curves", "matrix", "saturation")
-DIMENSIONS = {"alpha": 1, "bands": 1, "curves": 2, "matrix": 2, "saturation": 1}  # of one image
+NAMES = ("alpha", "bands", "curves", "matrix", "saturation", "local")
+DIMENSIONS = {"alpha": 1, "bands": 1, "curves": 2, "matrix": 2, "saturation": 1, "local": 1}  # of one image
 
 
 def filter_look(
@@ -29,6 +31,7 @@ def filter_look(
     curves: Tensor | None = None,
     matrix: Tensor | None = None,
     saturation: Tensor | None = None,
+    local: Tensor | None = None,
     operator: NonlocalOperator | None = None,
 ) -> Tensor:
     """An image under a look, each part of which may be left out.
@@ -43,6 +46,8 @@ def filter_look(
             image itself.
         saturation: (K,) or (B, K), how many times as far each channel is to be from the largest one of its pixel, for
             colours whose saturation in HSV is at K equal steps from 0 to 1.
+        local: (4,) or (B, 4), how much of the change of luminance that equalises histograms of the surroundings is
+            added, under four limits of contrast, :data:`~nlfilter_torch.filtering.local_tone.LIMITS`.
         operator: W, which ``alpha`` needs.
 
     Returns:
@@ -58,7 +63,7 @@ def filter_look(
         True
     """
     check_image(image, "image", channels=3)
-    parts = {"alpha": alpha, "bands": bands, "curves": curves, "matrix": matrix, "saturation": saturation}
+    parts = dict(zip(NAMES, (alpha, bands, curves, matrix, saturation, local), strict=True))
     given = {name: value for name, value in parts.items() if value is not None}
     for name, value in given.items():
         check_part(value, name, image.shape[0])
@@ -66,6 +71,10 @@ def filter_look(
     if bands is not None:
         mean = reduce_channels(image, "luminance").mean((2, 3), keepdim=True)
         result = result + band_change(image, bands, mean)
+    if local is not None:
+        light = reduce_channels(image, "luminance")
+        weighed = local_curves(light).weighed(local)
+        result = result + weighed.rectangle(light, (0, 0))
     if alpha is not None:
         if operator is None:
             raise ValueError("operator must be given where alpha is, got None; make it with nonlocal_operator")
@@ -82,6 +91,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         "curves": "(3, K)",
         "matrix": "(3, 3)",
         "saturation": "(K,)",
+        "local": f"({len(LIMITS)},)",
     }
     shape, one = tuple(value.shape), DIMENSIONS[name]
     last = shape[-one:]
@@ -91,6 +101,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         "curves": lambda: last[0] == 3 and last[1] >= 2,
         "matrix": lambda: last == (3, 3),
         "saturation": lambda: last[0] >= 2,
+        "local": lambda: last == (len(LIMITS),),
     }
     if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
         raise ValueError(
@@ -98,9 +109,15 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         )
 
 
-def acts(gains: Tensor) -> bool:
-    """Whether gains change anything, or may once they are learned."""
-    return gains.requires_grad or bool((gains != 1).any())
+def acts(gains: Tensor, idle: float = 1.0) -> bool:
+    """Whether gains change anything, which ``idle`` ones do not, or may once they are learned."""
+    return gains.requires_grad or bool((gains != idle).any())
+
+
+def local_curves(light: Tensor) -> LocalCurves:
+    """Local tone curves of an image of luminance (B, 1, H, W)."""
+    size = (light.shape[-2], light.shape[-1])
+    return LocalCurves.of(size, lambda step: F.avg_pool2d(shades(light), step, ceil_mode=True, count_include_pad=False))
 
 
 def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None, saturation: Tensor | None) -> Tensor:
@@ -156,7 +173,7 @@ def bands_of(image: Tensor) -> Iterator[Tensor]:
 def _blur(image: Tensor, dim: int, step: int) -> Tensor:
     """Along one axis by the weights 1, 4, 6, 4, 1 of pixels ``step`` apart, which ends 2 steps inside the borders."""
     a, b, c, d, e = (image.narrow(dim, i * step, image.shape[dim] - 4 * step) for i in range(5))
-    return (a + e) / 16 + (b + d) / 4 + c * 0.375
+    return (a + e).mul_(1 / 16).add_(b, alpha=0.25).add_(d, alpha=0.25).add_(c, alpha=0.375)
 
 
 def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:

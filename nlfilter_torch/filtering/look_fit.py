@@ -2,9 +2,9 @@
 
 A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
 channel a tone curve's hat functions, the three colours, the distance from the largest of them at each saturation, the
-bands of blurs and the layers of the filter. Which parts a look has, and how strong a ridge keeps them close to the
-identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A curve is kept from falling by a
-least-squares problem with bounds.
+bands of blurs, the changes by local tone curves and the layers of the filter. Which parts a look has, and how strong a
+ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A
+curve is kept from falling by a least-squares problem with bounds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,6 +14,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from nlfilter_torch.filtering.local_tone import LIMITS
 from nlfilter_torch.filtering.look import BLURS, below_largest, saturation_hats
 
 Parts = tuple[str, ...]
@@ -29,14 +30,21 @@ CHOICES: tuple[Parts, ...] = (
     ("tone", "matrix"),
     ("bands", "matrix"),
     ("curves",),
+    ("local",),
     ("tone", "bands"),
+    ("tone", "local"),
     ("alpha", "bands"),
     ("curves", "matrix", "saturation"),
     ("tone", "matrix", "bands"),
+    ("tone", "bands", "local"),
+    ("alpha", "bands", "local"),
+    ("tone", "matrix", "bands", "local"),
     ("alpha", "tone", "matrix", "saturation"),
     ("alpha", "tone", "matrix", "saturation", "bands"),
     ("curves", "matrix", "saturation", "bands"),
     ("alpha", "curves", "matrix", "saturation", "bands"),
+    ("alpha", "tone", "matrix", "saturation", "bands", "local"),
+    ("alpha", "curves", "matrix", "saturation", "bands", "local"),
 )
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Weight of a curve's bends beside that of its distance from the identity, all that counts for factors of saturation.
@@ -69,6 +77,7 @@ class Layout:
             "matrix": 3,
             "saturation": self.factors,
             "bands": BLURS + 1,
+            "local": len(LIMITS),
             "alpha": self.sliders,
         }
 
@@ -139,22 +148,23 @@ def sample(weights: Tensor) -> Tensor:
     return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
 
 
-def columns_of(image: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
+def columns_of(image: Tensor, bands: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
     """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
         image: pixels (3, P) before the edit.
-        local: their bands, (3, 7, P).
+        bands: of them, (3, 7, P).
+        local: changes by local tone curves, (4, P).
         layers: of luminance, (k+1, P).
         layout: of the columns.
     """
     colours = image.double()  # the columns nearly depend on each other
     knots = torch.arange(layout.knots).to(colours).view(-1, 1)
     hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
-    spread = [values.double().expand(3, -1, -1) for values in (colours, layers)]
+    spread = [values.double().expand(3, -1, -1) for values in (colours, local, layers)]
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    return torch.cat([hats, spread[0], below, local.double(), spread[1]], dim=1)
+    return torch.cat([hats, spread[0], below, bands.double(), *spread[1:]], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
@@ -220,9 +230,9 @@ def _choose(
         products = [_products(sums, spread) for sums in folds]
         grams, crosses = (torch.stack(values) for values in zip(*products, strict=True))
         without, aims = grams.sum(0) - grams, crosses.sum(0) - crosses
-        ridged = torch.stack(
-            [torch.stack([gram + _penalty(gram, parts, layout, ridge, stiff) for gram in without]) for ridge in ridges]
-        )
+        penalties = [_penalties(gram, parts, layout) for gram in without]
+        free, bent = (torch.stack(some) for some in zip(*penalties, strict=True))
+        ridged = torch.stack([without + ridge * free + max(ridge, stiff) * bent for ridge in ridges])
         solved = torch.linalg.solve(ridged + _floor(without), aims.expand(len(ridges), -1, -1))
         changes = torch.einsum("rfp,fpq,rfq->rf", solved, grams, solved)
         changes = changes - 2 * torch.einsum("rfp,fp->rf", solved, crosses)
@@ -247,7 +257,8 @@ def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: flo
     """
     spread = layout.spread(parts)
     gram, cross = _products(sums, spread)
-    return spread @ _solve(gram + _penalty(gram, parts, layout, ridge, stiff) + _floor(gram), cross, parts, layout)
+    free, bent = _penalties(gram, parts, layout)
+    return spread @ _solve(gram + ridge * free + max(ridge, stiff) * bent + _floor(gram), cross, parts, layout)
 
 
 def simplest(found: dict[Parts, Found]) -> Found:
@@ -261,24 +272,31 @@ def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:
     return gram, torch.einsum("cfp,cf->p", spread, sums.cross)
 
 
-def _penalty(gram: Tensor, parts: Parts, layout: Layout, ridge: float, stiff: float) -> Tensor:
-    """Weights (P, P) of the distance of parameters from the identity, relative to what the columns weigh."""
-    penalty = torch.diag(ridge * gram.diagonal())
+def _penalties(gram: Tensor, parts: Parts, layout: Layout) -> tuple[Tensor, Tensor]:
+    """Weights (P, P) of the distance of parameters from the identity, relative to what the columns weigh.
+
+    Those of tone curves and saturation are apart.
+    """
+    free, bent = torch.diag(gram.diagonal()), torch.zeros_like(gram)
     start = 0
-    bent = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
+    curved = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
     for part in parts:
-        curves, length = bent.get(part, (0, 0))
+        curves, length = curved.get(part, (0, 0))
         for _ in range(curves):
             place = slice(start, start + length)
-            straight = torch.eye(length, dtype=gram.dtype)
-            bends = straight.diff(n=2, dim=0)
-            level = max(ridge, stiff) * gram.diagonal()[place].mean()
-            rough = ROUGHNESS[part]
-            penalty[place, place] = level * (rough * bends.mT @ bends + straight)
+            free[place, place] = 0.0
+            bent[place, place] = gram.diagonal()[place].mean() * _distance(length, ROUGHNESS[part])
             start += length
         if not curves:
             start += layout.lengths[part] * (3 if part == "matrix" else 1)
-    return penalty
+    return free, bent
+
+
+def _distance(length: int, rough: float) -> Tensor:
+    """Weights (K, K) of a curve's bends and of its distance from the identity."""
+    straight = torch.eye(length, dtype=torch.float64)
+    bends = straight.diff(n=2, dim=0)
+    return rough * bends.mT @ bends + straight
 
 
 def _floor(gram: Tensor) -> Tensor:

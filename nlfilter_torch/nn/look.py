@@ -21,8 +21,9 @@ class Look(nn.Module):
     Paper: eq. (12) for the sliders. Starts from the identity, or from the result of :func:`fit_look`.
 
     Args:
-        parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K), ``matrix`` (3, 3) and
-            ``saturation`` (K,), as from :meth:`FittedLook.tensors`. Omitted parts start from the identity.
+        parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K), ``matrix`` (3, 3),
+            ``saturation`` (K,) and ``local`` (4,), as from :meth:`FittedLook.tensors`. Omitted parts start from the
+            identity.
         learn: names of the parts to learn; the others are buffers.
         knots: K, for curves that start from the identity.
         **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
@@ -43,6 +44,7 @@ class Look(nn.Module):
     curves: Tensor
     matrix: Tensor
     saturation: Tensor
+    local: Tensor
 
     def __init__(
         self,
@@ -63,6 +65,7 @@ class Look(nn.Module):
             "curves": torch.linspace(0, 1, knots).expand(3, -1),
             "matrix": torch.eye(3),
             "saturation": torch.ones(5),
+            "local": torch.zeros(4),
         } | given
         for name, value in start.items():
             check_part(value, name, 1)
@@ -92,4 +95,6 @@ class Look(nn.Module):
             operator = nonlocal_operator(reduce_channels(image, "luminance"), **near | self.options)
         if not acts(used["bands"]):
             del used["bands"]
+        if not acts(used["local"], 0.0):
+            del used["local"]
         return filter_look(image, operator=operator, **used)

@@ -28,7 +28,13 @@ from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled
 from nlfilter_torch.core.values import is_hidden, refuse_transforms
 from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_graph, balance_in_rounds, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
-from nlfilter_torch.operator.features import GuideChannels, bandwidth_of_rows, reduce_channels, unit_window
+from nlfilter_torch.operator.features import (
+    GuideChannels,
+    bandwidth_of_rows,
+    estimate_bandwidth,
+    reduce_channels,
+    unit_window,
+)
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
@@ -223,6 +229,47 @@ def operator_from_features(
     return _assemble(features, shape, method, weights=weights, among=among)
 
 
+def sampled_operator(
+    guide: Tensor,
+    places: Tensor,
+    *,
+    patch_size: int,
+    photometric_bandwidth: float | Tensor | str,
+    spatial_bandwidth: float | Tensor | None,
+    num_landmarks: int,
+    landmarks: Sampling,
+    generator: torch.Generator,
+) -> NonlocalOperator:
+    """:func:`nonlocal_operator` of some pixels of a guide, each of which stands for as many others.
+
+    Landmarks are those of the whole guide, and so are the results at these pixels, but for the error of sums over a
+    sample.
+
+    Args:
+        guide: (1, 1, H, W), which is checked.
+        places: of the pixels (n,), along the rows, even over the picture.
+        patch_size: as for :func:`nonlocal_operator`, as are all further ones.
+        photometric_bandwidth: see there.
+        spatial_bandwidth: see there.
+        num_landmarks: see there.
+        landmarks: see there.
+        generator: see there.
+
+    Returns:
+        The operator, for images of the size (1, n).
+    """
+    method = Construction(num_landmarks, landmarks, "diagonal", None, generator)
+    if isinstance(photometric_bandwidth, str):
+        photometric_bandwidth = estimate_bandwidth(guide)
+    window = unit_window(patch_size, None).to(guide)
+    recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, "luminance")
+    features, size = recipe(guide), (guide.shape[2], guide.shape[3])
+    chosen = choose_landmarks(features, size, num_landmarks, landmarks, generator)
+    count = len(places)
+    weights = guide.new_full((1, count), features.shape[2] / count)
+    return _assemble(features[:, :, places], (1, count), method, recipe=recipe, weights=weights, chosen=chosen)
+
+
 def _assemble(
     features: Tensor,
     size: tuple[int, int],
@@ -231,8 +278,19 @@ def _assemble(
     recipe: GuideFeatures | None = None,
     weights: Tensor | None = None,
     among: Communicator = ALONE,
+    chosen: Tensor | None = None,
 ) -> NonlocalOperator:
-    """Build an operator from features (B, D, N); ``recipe`` computed them, if they come from a guide."""
+    """Build an operator from features (B, D, N).
+
+    Args:
+        features: of the points.
+        size: (H, W) of the images to filter.
+        method: options.
+        recipe: computed the features, if they come from a guide.
+        weights: of the points.
+        among: ranks over which the points are distributed.
+        chosen: landmarks (B, D, M), if they are already chosen.
+    """
     whole = among.whole(size)
     points, count, tolerance = whole[0] * whole[1], method.num_landmarks, method.tolerance
     if count > points:
@@ -241,11 +299,12 @@ def _assemble(
     if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
     in_graph = torch.compiler.is_compiling()  # never with a generator, weights or a group
-    chosen = (
-        choose_in_graph(features, size, count, method.landmarks)
-        if in_graph
-        else choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
-    )
+    if chosen is None:
+        chosen = (
+            choose_in_graph(features, size, count, method.landmarks)
+            if in_graph
+            else choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
+        )
     kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
