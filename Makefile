@@ -1,4 +1,4 @@
-# A fresh machine needs CPython (3.11 or later) and make; each target makes .venv and installs what it lacks.
+# Requires CPython (3.11 or later) and make; each target creates .venv and installs what is missing.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,14 +9,14 @@ COMPILED := hatch_build.py $(wildcard nlfilter_torch/core/kernels/*.[ch])
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --no-install-recommends
 
-# Modules are compiled once for all processes of tests and benchmarks, whatever the environment says.
+# Write bytecode even if the environment disables it, so that the processes of tests and benchmarks share it.
 export PYTHONDONTWRITEBYTECODE :=
 
 .DELETE_ON_ERROR:
 .PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
 
-# The stamps are older than the pins whenever an install is due; a second run finds nothing to do.
-# torch comes first, by its exact pin, so that nothing else draws in another build of it.
+# The stamp files record the last install, which is repeated when a prerequisite changes.
+# torch is installed first, by its exact pin, so that no other package pulls in another build of it.
 $(VENV)/.installed: $(PINS) $(COMPILED) | compiler
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) "$$(grep '^torch==' constraints.txt)"
@@ -28,23 +28,23 @@ $(VENV)/.installed-test: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[cli,app,notebooks,bench,docs,test]'
 	touch $@
 
-# Compiles the kernels in C.
+# Installs a C compiler for the kernels if there is none.
 compiler:
 	@command -v cc >/dev/null || { $(INSTALL_DEBIAN) gcc libc6-dev; } >/dev/null 2>&1 \
 	|| echo "No C compiler could be installed; torch does the work of the kernels in C, more slowly."
 
-# The browser that the editor is tested in; without one those tests are skipped, and say so.
+# Installs a browser for the tests of the editor if there is none; without one they are skipped.
 chromium:
 	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit; done; \
 	{ $(INSTALL_DEBIAN) chromium; } >/dev/null 2>&1 \
 	|| echo "No Chromium could be installed; the editor's tests in the browser will be skipped."
 
-# A picture of every step, from a photograph that comes with scikit-image, in out/.
+# Pictures of every step in out/, from a photograph that comes with scikit-image.
 demo: $(VENV)/.installed
 	$(BIN)/nlfilter-torch demo out
 
-# Everything that has to hold; pytest comes last, so that its count closes the output. A process for every core, of one
-# thread each: several threads in several processes would wait for each other. Tests of threads set their own number.
+# All checks; pytest runs last, so that its summary ends the output. One single-threaded process per core, since several
+# threads in several processes would wait for each other. Tests of threads set their own number.
 test: $(VENV)/.installed-test chromium
 	$(MAKE) --no-print-directory -j2 lint types bench-quick
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
@@ -56,12 +56,12 @@ lint: $(VENV)/.installed-test
 types: $(VENV)/.installed-test
 	$(BIN)/mypy
 
-# All figures of speed, in ten minutes; on a machine that does nothing else meanwhile.
+# All speed measurements, in ten minutes, on an otherwise idle machine.
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
 	$(BIN)/python -m benchmarks.report out/speed.json
 
-# Every benchmark once, on a size that takes seconds: that it runs, not how fast. One of one thread for every core.
+# Checks that every benchmark runs, on sizes that take seconds. One single-threaded benchmark per core.
 bench-quick: export OMP_NUM_THREADS = 1
 bench-quick: $(VENV)/.installed-test
 	printf '%s\n' $(QUICK) | xargs -P "$$(getconf _NPROCESSORS_ONLN)" -I '{}' \
@@ -86,15 +86,15 @@ QUICK := \
 	'memory --side 128 --repeats 1' \
 	'fuzz --cases 20'
 
-# The weights of the denoiser, from nothing, with their figures and learning curve: about an hour on a processor with AMX.
-# A training that was stopped goes on.
+# Trains the denoiser from scratch and copies its weights, results and learning curve: about an hour on a processor with
+# AMX. A stopped training is resumed.
 train: $(VENV)/.installed-test
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser --half --out out/denoiser
 	cp out/denoiser/denoiser.safetensors nlfilter_torch/nn/
 	cp out/denoiser/denoiser.json docs/
 	cp out/denoiser/curve.png docs/denoiser.png
 
-# The pictures of the README and of the pages of docs.
+# The pictures of the README and of docs/.
 pictures: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.detail_pictures docs
 	$(BIN)/python -m benchmarks.gallery docs
@@ -104,17 +104,17 @@ pictures: $(VENV)/.installed
 figures: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.figures --out out/figures
 
-# A source distribution and wheels in out/wheels, checked; AArch64 by a cross compiler, where one can be installed.
+# A source distribution and wheels in out/wheels, checked; AArch64 by a cross compiler if one can be installed.
 wheels: $(VENV)/.installed
 	@{ command -v aarch64-linux-gnu-gcc && command -v qemu-aarch64; } >/dev/null \
 	|| { $(INSTALL_DEBIAN) gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user; } >/dev/null 2>&1 || true
 	$(BIN)/python build_wheels.py out/wheels
 
-# The documentation as a website in out/docs; whatever its generator would warn of is an error.
+# The documentation as a website in out/docs; warnings of Sphinx are errors.
 docs: $(VENV)/.installed-test
 	$(BIN)/python -m sphinx -E -W --keep-going -b html -d out/doctrees docs out/docs
 
-# Every notebook from the script it is paired with, run, with small pictures, in some minutes.
+# Executes every notebook from its paired script, with small pictures, in a few minutes.
 notebooks: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.notebooks notebooks
 

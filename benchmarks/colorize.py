@@ -132,7 +132,7 @@ def report(cases: list[Case]) -> bool:
     print("median CPU time " + ", ".join(f"{method} {value:.3f} s" for method, value in seconds.items()))
     print(
         f"beats Levin in {won:.0%} of {len(cases)} cases, by {median:.2f} dB in the median ({min(leads):.2f} to "
-        f"{max(leads):.2f}), in {ratio:.2f} of his time; beats k-means in "
+        f"{max(leads):.2f}), in {ratio:.2f} of its time; beats k-means in "
         f"{sum(lead > 0 for lead in over_pieces) / len(cases):.0%}, by {statistics.median(over_pieces):.2f} dB"
     )
     lost = sorted((case for case in cases if case.lead <= 0), key=lambda case: case.lead)
@@ -145,14 +145,23 @@ def report(cases: list[Case]) -> bool:
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables and the claim."""
-    parser = argparse.ArgumentParser(description="Colours from strokes, against Levin's optimisation.")
-    parser.add_argument("--quick", action="store_true", help="one seed at 40x60, to see that it runs")
-    parser.add_argument("--pictures", type=Path, help="folder of photographs in place of scikit-image's")
-    parser.add_argument("--set", choices=("reporting", "choosing"), default="reporting", help="of scikit-image's")
-    parser.add_argument("--side", type=int, default=SIDE, help="pixels of the short side of photographs of a folder")
-    parser.add_argument("--first-seed", type=int, default=1000, help="of the strokes; 0 to 299 were used for choosing")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="sets of strokes for each number of them")
-    parser.add_argument("--save", type=Path, help="folder for scribbles, all results and the photograph side by side")
+    parser = argparse.ArgumentParser(description="Colourisation against Levin's optimisation.")
+    parser.add_argument("--quick", action="store_true", help="one seed at 40x60, to check that it runs")
+    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
+    parser.add_argument(
+        "--set", choices=("reporting", "choosing"), default="reporting", help="set of scikit-image's photographs"
+    )
+    parser.add_argument("--side", type=int, default=SIDE, help="short side in pixels of photographs of a folder")
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=1000,
+        help="first seed of the strokes; 0 to 299 were used to choose parameters",
+    )
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="sets of strokes for each number of strokes")
+    parser.add_argument(
+        "--save", type=Path, help="folder for pictures of the scribbles, all results and the photograph, side by side"
+    )
     options = parser.parse_args(arguments)
     shape = (40, 60) if options.quick else SHAPE
     seeds = range(options.first_seed, options.first_seed + (1 if options.quick else options.seeds))

@@ -1,6 +1,6 @@
 """Composites with known opacity: a textured object from one photograph over another, and scribbles on both.
 
-The shapes are random: blobs, blobs with hairs, with holes, with motion blur, and out of focus. The photographs in
+The shapes are random: blobs, and blobs with hairs, holes, motion blur or defocus. The photographs in
 ``CHOOSING`` were used to choose the defaults of masks, recolouring and defocus; those in ``REPORTING`` were not.
 """
 
@@ -33,7 +33,7 @@ class Composite:
     """An object over a background.
 
     Attributes:
-        name: of the two photographs and the shape.
+        name: names of the two photographs and the shape.
         image: (1, 3, H, W).
         alpha: opacity of the object, (1, 1, H, W).
         object: its colours, (1, 3, H, W).
@@ -47,7 +47,7 @@ class Composite:
     background: Tensor
 
     def scribbles(self, count: int, seed: int) -> tuple[Tensor, Tensor]:
-        """Masks (1, 1, H, W) of ``count`` short strokes inside the object, and as many inside the background."""
+        """Draw masks (1, 1, H, W) of ``count`` short strokes inside the object, and as many in the background."""
         random = np.random.default_rng(seed)
         alpha = self.alpha[0, 0].numpy()
         inside, outside = (draw_strokes(place, count, random) for place in (alpha > 0.98, alpha < 0.02))
@@ -55,7 +55,7 @@ class Composite:
 
 
 def draw_strokes(allowed: NDArray[np.bool_], count: int, random: np.random.Generator) -> Tensor:
-    """A mask (1, 1, H, W) of short strokes, spread over an area and away from its border where possible."""
+    """Draw a mask (1, 1, H, W) of short strokes, spread over an area and away from its border where possible."""
     short = min(allowed.shape)
     depth = cv2.distanceTransform(np.pad(allowed, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     places = np.argwhere(depth >= min(depth.max(), 2 * RADIUS * short))
@@ -78,7 +78,7 @@ def draw_strokes(allowed: NDArray[np.bool_], count: int, random: np.random.Gener
 
 
 def blob(random: np.random.Generator, size: tuple[int, int], radius: float, middle: tuple[float, float]) -> Plane:
-    """An antialiased star-shaped area with a wavy border, (H, W)."""
+    """Draw an antialiased star-shaped area with a wavy border, (H, W)."""
     scale = 4
     angles = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     reach = np.ones_like(angles)
@@ -151,7 +151,7 @@ def composites(count: int, first_seed: int, images: dict[str, Tensor], size: tup
 
 
 def sources(folder: Path | None, kind: str) -> dict[str, Tensor]:
-    """The photographs for composites: those in a folder, or those of scikit-image in a set."""
+    """Photographs for composites: those in a folder, or scikit-image's of one of the two sets."""
     if folder is not None:
         return pictures(folder, 426, ())
     names = CHOOSING if kind == "choosing" else REPORTING
@@ -165,7 +165,7 @@ class Setup:
     Attributes:
         count: number of composites.
         size: (H, W) of each.
-        images: photographs that they are made of.
+        images: photographs that the composites are made of.
         first: seed of the first composite.
         kind: set of photographs and seeds.
         quick: whether this is only a check that the benchmark runs.
@@ -182,11 +182,13 @@ class Setup:
 def setup(description: str, arguments: list[str] | None) -> Setup:
     """Read the options of the command line."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
+    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
     parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
-    parser.add_argument("--first-seed", type=int, help="of composites and scribbles; without it, that of the set")
-    parser.add_argument("--composites", type=int, default=COMPOSITES, help="how many")
-    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to see that it runs")
+    parser.add_argument(
+        "--first-seed", type=int, help="first seed of composites and scribbles; default: that of the set"
+    )
+    parser.add_argument("--composites", type=int, default=COMPOSITES, help="number of composites")
+    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to check that it runs")
     options = parser.parse_args(arguments)
     count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
     first = FIRST_SEED[options.set] if options.first_seed is None else options.first_seed

@@ -1,7 +1,7 @@
 """Training data of the denoiser: randomly augmented crops of scikit-image's pictures, synthetic patterns, and noise.
 
-The test pictures of :mod:`benchmarks.denoising` are not among them; of ``retina`` and ``page`` the left halves are for
-testing, and the right halves for training.
+The test pictures of :mod:`benchmarks.denoising` are not among them; the left halves of ``retina`` and ``page`` are for
+testing, and their right halves for training.
 """
 
 import math
@@ -159,9 +159,7 @@ class Crops:
         uneven = torch.where(kind < 0.7, even, level * (0.3 + 1.4 * shades))
         deviation = torch.where(kind < 0.82, uneven, (gain * clean.clamp(min=0) + dark).sqrt())
         noisy = clean + deviation * torch.randn(clean.shape, generator=self.generator)
-        seen = F.avg_pool2d(
-            F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1
-        )  # brightness, as far as it can be estimated
+        seen = F.avg_pool2d(F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1)  # estimated brightness
         told = torch.where(kind < 0.82, uneven, (gain * seen.clamp(min=0) + dark).sqrt())
         low, high = (math.log(factor) for factor in MISSTATED)
         factor = (low + (high - low) * self._random(*each)).exp()

@@ -243,7 +243,7 @@ def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dic
 
 def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
     """Print results for misstated noise levels, for noise that depends on brightness, and for clean photographs."""
-    print("\nmean loss in dB with the noise told 0.8 and 1.2 times as strong")
+    print("\nmean loss in dB if the given noise level is 0.8 and 1.2 times the true one")
     for level in NOISE:
         losses = {}
         for factor in (0.8, 1.2):
@@ -254,14 +254,12 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
                 pairs.append(psnr(denoiser(case), image) - psnr(denoiser(wrong), image))
             losses[factor] = statistics.mean(pairs)
         print(f"  noise {level:2}: " + ", ".join(f"{factor:g} {loss:+.2f}" for factor, loss in losses.items()))
-    print("\nclean photographs: PSNR with the noise estimated, and told to be 1 and 2 levels")
+    print("\nclean photographs: PSNR with estimated noise, and with given noise of 1 and 2 grey levels")
     for name, image in clean.items():
         estimated = psnr(denoise(image), image)
         told = [psnr(denoiser(Case(name, image, image, level / 255)), image) for level in (1, 2)]
         print(f"  {name:20}{estimated:8.1f}" + "".join(f"{value:8.1f}" for value in told))
-    print(
-        "\nnoise whose variance grows with the light, by 0.002 and 0.01 of it: PSNR with the noise known, and estimated"
-    )
+    print("\nnoise whose variance grows by 0.002 and 0.01 of the brightness: PSNR with known and with estimated noise")
     for number, (name, image) in enumerate(clean.items()):
         line = f"  {name:20}"
         for gain in GAINS:
@@ -270,7 +268,7 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
             known = psnr(NonlocalDenoiser.trained()(noisy, deviation).detach(), image)
             line += f"{known:8.2f}{psnr(denoise(noisy), image):8.2f}"
         print(line)
-    print("\nestimated noise in grey levels, for 5, 15, 25 and 50")
+    print("\nestimated noise in grey levels, for true noise of 5, 15, 25 and 50")
     for number, (name, image) in enumerate(clean.items()):
         found = [255 * float(estimate_noise(with_noise(image, level / 255, number))) for level in NOISE]
         print(f"  {name:20}" + "".join(f"{value:8.2f}" for value in found))
@@ -278,16 +276,24 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description="Denoisers beside each other.")
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs; without it, scikit-image's")
-    parser.add_argument("--noise", type=float, nargs="+", default=NOISE, help="grey levels; default %(default)s")
+    parser = argparse.ArgumentParser(description="Comparison of denoisers.")
+    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
+    parser.add_argument(
+        "--noise", type=float, nargs="+", default=NOISE, help="noise levels in grey levels; default: %(default)s"
+    )
     parser.add_argument("--kinds", nargs="+", choices=("grey", "colour"), default=("grey", "colour"))
-    parser.add_argument("--weights", type=Path, action="append", default=[], help="further networks to judge")
-    parser.add_argument("--plain", type=Path, action="append", default=[], help="networks without the filter to judge")
+    parser.add_argument(
+        "--weights", type=Path, action="append", default=[], help="weights of further networks to compare"
+    )
+    parser.add_argument(
+        "--plain", type=Path, action="append", default=[], help="weights of networks without the filter"
+    )
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=tuple(METHODS), help="default: all")
-    parser.add_argument("--wrong", action="store_true", help="noise misstated and estimated, and clean photographs")
-    parser.add_argument("--quick", action="store_true", help="small parts of two photographs, to see that it runs")
-    parser.add_argument("--out", type=Path, help="a JSON file of all figures")
+    parser.add_argument(
+        "--wrong", action="store_true", help="also test misstated and estimated noise, and clean photographs"
+    )
+    parser.add_argument("--quick", action="store_true", help="small parts of two photographs, to check that it runs")
+    parser.add_argument("--out", type=Path, help="JSON file to which all measurements are added")
     options = parser.parse_args(arguments)
     methods = {name: METHODS[name] for name in options.methods}
     methods |= {path.parent.name: network(path) for path in options.weights}

@@ -54,7 +54,7 @@ def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tu
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables, and write them to files."""
-    parser = argparse.ArgumentParser(description="Tables of denoisers.")
+    parser = argparse.ArgumentParser(description="Tables from the comparison of denoisers.")
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.denoising")
     parser.add_argument("--docs", type=Path, help="file for the table of all methods")
     parser.add_argument("--readme", type=Path, help="file for the table of a few methods")

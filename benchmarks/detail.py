@@ -225,7 +225,7 @@ def compare(images: dict[str, Tensor]) -> None:
                 if ahead:
                     lost.append(f"{name}, gain {gain}: {figure} {own.costs[i]:.2f}: {', '.join(ahead)}")
     for gain in GAINS:
-        print(f"\nmean of the pictures on which it is reached, detail gain {gain}")
+        print(f"\nmean of the pictures on which the gain is reached, detail gain {gain}")
         print(row(["", "halo", "noise", "clipped", "reached"]))
         for method in METHODS:
             known = means.get((gain, method), [])
@@ -263,10 +263,10 @@ def compare_scales(name: str, image: Tensor, megapixels: float) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Print tables."""
     parser = argparse.ArgumentParser(description="Detail against other methods at equal gain.")
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs, in place of scikit-image's")
-    parser.add_argument("--side", type=int, default=SIDE, help="pixels of the short side they are reduced to")
+    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
+    parser.add_argument("--side", type=int, default=SIDE, help="short side in pixels to which they are reduced")
     parser.add_argument("--scales", action="store_true", help="the same presets on one photograph in three sizes")
-    parser.add_argument("--quick", action="store_true", help="two photographs at 64 pixels, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="two photographs at 64 pixels, to check that it runs")
     options = parser.parse_args(arguments)
     names = CHOSEN_ON[:2] if options.quick else CHOSEN_ON
     if options.scales:

@@ -92,7 +92,7 @@ def matching_amount(luminance: Tensor, gain: float) -> float:
 def main() -> None:
     """Write one picture for each photograph and print the measurements."""
     parser = argparse.ArgumentParser(description="Sharpening against an unsharp mask of equal detail gain.")
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where the pictures go")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="folder for the pictures")
     folder = parser.parse_args().folder
     folder.mkdir(exist_ok=True)
     table = Table(title="The preset crisp")

@@ -139,8 +139,8 @@ def _work_here(rank: int, options: argparse.Namespace, folder: str) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="What the ranks send when one image is spread over them.")
-    parser.add_argument("--ranks", type=int, default=3, help="processes on this machine; torchrun decides otherwise")
+    parser = argparse.ArgumentParser(description="Communication between ranks that share one image.")
+    parser.add_argument("--ranks", type=int, default=3, help="processes on this machine; ignored under torchrun")
     parser.add_argument("--widths", type=int, nargs="+", default=[128, 256], help="widths of the pictures")
     parser.add_argument("--landmarks", type=int, nargs="+", default=[50, 100], help="numbers of landmarks m")
     options = parser.parse_args(arguments)

@@ -67,11 +67,11 @@ def masks() -> Iterator[Claim]:
     below_collar = np.arange(512)[:, None] > 200
     suit = torch.from_numpy((hue > 0.01) & (hue < 0.08) & (saturation > 0.6) & (value > 0.35) & below_collar)
     ratio = float(mask[0, 0][suit].mean() / mask[0, 0][~suit].mean())
-    yield Claim("mask at t = 1: mean on the suit, over the mean elsewhere", 3.0, ratio, at_least=True)
+    yield Claim("mask at t = 1: mean on the suit / mean elsewhere", 3.0, ratio, at_least=True)
     levels = torch.linspace(0, 1, 21)
     quantiles = torch.stack([diffusion_mask(preview, small_spot, time=t).flatten().quantile(levels) for t in TIMES])
     yield Claim(
-        f"least growth of its quantiles from 5 to 95 %, t = {TIMES}",
+        f"smallest growth of its 5 to 95 % quantiles, t = {TIMES}",
         0.0,
         float(quantiles.diff(dim=0)[:, 1:-1].min()),
         at_least=True,
@@ -79,7 +79,7 @@ def masks() -> Iterator[Claim]:
     yield Claim("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
     yield Claim("largest value of the mask", 1.0, float(mask.max()))
     apart = F.avg_pool2d(mask, 2) - diffusion_mask(preview, small_spot)
-    yield Claim("mean difference of the masks at 256 and at 512 pixels", 0.05, float(apart.abs().mean()))
+    yield Claim("mean difference between masks at 256 and 512 pixels", 0.05, float(apart.abs().mean()))
 
 
 def recolouring() -> Iterator[Claim]:
@@ -94,7 +94,9 @@ def recolouring() -> Iterator[Claim]:
     kept = spots(image, scale, (200, 90, 50, 60))  # face
     edited = recolor(image, colours, painted, keep=kept)
     yield Claim(
-        "recolor: largest change of what is to be kept", 2.0, _levels(edited - image, kept.expand_as(image) > 0)
+        "recolor: largest change of the area to keep, grey levels",
+        2.0,
+        _levels(edited - image, kept.expand_as(image) > 0),
     )
 
 
@@ -106,9 +108,9 @@ def focusing() -> Iterator[Claim]:
     for aperture in ("disc", "gaussian"):
         blurred = defocus(image, region, radius=4.0, aperture=aperture)
         kept = _energy(blurred, face) / _energy(image, face)
-        yield Claim(f"defocus, {aperture}: gradient energy that the face keeps", 0.95, kept, at_least=True)
+        yield Claim(f"defocus, {aperture}: remaining gradient energy of the face", 0.95, kept, at_least=True)
         left = _energy(blurred, shuttle) / _energy(image, shuttle)
-        yield Claim(f"defocus, {aperture}: gradient energy left behind it", 0.3, left)
+        yield Claim(f"defocus, {aperture}: remaining gradient energy behind it", 0.3, left)
 
 
 def abstraction() -> Iterator[Claim]:
@@ -129,7 +131,7 @@ def pan() -> Iterator[Claim]:
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
     each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
     yield Claim(
-        "flicker of a pan of ten frames, over that of frames edited alone", 0.25, _flicker(together) / _flicker(each)
+        "flicker of a ten-frame pan / flicker of frames edited alone", 0.25, _flicker(together) / _flicker(each)
     )
 
 
@@ -152,8 +154,8 @@ TOPICS: tuple[Callable[[], Iterator[Claim]], ...] = (masks, recolouring, focusin
 
 def main(arguments: list[str] | None = None) -> None:
     """Print a line per claim; exit with status 1 if one does not hold."""
-    parser = argparse.ArgumentParser(description="What masks and edits have to keep, and how well they do.")
-    parser.add_argument("--out", type=Path, help="also write them as JSON")
+    parser = argparse.ArgumentParser(description="Claims about masks and edits, and whether they hold.")
+    parser.add_argument("--out", type=Path, help="also write the results to this JSON file")
     options = parser.parse_args(arguments)
     kept = []
     print(f"{'':66}{'limit':>12}{'measured':>12}")

@@ -113,8 +113,8 @@ EDITS: dict[str, Callable[[], dict[str, Tensor]]] = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Write a picture for every edit."""
-    parser = argparse.ArgumentParser(description="The README's pictures of edits.")
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="where the pictures go")
+    parser = argparse.ArgumentParser(description="Write the pictures of edits for the README.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="folder for the pictures")
     folder = parser.parse_args(arguments).folder
     folder.mkdir(exist_ok=True)
     for name, panels in EDITS.items():

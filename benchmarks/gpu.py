@@ -187,7 +187,7 @@ def training_step(device: str, batch: int = BATCH, crop: int = CROP) -> Callable
 
 def report(device: str, sizes: Iterable[float], rate_size: int, *, side: int = 96, crop: int = CROP) -> None:
     """Print all tables."""
-    print("| result | largest difference from float64 on the processor |\n|---|---|")
+    print("| result | largest difference from float64 on the CPU |\n|---|---|")
     for name, difference in differences(device, side).items():
         print(f"| {name} | {difference:.1e} |", flush=True)
     rates = measured_rates(device, rate_size)
@@ -205,7 +205,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="small sizes")
     options = parser.parse_args(arguments)
     if not torch.cuda.is_available():
-        print("a GPU that this torch can use must be there, got none; run it on a machine with CUDA", file=sys.stderr)
+        print(
+            "this benchmark needs a GPU that torch can use, found none; run it on a machine with CUDA", file=sys.stderr
+        )
         return 2
     print(torch.cuda.get_device_name(), torch.__version__)
     if options.quick:

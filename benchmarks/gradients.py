@@ -90,11 +90,11 @@ def verdict(holds: bool) -> str:
 
 def main() -> None:
     """Print the table and the claims."""
-    parser = argparse.ArgumentParser(description="Time and memory of a training step, beside plain autograd.")
+    parser = argparse.ArgumentParser(description="Time and memory of a training step, compared with plain autograd.")
     parser.add_argument("--side", type=int, default=512, help="height and width of the picture")
     parser.add_argument("--landmarks", type=int, default=100, help="number of landmarks m")
     parser.add_argument("--repeats", type=int, default=9, help="timed steps after the first")
-    parser.add_argument("--quick", action="store_true", help="a small picture, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a small picture, to check that it runs")
     parser.add_argument("--child", choices=tuple(METHODS), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.quick:

@@ -235,9 +235,9 @@ PICTURES = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Write the pictures as JPEG files, and print what to look at."""
-    parser = argparse.ArgumentParser(description="The pictures of the documentation.")
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs/pictures"), help="where the pictures go")
-    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(PICTURES)}, with commas between")
+    parser = argparse.ArgumentParser(description="Write the pictures of the documentation.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs/pictures"), help="folder for the pictures")
+    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(PICTURES)}, separated by commas")
     options = parser.parse_args(arguments)
     chosen = options.only.split(",") if options.only else list(PICTURES)
     unknown = [name for name in chosen if name not in PICTURES]

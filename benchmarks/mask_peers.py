@@ -19,7 +19,7 @@ from nlfilter_torch import diffusion_mask, nonlocal_operator, propagate_strokes
 from nlfilter_torch.edits.colour import colour_guide
 
 Mask = Callable[[Tensor, Tensor, Tensor], Tensor]
-COMPONENTS, FLOOR = 5, 4.0  # of a Gaussian mixture, and its smallest variance in squared Lab units
+COMPONENTS, FLOOR = 5, 4.0  # number of Gaussians in a mixture, and their smallest variance in squared Lab units
 
 
 def _array(image: Tensor) -> NDArray[np.float64]:
@@ -35,7 +35,7 @@ def _tensor(alpha: Any) -> Tensor:
 
 
 def closed_form(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """Closed-form matting with the scribbles as trimap."""
+    """Closed-form matting with the scribbles as the trimap."""
     front, back = _seeds(inside, outside)
     # Not estimate_alpha_cf: its preconditioner fails on trimaps with so few known pixels.
     known = np.where(front | back, 100.0, 0.0).ravel()
@@ -46,7 +46,7 @@ def closed_form(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
 
 
 def grabcut(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """GrabCut with eight iterations, initialised by the Gaussian mixture, which gives better results."""
+    """GrabCut with eight iterations, initialised by the Gaussian mixtures, which improves its results."""
     front, back = _seeds(inside, outside)
     guess = gaussian_mixture(image, inside, outside)[0, 0].numpy() > 0.5
     labels = np.where(guess, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -96,7 +96,7 @@ def walker(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
 
 
 def diffusion(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
-    """:func:`diffusion_mask` of colours, the paper's method."""
+    """The paper's method, :func:`diffusion_mask`, with colours as the guide."""
     operator = nonlocal_operator(image, photometric_bandwidth=25 / 255, guide_channels="all")
     return diffusion_mask(operator.spectrum(), inside, negative=outside)
 

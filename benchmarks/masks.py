@@ -1,9 +1,9 @@
 """Masks from scribbles against matting and segmentation: ``python -m benchmarks.masks [--pictures FOLDER] [--quick]``.
 
-Composites with known transparency (:mod:`benchmarks.composites`), with 1, 2 and 4 scribbles on each side, and one on
-the object alone. Mean squared error of the mask, and intersection over union of its upper half, for :func:`region_mask`
-and each of :mod:`benchmarks.mask_peers`; how often it is better than each; what it loses by most; its time.
-``--set choosing`` takes the photographs and seeds that its defaults were chosen on.
+Composites with known opacity (:mod:`benchmarks.composites`), with 1, 2 and 4 scribbles on each side, and on the object
+alone. Reports the mean squared error of the mask, and the intersection over union of its values above 0.5, for
+:func:`region_mask` and each method of :mod:`benchmarks.mask_peers`; how often :func:`region_mask` is better than each,
+its largest losses, and its time. ``--set choosing`` uses the photographs and seeds that its defaults were chosen on.
 """
 
 import statistics
@@ -24,34 +24,34 @@ from nlfilter_torch.edits.source import InMemory
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)
-WON = 0.6  # share of cases in which each peer is to be beaten
+WON = 0.6  # required share of cases in which each peer is beaten
 MEGAPIXEL = 1024
 METHODS = {OURS: region_mask, **PEERS}
 
 
 @dataclass(frozen=True)
 class Score:
-    """Of one mask: mean squared error, and intersection over union."""
+    """Mean squared error and intersection over union of one mask."""
 
     error: float
     overlap: float
 
 
 def score(found: Tensor, wanted: Tensor) -> Score:
-    """Of a mask (1, 1, H, W) against the true one."""
+    """Score a mask (1, 1, H, W) against the true one."""
     both, either = (found > 0.5) & (wanted > 0.5), (found > 0.5) | (wanted > 0.5)
     return Score(float((found - wanted).square().mean()), float(both.sum() / either.sum()))
 
 
 def measure(composite: Composite, count: int, seed: int) -> dict[str, Score]:
-    """Every method on one composite with so many scribbles on each side; the first key has none on the background."""
+    """Score every method with ``count`` scribbles on each side; the key "alone" has none on the background."""
     inside, outside = composite.scribbles(count, seed)
     found = {name: score(method(composite.image, inside, outside), composite.alpha) for name, method in METHODS.items()}
     return {"alone": score(region_mask(composite.image, inside), composite.alpha), **found}
 
 
 def report(cases: dict[str, dict[str, Score]]) -> bool:
-    """Print means, wins and the most lost comparisons; whether it is best in the mean and wins often enough."""
+    """Print means, wins and worst losses; return whether it is best in the mean and wins often enough."""
     print(f"{'':14}{'MSE':>8}{'IoU':>8}{'beaten in MSE':>16}{'in IoU':>9}")
     means, won = {}, []
     for name in ("alone", *METHODS):
@@ -75,7 +75,7 @@ def report(cases: dict[str, dict[str, Score]]) -> bool:
 
 
 def timed(call: Callable[[], Tensor]) -> float:
-    """Seconds, the median of three."""
+    """Median time of three calls, in seconds."""
     seconds = []
     for _ in range(3):
         start = time.perf_counter()
@@ -85,13 +85,13 @@ def timed(call: Callable[[], Tensor]) -> float:
 
 
 def speed(side: int) -> None:
-    """Print how long a first mask of a photograph takes, and a further scribble with the operator kept."""
+    """Print the time of a first mask of a photograph, and of a further scribble with the cached operator."""
     image = photograph("astronaut", side, side)
     inside, outside = torch.zeros(1, 1, side, side), torch.zeros(1, 1, side, side)
     inside[..., side // 2 : side // 2 + side // 20, side // 2 :][..., : side // 10] = 1
     outside[..., : side // 20, : side // 10] = 1
     source = InMemory(image.to(working_dtype(image)), {})
-    source.all(fit_mask(source, inside, outside))  # the operator is kept
+    source.all(fit_mask(source, inside, outside))  # caches the operator
 
     first = timed(lambda: region_mask(image, inside, outside))
     further = timed(lambda: source.all(fit_mask(source, inside, outside)))

@@ -72,7 +72,7 @@ def main() -> None:
     """Run all scripts of a folder, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("names", nargs="*", help="of scripts, without .py; all if none is given")
+    parser.add_argument("names", nargs="*", help="names of scripts, without .py; default: all")
     given = parser.parse_args()
     for script in sorted(given.folder.glob("*.py")):
         if given.names and script.stem not in given.names:
@@ -82,7 +82,7 @@ def main() -> None:
         target = script.with_suffix(".ipynb")
         nbformat.write(notebook, target)
         print(
-            f"{target}: {processor() - before:.0f} s of processor, {time.perf_counter() - started:.0f} s, "
+            f"{target}: {processor() - before:.0f} s of CPU time, {time.perf_counter() - started:.0f} s, "
             f"{target.stat().st_size / 1e3:.0f} kB",
             flush=True,
         )

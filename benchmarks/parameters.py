@@ -133,7 +133,7 @@ def written_out(node: ast.expr) -> bool:
 def main(arguments: list[str] | None = None) -> int:
     """Print the declarations, write the page, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("file", nargs="?", type=Path, help="the page to write")
+    parser.add_argument("file", nargs="?", type=Path, help="page to write")
     file = parser.parse_args(arguments).file
     worst = 0
     for edit in EDITS.values():

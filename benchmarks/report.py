@@ -238,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.report", description=__doc__)
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.speed")
-    parser.add_argument("--folder", type=Path, help="where the report goes (default: beside FILE)")
+    parser.add_argument("--folder", type=Path, help="path of the report (default: beside FILE)")
     parser.add_argument("--readme", type=Path, help="file whose table between the markers is replaced")
     options = parser.parse_args(arguments)
     results = json.loads(options.file.read_text())

@@ -146,7 +146,7 @@ def reach_gain(scene: Scene, strength: Strength) -> Tensor | None:
 def main(arguments: list[str] | None = None) -> None:
     """Print a table for each noise level, and a summary."""
     parser = argparse.ArgumentParser(description="Halo and noise of sharpening to one gain.")
-    parser.add_argument("--quick", action="store_true", help="two photographs at 64x64, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="two photographs at 64x64, to check that it runs")
     options = parser.parse_args(arguments)
     pictures, side = (PICTURES[:2], 64) if options.quick else (PICTURES, SIDE)
     print(f"gradient on strong edges times {GAIN}, {side}x{side}: halo in grey levels / noise gain")

@@ -167,10 +167,12 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
 
 def main() -> None:
     """Measure, print, and write JSON if requested."""
-    parser = argparse.ArgumentParser(description="Time, memory and exactness of pictures worked out by rows.")
-    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
+    parser = argparse.ArgumentParser(description="Time, memory and accuracy of tiled filtering.")
+    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel, to check that it runs")
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    parser.add_argument("--table", type=Path, metavar="JSON", help="print the tables of docs/scale.md from such a file")
+    parser.add_argument(
+        "--table", type=Path, metavar="JSON", help="print the tables of docs/scale.md from a file of --out"
+    )
     parser.add_argument("--work", nargs=4, metavar=("IN", "OUT", "STATISTICS", "LANDMARKS"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.table:
@@ -196,7 +198,7 @@ def main() -> None:
                 show(runs[-1])
     exact = exactness(200, [16, 64, 200]) if options.quick else exactness(2050, [64, 256, 1000, 4096])
     print(
-        f"{exact['megapixels']:.2f} MP against memory, from a sample of {exact['sample_pixels']:.0f} pixels: "
+        f"{exact['megapixels']:.2f} MP compared with memory, from a sample of {exact['sample_pixels']:.0f} pixels: "
         f"{exact['sample_max'] * 255:.2f} levels of 255 at most (RMS {exact['sample_rms'] * 255:.3f}), "
         f"from a quarter of them {exact['few_max'] * 255:.2f}; "
         f"from all pixels: {exact['full_max']:.1e} of white ({exact['usual_max']:.1e} with the usual tolerance); "
@@ -210,7 +212,7 @@ def main() -> None:
 
 def table(figures: dict[str, Any]) -> None:
     """Print the tables of docs/scale.md from the JSON of a run."""
-    print("| megapixels | m | statistics | processor, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|---|")
+    print("| megapixels | m | statistics | CPU, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|---|")
     for run in figures["runs"]:
         cpu, pixels = run["cpu_s"], run["megapixels"]
         kinds = f"{pixels:.1f} | {run['landmarks']} | {run['statistics']}"
@@ -234,7 +236,7 @@ def show(run: dict[str, object]) -> None:
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
     cpu, pixels = float(run["cpu_s"]), float(run["megapixels"])  # type: ignore[arg-type]
     print(
-        f"{pixels:7.2f} MP, m = {run['landmarks']}, {run['statistics']}: {cpu:.1f} s of processor, {cpu / pixels:.2f} "
+        f"{pixels:7.2f} MP, m = {run['landmarks']}, {run['statistics']}: {cpu:.1f} s of CPU time, {cpu / pixels:.2f} "
         f"s per MP, {run['peak_mib']:.0f} MiB over {run['start_mib']:.0f} at the start ({stages})",
         flush=True,
     )

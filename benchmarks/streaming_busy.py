@@ -46,23 +46,22 @@ def times(edit: Edit) -> tuple[float, float]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description="Tiles beside busy processes, against alone.")
-    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
+    parser = argparse.ArgumentParser(description="Time of tiled edits beside busy processes, compared with alone.")
+    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel, to check that it runs")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[6.0])
     parser.add_argument("--edits", nargs="+", choices=("detail", "recolor"), default=["detail", "recolor"])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument(
-        "--neighbours", type=int, default=os.cpu_count() or 1, help="busy processes (default: one a core)"
+        "--neighbours", type=int, default=os.cpu_count() or 1, help="busy processes (default: one per core)"
     )
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--memory", type=float, default=1.0, help="gigabytes that tiles may take")
+    parser.add_argument("--memory", type=float, default=1.0, help="memory limit of tiles in gigabytes")
     options = parser.parse_args()
     print(
-        f"{options.neighbours} neighbours on {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before", flush=True
+        f"{options.neighbours} busy processes on {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before",
+        flush=True,
     )
-    print(
-        "| edit | MP | threads | alone, s | processor, s | beside, s | processor, s | beside / alone | 1 thread / n |"
-    )
+    print("| edit | MP | threads | alone, s | CPU, s | beside, s | CPU, s | beside / alone | 1 thread / n |")
     print("|---|---|---|---|---|---|---|---|---|")
     for megapixels in [0.04] if options.quick else options.megapixels:
         side = round((megapixels * 1e6) ** 0.5)

@@ -59,13 +59,13 @@ def processor_time(edit: Edit) -> float:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description="CPU time of tiles, beside that of the same in memory.")
-    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
+    parser = argparse.ArgumentParser(description="CPU time of edits in tiles compared with edits in memory.")
+    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel, to check that it runs")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[1.4, 4.0, 12.0])
     parser.add_argument("--edits", nargs="+", choices=("detail", "recolor"), default=["detail", "recolor"])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--memory", type=float, default=1.0, help="gigabytes that tiles may take")
+    parser.add_argument("--memory", type=float, default=1.0, help="memory limit of tiles in gigabytes")
     options = parser.parse_args()
     print(f"| edit | megapixels | threads | in memory, s per MP | tiled with {options.memory:g} GB, s per MP | ratio |")
     print("|---|---|---|---|---|---|")

@@ -106,15 +106,15 @@ def exactness(side: int) -> list[str]:
 
 def main() -> None:
     """Measure, and print the results."""
-    parser = argparse.ArgumentParser(description="Time, memory and exactness of stroke edits worked out by rows.")
-    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel: that it runs")
+    parser = argparse.ArgumentParser(description="Time, memory and accuracy of tiled stroke edits.")
+    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel, to check that it runs")
     parser.add_argument("--work", nargs=3, metavar=("VERB", "IN", "OUT"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work:
         verb, source, target = options.work
         print(json.dumps(work(verb, Path(source), Path(target), 800 * MIB)))
         return
-    print("| edit | megapixels | processor, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|")
+    print("| edit | megapixels | CPU, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as name:
         source, target = Path(name) / "in.tif", Path(name) / "out.tif"
         for side in (200,) if options.quick else (2048, 5000):

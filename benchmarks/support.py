@@ -40,7 +40,7 @@ def table() -> str:
 def main() -> None:
     """Print the table, or replace the table in a page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, nargs="?", help="the page of Markdown that has the table")
+    parser.add_argument("page", type=Path, nargs="?", help="Markdown page that contains the table")
     page = parser.parse_args().page
     if page is None:
         print(table(), end="")

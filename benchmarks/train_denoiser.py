@@ -2,16 +2,16 @@
 
 Trains :class:`nlfilter_torch.NonlocalDenoiser` on crops of scikit-image's pictures (:mod:`benchmarks.denoiser_crops`),
 half of them grey, half in colour, with noise of 0 to 60 grey levels. The loss is the mean, over crops, of the root mean
-squared error; the weights that are saved are running means of those that were trained. The folder gets
+squared error; the saved weights are running means of the trained ones. The folder contains
 
-denoiser.safetensors   the weights, with the figures of the training as metadata;
+denoiser.safetensors   the weights, with the results of the training as metadata;
 denoiser.json          arguments, times and losses;
-curve.png              the loss on crops that are set aside;
-state.pt               everything that a training needs to go on: the same command takes it up where it was stopped, and
-                       one of more steps continues it.
+curve.png              the loss on validation crops;
+state.pt               the state of the training: the same command resumes a stopped training, and a larger number of
+                       steps continues a finished one.
 
 ``--plain`` trains the same network with a further convolution in place of the filter, for comparison. Equal arguments
-train equal weights on one machine with one number of threads.
+give equal weights on the same machine with the same number of threads.
 """
 
 import argparse
@@ -36,19 +36,19 @@ from nlfilter_torch.plotting import save_figure
 BATCH = 6  # crops in a step
 SIDE = 64  # pixels of a crop
 RATE = 4e-3  # of Muon, for the kernels of the convolutions
-ADAM_RATE = 2e-3  # of Adam, for all else
-BANDWIDTH_RATE = 5.0  # times that for bandwidths, which are single numbers and learn as logarithms
-EXPECTED = 0.55  # power of the noise that the error of a denoiser grows with
-WARM_UP = 200  # steps over which the rate rises
-FALL = 0.4  # last share of the steps, over which it falls to nothing along half a cosine
-LARGEST_GRADIENT = 0.5  # its norm
-MEAN_OVER = 500  # steps that the running mean of the weights remembers
-EVERY = 500  # steps from one line, one point of the curve and one saved state to the next
-ASIDE, ASIDE_SEED = 24, 1_000_000  # crops of either kind that are set aside
+ADAM_RATE = 2e-3  # of Adam, for all other weights
+BANDWIDTH_RATE = 5.0  # factor on ADAM_RATE for bandwidths, which are scalars learned as logarithms
+EXPECTED = 0.55  # exponent with which the error of a denoiser grows with the noise
+WARM_UP = 200  # steps over which the learning rate rises
+FALL = 0.4  # final share of the steps, over which the rate falls to zero along half a cosine
+LARGEST_GRADIENT = 0.5  # norm to which gradients are clipped
+MEAN_OVER = 500  # time constant of the running mean of the weights, in steps
+EVERY = 500  # steps between printed lines, points of the curve and saved states
+ASIDE, ASIDE_SEED = 24, 1_000_000  # validation crops of each kind, and their seed
 
 
 class PlainDenoiser(NonlocalDenoiser):
-    """The denoiser without the filter: a convolution in place of guide and sliders, of more weights than these."""
+    """The denoiser without the filter: a convolution, with more weights, in place of guide and sliders."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class PlainDenoiser(NonlocalDenoiser):
         self.register_buffer("log_bandwidths", torch.zeros(2), persistent=False)
 
     def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
-        """What the convolutions take for the picture."""
+        """Estimate the smoothed planes by convolutions."""
         found: Tensor = self.picture(F.leaky_relu(self.guide(F.leaky_relu(features, 0.1)), 0.1))
         return planes + found.to(planes)
 
@@ -69,12 +69,12 @@ def errors(image: Tensor, clean: Tensor) -> Tensor:
 
 
 def loss_of(denoised: Tensor, clean: Tensor, noisy: Tensor) -> Tensor:
-    """Mean error of crops, over what is to be expected of their noise, so that weak noise counts as much as strong."""
+    """Mean error of crops relative to the error expected for their noise, so that weak noise counts equally."""
     return (errors(denoised, clean) / (1 + errors(noisy, clean)) ** EXPECTED).mean()
 
 
 def rate_at(step: int, steps: int) -> float:
-    """Share of the rate at a step."""
+    """Learning rate at a step, relative to the full rate."""
     if step < WARM_UP:
         return (step + 1) / WARM_UP
     passed = max(0.0, (step / steps - (1 - FALL)) / FALL)
@@ -82,19 +82,19 @@ def rate_at(step: int, steps: int) -> float:
 
 
 def _as_matrix(kernel: Tensor) -> Tensor:
-    """A kernel, in memory by outputs, then pixels, then inputs, as a matrix of outputs, in the same memory."""
+    """View a channels-last kernel as a matrix with one row per output."""
     return kernel.detach().permute(0, 2, 3, 1).view(len(kernel), -1)
 
 
 def new_denoiser(*, plain: bool, seed: int) -> NonlocalDenoiser:
-    """A denoiser with weights drawn from a seed."""
+    """Create a denoiser with weights drawn from a seed."""
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.manual_seed(seed)
         return PlainDenoiser() if plain else NonlocalDenoiser()
 
 
 class Training:
-    """A training that can be stopped and taken up.
+    """A training that can be stopped and resumed.
 
     Args:
         seed: of weights, crops and noise.
@@ -134,13 +134,13 @@ class Training:
         self.seconds = 0.0
 
     def denoise(self, model: nn.Module, noisy: Tensor, told: Tensor) -> Tensor:
-        """Crops denoised as a training does it."""
+        """Denoise crops as in training."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            found: Tensor = model.noise_in(noisy, told)  # type: ignore[operator]
+            found: Tensor = model.estimate_noise(noisy, told)  # type: ignore[operator]
         return noisy - found
 
     def step(self, steps: int) -> None:
-        """One step of so many."""
+        """Train one step, out of ``steps`` in all."""
         number = len(self.losses)
         groups = [group for optimizer in self.optimizers for group in optimizer.param_groups]
         for group, rate in zip(groups, self.rates, strict=True):
@@ -159,12 +159,12 @@ class Training:
 
     @torch.no_grad()
     def judge(self) -> float:
-        """The loss of the mean weights on the crops set aside."""
+        """Mean error of the running-mean weights on the validation crops, in grey levels."""
         found = [errors(self.denoise(self.mean.module, noisy, told), clean) for clean, noisy, told in self.aside]
         return float(torch.stack(found).mean())
 
     def run(self, steps: int, folder: Path | None = None) -> None:
-        """Train up to so many steps in all; with a folder, save the state now and then."""
+        """Train up to ``steps`` steps in all; with a folder, save the state every :data:`EVERY` steps."""
         start, before = time.perf_counter(), self.seconds
         while len(self.losses) < steps:
             self.step(steps)
@@ -195,7 +195,7 @@ class Training:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Take up a training."""
+        """Resume a training from its saved state."""
         self.model.load_state_dict(state["model"])
         self.mean.load_state_dict(state["mean"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
@@ -205,7 +205,7 @@ class Training:
 
 
 def save(folder: Path, training: Training, figures: dict[str, Any]) -> None:
-    """Write weights, figures and the curve; each file appears complete or not at all."""
+    """Write weights, results and the curve, each file atomically."""
     from safetensors.torch import save as as_bytes
 
     weights = {name: value.contiguous() for name, value in training.mean.module.state_dict().items()}
@@ -217,7 +217,7 @@ def save(folder: Path, training: Training, figures: dict[str, Any]) -> None:
 
 
 def curve(losses: Sequence[float]) -> Figure:
-    """The loss on crops set aside against the steps."""
+    """Plot the error on validation crops against the steps."""
     figure = Figure(figsize=(6, 3.5), layout="constrained")
     axes = figure.add_subplot()
     axes.plot([EVERY * (i + 1) / 1000 for i in range(len(losses))], losses)
@@ -227,7 +227,7 @@ def curve(losses: Sequence[float]) -> Figure:
 
 
 def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The arguments, checked before anything is trained."""
+    """Read and check the arguments."""
     parser = argparse.ArgumentParser(description="Train the denoiser.")
     parser.add_argument("--steps", type=int, default=11500, help=f"of {BATCH} crops each; default %(default)s")
     parser.add_argument("--side", type=int, default=SIDE, help="of crops, in pixels; default %(default)s")
@@ -253,7 +253,7 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, and save what was trained."""
+    """Train, and save the results."""
     options = read_options(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     training = Training(options.seed, plain=options.plain, side=options.side, half=options.half, rate=options.rate)

@@ -14,8 +14,8 @@
 # %% [markdown]
 # # A first filter
 #
-# From a photograph to its filter, its layers and its sliders, in five steps. All of it took 7 to 10
-# seconds of processor time, with the start of Python, on a machine of two cores.
+# From a photograph to its filter, its layers and its sliders, in five steps. The notebook took 7 to 10 seconds of
+# processor time on a machine with two cores, including the start of Python.
 
 # %%
 # %matplotlib inline
@@ -33,7 +33,7 @@ from nlfilter_torch.plotting import plot_response, show_eigenvectors, show_image
 # %% [markdown]
 # ## 1. A photograph
 #
-# Images are tensors `(batch, channels, height, width)` with values from 0 to 1. This one is made smaller, to be quick.
+# Images are tensors `(batch, channels, height, width)` with values from 0 to 1. This one is reduced in size to save time.
 
 # %%
 pixels = resize(skimage.data.coffee(), (160, 240), anti_aliasing=True)
@@ -46,8 +46,8 @@ show_images({"The photograph": image, "Its luminance": luminance}, side=280)
 #
 # The operator W links each of the 38,400 pixels to all others, by the similarity of the 5x5 patches around them. A hundred
 # typical patches, the landmarks, represent all of them, so the matrix of more than a thousand million entries is never formed.
-# The diagnostics measure this approximation: look at `row_sum_residual` (W averages, so its rows sum to 1), and at beta, the
-# share of the picture that the filter's eigenvectors capture.
+# The diagnostics measure the quality of this approximation: `row_sum_residual` (W averages, so its rows should sum to 1), and
+# beta, the share of the picture that the filter's eigenvectors capture.
 
 # %%
 operator = nonlocal_operator(luminance)
@@ -59,7 +59,7 @@ operator.diagnostics()
 # ## 3. Its eigenvectors
 #
 # The eigenvectors are patterns of the picture itself. The first ones separate large areas of light and dark; later ones pick
-# out edges and texture. Note that each of them joins places far apart, wherever the picture is alike.
+# out edges and texture. Each of them connects similar places, even if these are far apart.
 
 # %%
 show_eigenvectors(spectrum, numbers=(2, 3, 4, 8, 20, 40), side=280)
@@ -68,7 +68,7 @@ show_eigenvectors(spectrum, numbers=(2, 3, 4, 8, 20, 40), side=280)
 # ## 4. Layers and sliders
 #
 # `I - W` is the finest detail, `W (I - W)` the next, and so on; what remains is smooth. The layers sum to the picture, so
-# weighing them edits it. Look at the grain of the wood: the first layer has nearly all of it, the smooth rest none.
+# weighting them edits it. Look at the grain of the wood: the first layer has nearly all of it, the smooth rest none.
 
 # %%
 layers = detail_layers(operator, luminance)
@@ -84,9 +84,9 @@ show_images({"alpha = (3, 3, 4, 1.05)": crisp, "before": image, "alpha = (0, 0.3
 # %% [markdown]
 # ## 5. Move the sliders
 #
-# Given the layers, an edit is their weighted sum, fast enough for interactive sliders. The curve below the
-# picture is the gain of each eigenvalue: the four numbers are a polynomial. Fine detail is on its left, the smooth shading
-# on its right; the dots are the eigenvalues of this photograph. (The sliders move when the notebook runs, not on a page.)
+# Given the layers, an edit is their weighted sum, fast enough for interactive sliders. The curve below the picture is the
+# gain of each eigenvalue, a polynomial given by the four sliders. Fine detail is at its left end, smooth shading at its
+# right end; the dots are the eigenvalues of this photograph. (The sliders work only while the notebook is running.)
 
 
 # %%
@@ -107,4 +107,4 @@ sliders = interact(
 )
 
 # %% [markdown]
-# Next: [regions and strokes](02_masks_and_strokes.ipynb), [sliders that are found, not moved](03_learning_sliders.ipynb).
+# Next: [regions and strokes](02_masks_and_strokes.ipynb), [fitting sliders to an edit](03_learning_sliders.ipynb).

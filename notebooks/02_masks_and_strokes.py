@@ -32,7 +32,7 @@ image = torch.from_numpy(pixels).float().permute(2, 0, 1)[None]
 
 
 def spot(top: int, left: int, height: int = 8, width: int = 8) -> torch.Tensor:
-    """A rectangle, (1, 1, H, W)."""
+    """A rectangular mask (1, 1, H, W)."""
     region = torch.zeros(1, 1, *image.shape[2:])
     region[..., top : top + height, left : left + width] = 1
     return region
@@ -64,7 +64,7 @@ show_images(masks, side=220)
 # %% [markdown]
 # ## 3. Sliders for each region
 #
-# Two regions, two rows of sliders: the suit gets crisp, the background smooth. The face belongs to neither and is unchanged.
+# Two regions, two rows of sliders: the suit becomes crisp, the background smooth. The face belongs to neither and is unchanged.
 
 # %%
 regions = torch.cat([spot(117, 24), spot(12, 100)], dim=1)

@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Fitting sliders
 #
-# A photograph was edited in another program. Which sliders have the same effect? They are found by least squares, or by gradient
-# descent where that is not enough, and saved for other photographs.
+# A photograph was edited in another program. Which sliders have the same effect? Least squares finds them, or gradient
+# descent where least squares is not enough, and they are saved for other photographs.
 
 # %%
 # %matplotlib inline
@@ -43,7 +43,7 @@ luminance = rgb_to_grayscale(image)
 # %% [markdown]
 # ## 1. An edit from elsewhere
 #
-# An unsharp mask of scikit-image, radius 2, unrelated to this filter.
+# An unsharp mask of scikit-image with radius 2, which is unrelated to this filter.
 
 # %%
 sharpened = unsharp_mask(luminance[0, 0].numpy(), radius=2.0, amount=1.5)
@@ -55,7 +55,8 @@ show_images({"before": image, "the edit": edited}, side=380)
 # ## 2. Its sliders, in one step
 #
 # The filter is linear in its sliders, so the best ones solve a small least-squares problem. The fit is not exact: an unsharp
-# mask depends on nearby pixels, this filter on similar ones. The number is the share of the change that the sliders reproduce.
+# mask depends on nearby pixels, this filter on similar ones. The printed percentage is the share of the change that the
+# sliders reproduce.
 
 # %%
 operator = nonlocal_operator(luminance)
@@ -72,8 +73,8 @@ plot_response(alpha, operator.spectrum())
 # %% [markdown]
 # ## 3. Saved, and used on another photograph
 #
-# A preset holds the sliders and the filter they belong to. Written to a file it is what
-# `nlfilter-torch detail photo.jpg out.jpg --preset look.json` reads.
+# A preset contains the sliders and the parameters of their filter. Written to a file, it is applied by
+# `nlfilter-torch detail photo.jpg out.jpg --preset look.json`.
 
 # %%
 look = Preset(tuple(round(a, 3) for a in alpha.tolist()))
@@ -81,7 +82,7 @@ print(look.to_json())
 show_images({"another photograph": other, "with the same look": look.apply(other)}, side=380)
 
 # %% [markdown]
-# Some looks have names. Each of these is one line of code, or `--preset NAME`.
+# Named presets take one line of code, or `--preset NAME` on the command line.
 
 # %%
 names = ("crisp", "dramatic", "glow", "soft skin", "calm", "smooth")
@@ -91,7 +92,7 @@ show_images({name: PRESETS[name].apply(other) for name in names}, columns=3, sid
 # ## 4. The filter itself, by gradient descent
 #
 # Least squares finds sliders, but not the bandwidth, the difference up to which two patches count as similar. The fit is
-# differentiable, so the bandwidth follows the gradient of the residual that the best sliders leave.
+# differentiable, so the bandwidth can follow the gradient of the error that the best sliders leave.
 
 # %%
 logarithm = estimate_bandwidth(luminance).log().requires_grad_()
@@ -110,4 +111,5 @@ for step in range(12):
 show_images({"the edit": edited, "learned": edit_luminance(image, lambda _: learned.detach())}, side=380)
 
 # %% [markdown]
-# Sliders, bandwidths and a network that makes the guide learn together in [the next notebook](04_inside_a_network.ipynb).
+# In [the next notebook](04_inside_a_network.ipynb), sliders, bandwidths and a network that computes the guide are trained
+# together.

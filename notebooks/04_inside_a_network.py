@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Inside a network
 #
-# The filter is a layer like any other. Here a small convolution computes the guide from a noisy image, the filter links pixels
-# that are similar in the guide, and everything is trained together: the convolution, the sliders, the bandwidths.
+# The filter is a layer like any other. Here two small convolutions compute the guide from a noisy image, the filter averages
+# pixels that are similar in the guide, and everything is trained together: convolutions, sliders and bandwidths.
 
 # %%
 # %matplotlib inline
@@ -33,7 +33,7 @@ NOISE = 25 / 255
 # %% [markdown]
 # ## 1. The network
 #
-# A convolution and the filter. `learn=` names the parameters of the filter to train; bandwidths stay positive.
+# Two convolutions and the filter. `learn=` names the parameters of the filter to train; bandwidths stay positive.
 
 
 # %%
@@ -44,7 +44,7 @@ class Denoiser(nn.Module):
         self.filter = NonlocalFilter(
             alpha=(0.2, 0.8, 1.0),
             learn=("alpha", "photometric_bandwidth", "spatial_bandwidth"),
-            patch_size=1,  # the convolutions cover the surroundings
+            patch_size=1,  # the convolutions cover neighbouring pixels
             photometric_bandwidth=0.2,
             spatial_bandwidth=10.0,
             num_landmarks=32,
@@ -123,8 +123,8 @@ figure
 # ## 4. On a picture that was not used in training
 #
 # Look at the whiskers and at the skin between the eyes: noise disappears where the guide makes many pixels similar. This is the
-# result of a few seconds of training with few landmarks; more of them at test time help. `denoise` has one
-# that was trained for longer, `NonlocalDenoiser`; `python -m benchmarks.train_denoiser` trains it.
+# result of a few seconds of training with few landmarks; more landmarks at test time help. `denoise` uses a network that was
+# trained for longer, `NonlocalDenoiser`; `python -m benchmarks.train_denoiser` trains it.
 
 # %%
 network.filter.affinity.num_landmarks = 300

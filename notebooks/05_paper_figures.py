@@ -14,9 +14,9 @@
 # %% [markdown]
 # # The paper's figures
 #
-# Counterparts of the figures of *Nonlocal Image Editing* on photographs that ship with scikit-image, small here, so that they
-# take seconds. `python -m benchmarks.figures` draws all of them in full size and keeps their numbers; this notebook needs a
-# checkout of the repository.
+# Counterparts of some figures of *Nonlocal Image Editing* on photographs that ship with scikit-image, small here, so that
+# they take seconds. `python -m benchmarks.figures` draws all of them in full size and saves their numbers. This notebook needs
+# a checkout of the repository.
 
 # %%
 # %matplotlib inline

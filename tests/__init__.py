@@ -1,1 +1,1 @@
-"""Tests of nlfilter_torch; a package, so that tests and benchmarks share one reference and one set of pictures."""
+"""Tests of nlfilter_torch. A package, so that tests and benchmarks share one reference and one set of images."""

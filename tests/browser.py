@@ -1,4 +1,4 @@
-"""A headless Chromium and an editor of its own for tests."""
+"""A headless Chromium and a separate editor process, for tests of the editor in a browser."""
 
 import os
 import re
@@ -19,9 +19,9 @@ TIMEOUT = 15_000  # milliseconds; a machine may be busy
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A browser that is closed in the end."""
+    """A browser that is closed at the end."""
     with sync_playwright() as playwright:
-        # As root, as in most containers, Chromium has no sandbox; it opens nothing but this machine's own pages here.
+        # Chromium has no sandbox when run as root, as in most containers; only pages of this machine are opened here.
         options = ["--no-sandbox"] if os.geteuid() == 0 else []
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
         yield browser
@@ -29,11 +29,11 @@ def chromium() -> Iterator[Browser]:
 
 
 class Editor:
-    """``nlfilter-torch app`` as a process of its own."""
+    """``nlfilter-torch app`` in a separate process."""
 
     def __init__(self, folder: Path, *arguments: str, threads: int = 1) -> None:
         command = [sys.executable, "-m", "nlfilter_torch", "app", "--no-open", *arguments]
-        # NiceGUI would take the process for a test of its own if pytest's variables reached it.
+        # With pytest's environment variables, NiceGUI would treat the process as a test of NiceGUI.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
         self.state = folder.parent / f"{folder.name}-state"
         environment = inherited | {"OMP_NUM_THREADS": str(threads), "XDG_STATE_HOME": str(self.state)}
@@ -51,7 +51,7 @@ class Editor:
         self.url = found[0]
 
     def stop(self) -> None:
-        """End the process as Ctrl+C does."""
+        """Interrupt the process, as Ctrl+C does."""
         self.process.terminate()
         self.process.wait(30)
         assert self.process.stdout is not None
@@ -59,7 +59,7 @@ class Editor:
 
 
 class Tab:
-    """A page of the editor, and what a person does there."""
+    """A page of the editor, and the actions of its user."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -69,15 +69,15 @@ class Tab:
         self.mask = page.get_by_alt_text("mask")
 
     def slider(self, name: str) -> Locator:
-        """The slider of that label."""
+        """Return the slider with a label."""
         return self.page.get_by_role("slider", name=name, exact=True)
 
     def source(self) -> str:
-        """Address of the picture that is shown; a new one for each."""
+        """Address of the picture shown, which differs from picture to picture."""
         return self.photo.get_attribute("src") or ""
 
     def wait_for_picture(self, other_than: str = "") -> None:
-        """Wait until a picture is there that has another address, and nothing is at work."""
+        """Wait until a picture with another address is shown and the editor is idle."""
         self.page.wait_for_function(
             """old => { const image = document.querySelector('.photo > img');
             return image && image.getAttribute('src') && image.getAttribute('src') != old && image.complete
@@ -99,20 +99,20 @@ class Tab:
         chooser.value.set_files(path)
 
     def drag(self, slider: Locator, start: float, end: float, *, steps: int = 4, release: bool = True) -> None:
-        """Drag a slider from one share of its length to another."""
+        """Drag a slider from one fraction of its length to another."""
         box = slider.bounding_box()
         assert box is not None
         y = box["y"] + box["height"] / 2
         self.page.mouse.move(box["x"] + start * box["width"], y)
         self.page.mouse.down()
         self.page.mouse.move(box["x"] + end * box["width"], y, steps=steps)
-        # A busy page takes moves frame by frame: one that comes with the release would be lost.
+        # A busy page handles moves frame by frame: a move that arrives together with the release would be lost.
         self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         if release:
             self.page.mouse.up()
 
     def paint(self, *points: tuple[float, float], release: bool = True) -> None:
-        """Draw a line through points given as shares of the picture."""
+        """Draw a line through points given as fractions of the picture's size."""
         box = self.photo.bounding_box()
         assert box is not None
         at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
@@ -124,7 +124,7 @@ class Tab:
             self.page.mouse.up()
 
     def save(self, button: str, name: str) -> None:
-        """Save under a name, and wait until that is done."""
+        """Save under a name, and wait until saving is done."""
         self.page.get_by_role("button", name=button, exact=True).click()
         self.page.get_by_label("Name").fill(name)
         self.page.get_by_role("button", name="Save", exact=True).click()

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 if TYPE_CHECKING:
     from nlfilter_torch.app.session import Session
 
-# Fixed examples: a test that passed does not fail tomorrow. No deadline: shared machines are slow at times.
+# Fixed examples, so that results are reproducible; no deadline, as shared machines are slow at times.
 settings.register_profile(
     "fixed",
     derandomize=True,
@@ -24,14 +24,14 @@ settings.load_profile("fixed")
 
 @pytest.fixture
 def generator() -> torch.Generator:
-    """A source of randomness that is not the global one."""
+    """A random generator other than the global one."""
     return torch.Generator().manual_seed(0)
 
 
 @pytest.fixture
 def session(tmp_path: Path) -> "Session":
-    """The editor's, with a small photograph open: cat.png, in the folder that it saves in."""
-    # Not above: tests of the filter run where nothing that reads files is installed.
+    """A session of the editor with a small photograph open: cat.png, in the folder that the session saves to."""
+    # Imported here, so that tests of the filter run without the packages that read files.
     from nlfilter_torch.app.session import Session
     from nlfilter_torch.io.photographs import Photograph, write_photograph
     from tests.problems import cat

@@ -1,4 +1,4 @@
-"""Small test pictures: photographs that ship with scikit-image, and images made to break a filter."""
+"""Small test images: photographs that ship with scikit-image, and images that are hard for a filter."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ PHOTOGRAPHS = ("astronaut", "camera", "chelsea", "coffee", "moon", "rocket")
 
 @cache
 def photograph(name: str, height: int | None = None, width: int | None = None) -> Array:
-    """A picture of skimage.data in grey, (H, W) in [0, 1], reduced with an anti-aliasing filter if a size is given."""
+    """Return a grey picture of skimage.data, (H, W) in [0, 1], reduced with anti-aliasing if a size is given."""
     picture = getattr(skimage.data, name)()
     grey = rgb2gray(picture) if picture.ndim == 3 else picture / 255.0
     if height is not None and width is not None:
@@ -40,14 +40,14 @@ def two_colours(height: int = 40, width: int = 48) -> Array:
 
 
 def bright_pixel(height: int = 40, width: int = 48) -> Array:
-    """Black but for one white pixel."""
+    """Black except for one white pixel."""
     image = np.zeros((height, width))
     image[height // 2, width // 2] = 1.0
     return image
 
 
 def hard_images() -> dict[str, Array]:
-    """Images that make a kernel matrix singular, a row vanish or a border collapse."""
+    """Images that make a kernel matrix singular, a row of it vanish, or a border impossible to reflect."""
     noise = np.random.default_rng(0)
     rows, columns = np.mgrid[:40, :48]
     return {

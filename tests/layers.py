@@ -1,4 +1,4 @@
-"""Layers of which something learns, what they look at, and what a loss tells their parameters."""
+"""Layers with learned parameters, their inputs, and the gradients of a loss in their parameters."""
 
 import copy
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ def everything(**options: object) -> NonlocalFilter:
 
 
 def backward(layer: nn.Module, *arguments: Tensor) -> dict[str, Tensor]:
-    """The gradients of a loss in the layer's parameters, by name."""
+    """Return the gradients of a loss in the layer's parameters, by name."""
     layer.zero_grad()
     layer(*arguments).square().mean().backward()
     return {name: p.grad.clone() for name, p in layer.named_parameters() if p.grad is not None}
@@ -32,7 +32,7 @@ def backward(layer: nn.Module, *arguments: Tensor) -> dict[str, Tensor]:
 
 @contextmanager
 def untouched(layer: nn.Module) -> Iterator[None]:
-    """Parameters and gradients are afterwards what they were before."""
+    """Check that the parameters of a layer do not change and receive no gradients."""
     before = copy.deepcopy(layer.state_dict())
     yield
     for name, value in layer.state_dict().items():

@@ -1,4 +1,4 @@
-"""The README and the pages of docs/, taken apart into their blocks of code, commands and links."""
+"""The README and the pages of docs/, parsed into their code blocks, commands and links."""
 
 import re
 import shlex
@@ -19,20 +19,20 @@ class Page:
         return self.path.read_text(encoding="utf-8")
 
     def blocks(self) -> list[tuple[str, str]]:
-        """Language and content of each block of code."""
+        """Language and content of each code block."""
         return re.findall(r"^```(\S+)\n(.*?)^```", self.text, flags=re.MULTILINE | re.DOTALL)
 
     def commands(self, program: str) -> list[list[str]]:
-        """Arguments of each command of that name in blocks of shell."""
+        """Arguments of each command of a program in the shell blocks."""
         lines = [shlex.split(line) for kind, block in self.blocks() if kind == "sh" for line in block.splitlines()]
         return [words[1:] for words in lines if words[0] == program]
 
     def targets(self) -> list[str]:
-        """Where links and pictures lead, without anchors."""
+        """Targets of links and pictures, without anchors."""
         return re.findall(r"\]\(([^)#]+)[^)]*\)", self.text)
 
     def run_python(self) -> dict[str, object]:
-        """Run the blocks of Python in order; the names that they leave."""
+        """Run the Python blocks in order, and return the names that they define."""
         names: dict[str, object] = {}
         for kind, block in self.blocks():
             if kind == "python":

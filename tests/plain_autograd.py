@@ -1,7 +1,7 @@
-"""The same filter as plain tensor operations, differentiated by autograd through every step of the balancing.
+"""The filter as plain tensor operations, differentiated by autograd through every step of the balancing.
 
-The way that one would write it without this package: nothing blocked, nothing recomputed, no derivative by hand. Tests
-compare gradients with it, and ``benchmarks/gradients.py`` time and memory.
+It has no blocks of pixels, no recomputation and no derivatives by hand. Tests compare gradients with it, and
+``benchmarks/gradients.py`` time and memory.
 """
 
 from itertools import pairwise
@@ -47,7 +47,7 @@ def plain_filter(
     patch_weights: Tensor | None = None,
     steps: int = 14,
 ) -> Tensor:
-    """What ``polynomial_filter`` returns for ``nonlocal_operator`` with these options, (B, C, H, W).
+    """Return what ``polynomial_filter`` returns for ``nonlocal_operator`` with these options, (B, C, H, W).
 
     Args:
         guide: (B, C', H, W), taken whole.
@@ -55,7 +55,7 @@ def plain_filter(
         alpha: (k+1,) or (B, k+1).
         patch_size, photometric_bandwidth, spatial_bandwidth, num_landmarks, completion, patch_weights: of
             ``nonlocal_operator``.
-        steps: of the balancing, each of which gains a factor of three; 14 reach float32.
+        steps: of the balancing, each of which reduces the error by a factor of three; 14 reach float32.
     """
     weights = patch_window(patch_size).to(guide) if patch_weights is None else patch_weights / patch_weights.sum()
     features = extract_features(

@@ -1,4 +1,4 @@
-"""What the tests share: seeded noise, photographs, strokes on them, operators, and any guide at all for hypothesis."""
+"""Inputs shared by tests: seeded noise, photographs, strokes on them, operators, and random guides for hypothesis."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from tests.images import photograph
 SAMPLINGS = ("kmeans", "uniform", "random")
 LUMINANCE = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
 
-# Where the astronaut, reduced to 64x64, shows one thing only.
+# Rectangles of the astronaut, reduced to 64x64, that show a single object.
 SUIT = (slice(None), slice(None), slice(36, 50), slice(8, 15))
 BACKGROUND = (slice(None), slice(None), slice(2, 18), slice(40, 46))
 
@@ -60,17 +60,17 @@ def luminance(image: torch.Tensor) -> torch.Tensor:
 
 
 def difference(a: torch.Tensor, b: torch.Tensor) -> float:
-    """Largest difference in grey levels of 255, within what a screen can show."""
+    """Return the largest difference in grey levels of 255, after clipping to [0, 1]."""
     return float((a.clamp(0, 1) - b.clamp(0, 1)).abs().max()) * 255
 
 
 @st.composite
 def guides(draw: st.DrawFn, max_side: int = 12) -> torch.Tensor:
-    """Random guides of every shape, as small as one pixel, of any contrast."""
+    """Random guides of any shape from one pixel upwards, and of any contrast."""
     batch, channels = draw(st.integers(1, 3)), draw(st.integers(1, 4))
     height, width = draw(st.integers(1, max_side)), draw(st.integers(1, max_side))
     contrast = draw(st.sampled_from([0.0, 1e-3, 0.1, 1.0]))
-    levels = draw(st.sampled_from([2, 5, 1000]))  # few levels make many pixels alike
+    levels = draw(st.sampled_from([2, 5, 1000]))  # with few levels, many pixels are equal
     values = (noise(batch, channels, height, width, seed=draw(st.integers(0, 99))) * levels).floor() / levels
     return 0.5 + contrast * (values - 0.5)
 
@@ -88,6 +88,6 @@ options = st.fixed_dictionaries(
 
 
 def build(guide: torch.Tensor, **kwargs: object) -> NonlocalOperator:
-    """An operator, with as many landmarks as there are pixels at most."""
+    """Build an operator, with at most as many landmarks as pixels."""
     count = min(int(str(kwargs.pop("num_landmarks", 100))), guide.shape[-2] * guide.shape[-1])
     return nonlocal_operator(guide, num_landmarks=count, generator=seeded(), **kwargs)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Processes for tests of what several of them do together."""
+"""Processes for tests of distributed code."""
 
 import multiprocessing
 from collections.abc import Callable
@@ -7,9 +7,9 @@ from torch.multiprocessing.spawn import start_processes
 
 
 def run_ranks(work: Callable[..., None], arguments: tuple[object, ...], processes: int) -> None:
-    """Run ``work(rank, *arguments)`` in so many processes, and wait for their end.
+    """Run ``work(rank, *arguments)`` in several processes, and wait for them to end.
 
-    They are forked from a process that has done the imports, which take longer than the work.
+    They are forked from a process that has imported the modules, as the imports take longer than the work.
     """
     multiprocessing.set_forkserver_preload(["tests.test_sharding", "tests.clients.test_fsdp"])
     start_processes(work, arguments, processes, start_method="forkserver")

@@ -1,9 +1,9 @@
-"""The paper, dense and in float64 numpy: every n x n matrix is formed, nothing is approximated, nothing is fast.
+"""The paper's filter, dense and in float64 numpy: every n x n matrix is formed, without approximation.
 
-Read it beside Talebi and Milanfar, "Nonlocal Image Editing"; equation numbers are the paper's. Pixels are numbered row
+It follows Talebi and Milanfar, "Nonlocal Image Editing"; equation numbers are the paper's. Pixels are numbered row
 by row, a grey image y is a vector of n numbers, eigenvectors are the columns of V.
 
-Three choices are not the paper's. Patch weights have unit sum, so that h_y is in the units of the image whatever the
+Three choices differ from the paper. Patch weights have unit sum, so that h_y is in the units of the image whatever the
 patch size. The filter is balanced to rounding, not by a few sweeps. Diffusion maps use eigenvectors of unit RMS
 (V sqrt(n)), since with unit-norm ones every distance vanishes as the image grows.
 """
@@ -108,8 +108,8 @@ def uniform_samples(height: int, width: int, m: int) -> NDArray[np.int64]:
 def nystrom_eigenpairs(x: Array, samples: NDArray[np.int64], steps: int = 100) -> tuple[Array, Array]:
     """S (r,) and V (n, r) from m sampled rows of the kernel. Fig. 2, eq. 5 and 6.
 
-    Where the samples do not explain a pixel, its row of the extended kernel is about zero and may sum to less than
-    that: then the scaling, and with it everything else, is not a number. That is the method; it is left as it is.
+    Where a pixel resembles no sample, its row of the extended kernel is about zero and may have a negative sum:
+    then the scaling, and everything that follows, is NaN. This is a property of the method, and is left unchanged.
     """
     a, b = samples, np.setdiff1d(np.arange(len(x)), samples)
     k_a, k_ab = affinity(x[a], x[a]), affinity(x[a], x[b])  # (m, m), (m, n - m)
@@ -129,7 +129,7 @@ def nystrom_eigenpairs(x: Array, samples: NDArray[np.int64], steps: int = 100) -
 
 
 def positive_part(matrix: Array, tolerance: float = 1e-10) -> tuple[Array, Array]:
-    """Eigenvalues above the tolerance, decreasing, and their eigenvectors."""
+    """Return the eigenvalues above the tolerance, decreasing, and their eigenvectors."""
     s, v = np.linalg.eigh((matrix + matrix.T) / 2)
     keep = s > tolerance * s[-1]
     return s[keep][::-1], v[:, keep][:, ::-1]
@@ -205,7 +205,7 @@ def segment_mask(s: Array, v: Array, regions: Array, time: float, steps: int = 1
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Appendices: how much of the image the eigenvectors hold
+# Appendices: the share of the image that the eigenvectors capture
 
 
 def captured_energy(v: Array, y: Array) -> float:

@@ -1,4 +1,4 @@
-"""Abstraction: its power, its tones and lines, and what is like nothing else."""
+"""Abstraction: power, tones, lines, and pixels unlike all others."""
 
 import torch
 
@@ -16,7 +16,7 @@ def test_abstraction_fades_with_its_power() -> None:
 
 
 def test_what_is_like_nothing_else_is_not_blackened() -> None:
-    """A border that few landmarks stand for stays between its two fields, and these stay what they are."""
+    """A border that few landmarks represent keeps values between those of its two sides, which are unchanged."""
     image = torch.full((1, 1, 40, 60), 0.4)
     image[..., 30:] = 0.9
     image[..., 29] = 0.65
@@ -31,7 +31,7 @@ def test_tones_and_lines() -> None:
     plain, toned, lined = abstract(image), abstract(image, tones=4), abstract(image, edges=1.0)
 
     def near_a_tone(picture: torch.Tensor) -> float:
-        """Share of pixels close to one of the tones, which lie half-way between thirds."""
+        """Return the share of pixels close to one of the tones, which are the midpoints of thirds."""
         return float(((luminance(picture) * 3 - 0.5).frac().sub(0.5).abs() > 0.4).float().mean())
 
     assert near_a_tone(toned) > 2 * near_a_tone(plain)

@@ -1,4 +1,4 @@
-"""Who may talk to the editor: requests and websockets of its own page only, and files up to a stated size."""
+"""Access to the editor: it accepts requests and websockets of its own page only, and files up to a size limit."""
 
 import socket
 
@@ -25,9 +25,9 @@ def status(headers: dict[str, str], host: str = "127.0.0.1", *, websocket: bool 
         ({"host": "[::1]:8080", "origin": "http://[::1]:8080"}, None),
         ({"host": "localhost", "origin": "https://localhost"}, None),  # behind a proxy
         ({"origin": "http://evil.example"}, 403),
-        ({"origin": "http://127.0.0.1:9090"}, 403),  # another program of this machine
+        ({"origin": "http://127.0.0.1:9090"}, 403),  # another program on this machine
         ({"origin": "http://localhost:8080"}, 403),
-        ({"origin": "null"}, 403),  # a page in a sandbox
+        ({"origin": "null"}, 403),  # a sandboxed page
         ({"origin": ""}, 403),
         ({"host": "evil.example:8080", "origin": "http://evil.example:8080"}, 400),  # DNS rebinding
         ({"host": ""}, 400),
@@ -46,7 +46,7 @@ def test_scripts_of_other_sites_send_no_origin() -> None:
 
 
 def test_addresses_of_an_editor_for_others() -> None:
-    """By figures, by the name of the machine and by that given, but by no other name."""
+    """Numeric addresses, the name of the machine and the name given are accepted, other names are not."""
     own = socket.gethostname()
     for host in ("192.168.1.9:8080", "[fe80::1]:8080", f"{own}:8080", "studio:8080", "127.0.0.1:8080"):
         assert status({"host": host, "origin": f"http://{host}"}, "studio") is None, host

@@ -1,4 +1,4 @@
-"""The editor in a real browser: every test does what a person would do."""
+"""The editor in a real browser: tests perform the actions of a user."""
 
 import http.client
 import io
@@ -46,7 +46,7 @@ def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
 
 @pytest.fixture
 def folder(editor: Editor) -> Iterator[Path]:
-    """Where the editor saves, with a photograph in it."""
+    """The folder that the editor saves to, with a photograph in it."""
     folder = editor.log.parent
     write_photograph(Photograph(cat()), folder / "cat.png")
     yield folder
@@ -64,7 +64,7 @@ def tab(browser: Browser, editor: Editor, folder: Path) -> Iterator[Tab]:
     page.goto(editor.url)
     yield Tab(page)
     page.close()
-    # Every script, font and picture comes from the editor itself.
+    # Every script, font and picture is served by the editor itself.
     assert [trouble for trouble in troubles if not trouble.startswith(("data:", "blob:", "ws://127.0.0.1:"))] == []
 
 
@@ -121,7 +121,7 @@ def test_picture_follows_a_slider_and_undo(opened: Tab) -> None:
 
 
 def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
-    """The mask is there for a second, or for as long as it is asked for, but never while a slider moves."""
+    """The mask is shown for a second, or while its box is checked, but never while a slider moves."""
     page = opened.page
     expect(opened.mask).not_to_be_visible()
     opened.paint((0.2, 0.9), (0.3, 0.9), release=False)
@@ -135,7 +135,7 @@ def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
     before = opened.source()
     opened.drag(opened.slider("Texture in the region"), 0.2, 0.9, release=False)
     opened.wait_for_picture(before)
-    expect(opened.mask).not_to_be_visible()  # the picture is what counts now
+    expect(opened.mask).not_to_be_visible()  # not while a slider moves
     page.mouse.up()
     expect(opened.mask).to_be_visible()
     page.get_by_role("checkbox", name="Mask").click()
@@ -240,7 +240,7 @@ def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None
     before = opened.source()
     opened.drag(opened.slider("Texture"), 0.2, 0.8)
     opened.wait_for_picture(before)
-    expect(error).not_to_be_visible(timeout=5000)  # sooner than by itself
+    expect(error).not_to_be_visible(timeout=5000)  # before it would disappear by itself
 
 
 def test_keyboard_focus_can_be_seen(opened: Tab) -> None:
@@ -257,7 +257,7 @@ def test_keyboard_focus_can_be_seen(opened: Tab) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (800, 600), (1280, 800), (1920, 1080)])
 def test_layout_on_every_screen(browser: Browser, editor: Editor, folder: Path, width: int, height: int) -> None:
-    """Nothing is off the screen, and a finger can draw and save on a phone."""
+    """Nothing is outside the screen, and on a phone a finger can draw and save."""
     phone = width < 500
     context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
     tab = Tab(context.new_page())
@@ -335,7 +335,7 @@ def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
 
     (folder / "edit.json").write_text('{"detail": {"sharpness": 11}}')
     opened.load_edit(folder / "edit.json")
-    expect(page.get_by_text("detail in edit.json must hold no other entries than")).to_be_visible()
+    expect(page.get_by_text("detail in edit.json must have no entries other than")).to_be_visible()
 
     page.get_by_role("button", name="Save photo").click()
     for name, sentence in (("../out.png", "the name must be one of a file"), ("out.gif", "out.gif must end in .png")):
@@ -346,7 +346,7 @@ def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
 
     assert "Traceback" not in page.content()
     before = opened.source()
-    opened.drag(opened.slider("Texture"), 0.2, 0.8)  # and work goes on
+    opened.drag(opened.slider("Texture"), 0.2, 0.8)  # and the editor still works
     opened.wait_for_picture(before)
 
 
@@ -416,7 +416,7 @@ def test_other_sites_reach_nothing(tab: Tab, editor: Editor, browser: Browser) -
 
 
 def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, editor: Editor, folder: Path) -> None:
-    """The log stays empty; the fixture of the editor looks at it."""
+    """The log stays empty, which the fixture of the editor checks."""
     other = Tab(browser.new_page(viewport={"width": 1280, "height": 900}))
     other.page.goto(editor.url)
     other.open(folder / "cat.png")
@@ -424,7 +424,7 @@ def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, 
     other.page.get_by_role("button", name="Save photo").click()
     expect(other.page.get_by_label("Name")).to_be_visible()
     other.page.close()
-    opened.page.wait_for_timeout(5000)  # after three seconds a page counts as gone
+    opened.page.wait_for_timeout(5000)  # after three seconds a page is considered closed
     assert editor.log.read_text() == ""
 
 
@@ -436,7 +436,7 @@ def test_pictures_are_for_those_who_know_their_address(opened: Tab, editor: Edit
 
 
 def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> None:
-    """Killed outright: the old file stays as it was, and the page says that the editor is gone."""
+    """The process is killed: the old file is unchanged, and the page reports that the editor has ended."""
     large = torch.nn.functional.interpolate(cat(), size=(600, 900), mode="bicubic").clamp(0, 1)
     write_photograph(Photograph(large), tmp_path / "large.png")
     (tmp_path / "out.png").write_bytes(b"what was there")

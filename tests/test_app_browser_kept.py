@@ -1,4 +1,4 @@
-"""Edits in the browser that outlive the page, the tab and the editor."""
+"""Edits that persist when the page, the tab or the editor is closed."""
 
 import signal
 from collections.abc import Iterator
@@ -87,7 +87,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
         editor.process.wait(30)
         editor.stop()
         editor = Editor(shots, "--port", port)
-        # The page finds the new editor by itself, and asks nothing: the edit is kept.
+        # The page reconnects to the new editor without asking: the edit is stored.
         expect(undo).to_be_disabled(timeout=60_000)
         shown(tab)
         expect(page.locator("path.stroke")).to_have_count(1)
@@ -104,7 +104,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
 
 
 def test_a_photograph_of_another_folder(browser: Browser, shots: Path) -> None:
-    """The browser does not tell where it is: its edit is kept in the user's folder, and comes back with it."""
+    """The browser does not reveal its path: its edit is stored in the user's state folder, and restored from there."""
     editor = Editor(shots)
     try:
         tab = visit(browser, editor.url)

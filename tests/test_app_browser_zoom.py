@@ -37,7 +37,7 @@ def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
 
 
 class Zoomed(Tab):
-    """A page of the editor with the photograph open, and what it shows of it."""
+    """A page of the editor with the photograph open, and the part of it that is shown."""
 
     def __init__(self, browser: Browser, editor: Editor, width: int, height: int, *, touch: bool) -> None:
         self.context = browser.new_context(
@@ -57,13 +57,13 @@ class Zoomed(Tab):
         return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
     def share(self, x: float, y: float) -> tuple[float, float]:
-        """What of the photograph lies at a place of the page, as shares of its width and height."""
+        """Return the point of the photograph at a point of the page, as fractions of its width and height."""
         box = self.photo.bounding_box()
         assert box is not None
         return (x - box["x"]) / box["width"], (y - box["y"]) / box["height"]
 
     def scale(self) -> float:
-        """Pixels of the page for each of the photograph."""
+        """Pixels of the page per pixel of the photograph."""
         box = self.photo.bounding_box()
         assert box is not None
         assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.02)
@@ -78,7 +78,7 @@ class Zoomed(Tab):
         expect(self.level).to_have_text(level)
 
     def wait_for_pieces(self) -> None:
-        """Wait until the middle of what is seen is covered, and each piece is there."""
+        """Wait until the middle of the visible part is covered and every piece has loaded."""
         self.page.wait_for_function(
             """() => { const box = document.querySelector('.canvas').getBoundingClientRect();
             const x = box.x + box.width / 2, y = box.y + box.height / 2;
@@ -88,7 +88,7 @@ class Zoomed(Tab):
         )
 
     def assert_shown(self, wanted: torch.Tensor) -> None:
-        """Raise unless all pieces agree with a photograph (1, 3, H, W) to one grey level, and lie in their places."""
+        """Assert that all pieces agree with a photograph (1, 3, H, W) to one grey level and are in the right places."""
         places: list[list[Any]] = self.pieces.evaluate_all(
             """images => images.map((image) => [image.getAttribute('src'), ...['left', 'top', 'width', 'height'].map(
             (side) => parseFloat(image.style[side]))])"""
@@ -133,14 +133,14 @@ def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor
     page.mouse.wheel(0, -200)
     expect(tab.level).not_to_have_text("400 %")
     assert tab.scale() > 4.5
-    assert tab.share(x + 50, y + 40) == pytest.approx(under, abs=0.003)  # what is under the pointer stays there
+    assert tab.share(x + 50, y + 40) == pytest.approx(under, abs=0.003)  # the point under the pointer stays there
 
     before = tab.share(x, y)
     page.mouse.down(button="middle")
     page.mouse.move(x, y + 10, steps=3)
     page.mouse.up(button="middle")
     after = tab.share(x, y)
-    assert after[0] > before[0]  # the photograph went with the pointer, to the left and up
+    assert after[0] > before[0]  # the photograph moved with the pointer, to the left and up
     assert after[1] > before[1]
     page.keyboard.press("ArrowLeft")
     assert tab.share(x, y)[0] < after[0]
@@ -150,7 +150,7 @@ def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor
     tab.assert_shown(cat(1))
     page.get_by_role("button", name="Fit", exact=True).click()
     assert tab.scale() == pytest.approx(fit, rel=0.01)
-    expect(page.locator("path.stroke")).to_have_count(0)  # nothing of this drew
+    expect(page.locator("path.stroke")).to_have_count(0)  # none of this drew
     tab.context.close()
 
 
@@ -195,7 +195,7 @@ def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, h
 
 
 def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: Editor) -> None:
-    """A scribble lies where it was drawn, its edit is shown as it is saved, and the wipe shows the original."""
+    """A scribble stays where it was drawn, its edit is shown as it is saved, and the wipe shows the original."""
     tab, folder = Zoomed(browser, editor, 1280, 800, touch=False), editor.log.parent
     page = tab.page
     tab.enlarge("400 %")
@@ -225,7 +225,7 @@ def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: E
     expect(page.locator(".originals img")).to_have_count(1)
     edge = page.locator(".edge").bounding_box()
     assert edge is not None
-    assert edge["x"] == pytest.approx(x, abs=12)  # half of what is seen, wherever that lies
+    assert edge["x"] == pytest.approx(x, abs=12)  # half of the visible part
     source = page.locator(".originals img").get_attribute("src")
     assert source is not None
     left, top, right, bottom = (int(number) for number in source.partition("at=")[2].split(","))

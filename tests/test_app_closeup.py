@@ -1,4 +1,4 @@
-"""What the editor shows at full size: it is what is saved, and only what is missing is worked out."""
+"""The editor at full size: it shows what it saves, and computes only the missing pieces."""
 
 import asyncio
 import io
@@ -46,7 +46,7 @@ RECIPES = {
 def test_what_is_shown_at_full_size_is_what_is_saved(
     name: str, tiles: bool, session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To one grey level, whether the photograph is saved in memory or, as large ones are, in tiles."""
+    """They agree to one grey level, whether the photograph is saved in memory or, as large ones are, in tiles."""
     if tiles:
         monkeypatch.setattr("nlfilter_torch.app.session.FIFTH", 0)
     session.load(RECIPES[name])
@@ -59,7 +59,7 @@ def test_what_is_shown_at_full_size_is_what_is_saved(
 
 
 class Page:
-    """Stands for the page: it keeps what it is told, and work is done when :meth:`finish` is called."""
+    """A stand-in for the page: it records messages, and work runs when :meth:`finish` is called."""
 
     def __init__(self, session: Session) -> None:
         self.told: list[str] = []
@@ -81,7 +81,7 @@ class Page:
         asyncio.run(all_of_it())
 
     def look(self, *view: int) -> list[str]:
-        """What the page is told if it shows a part."""
+        """Return the messages that the page receives when it shows a part."""
         self.told.clear()
         self.closeup.look(view or None)
         self.finish()
@@ -99,7 +99,7 @@ def large(tmp_path: Path) -> Session:
 
 @pytest.fixture
 def page(large: Session, monkeypatch: pytest.MonkeyPatch) -> Page:
-    """Of the editor that shows it; ``parts`` are those that were worked out."""
+    """A page that shows the photograph; ``parts`` are the parts that were computed."""
     page, part = Page(large), large.part
 
     def counted(place: Rectangle, *arguments: Any) -> torch.Tensor:
@@ -117,7 +117,7 @@ def pixels(content: bytes | None) -> torch.Tensor:
 
 def test_pieces_cover_what_is_seen_and_a_pan_adds_what_is_new(page: Page, large: Session) -> None:
     assert page.look(10, 20, 130, 100) == ["closeup.add('piece-1', 0, 0, 192, 128)"]
-    assert page.look(40, 20, 180, 128) == []  # there already
+    assert page.look(40, 20, 180, 128) == []  # already computed
     assert page.look(100, 20, 230, 100) == ["closeup.add('piece-2', 192, 0, 256, 128)"]
     assert page.look(100, 200, 250, 300) == ["closeup.add('piece-3', 64, 192, 256, 300)"]  # to the border
     assert len(page.parts) == 3
@@ -160,7 +160,7 @@ def test_an_edit_that_changes_takes_its_pieces_with_it(page: Page, large: Sessio
 
 
 def test_what_is_worked_out_for_an_edit_that_has_changed_is_not_shown(page: Page, large: Session) -> None:
-    """The fit is interrupted, and that of the new edit takes its place."""
+    """The fit is interrupted and replaced by that of the new edit."""
     large.load(Recipe((Step("detail", alpha=(3.0, 1.0)),)))
     meanwhile = iter([lambda: large.load(Recipe((Step("detail", alpha=(0.0, 1.0)),)))])
     page.before_work = lambda: next(meanwhile, lambda: None)()

@@ -1,4 +1,4 @@
-"""What the editor draws: pictures, masks, strokes and responses; and the range of its controls."""
+"""Drawings of the editor: pictures, masks, strokes and responses, and the ranges of its controls."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""Files that the editor opens and saves: as the command line writes them, and refusals that leave all as it was."""
+"""Files that the editor opens and saves: they equal those of the command line, and refusals change nothing."""
 
 import io
 import socket
@@ -73,7 +73,7 @@ def test_names_to_save_under(session: Session, name: str, photograph: Photograph
     assert session.opened is not None
     session.opened = replace(session.opened, name=name, photograph=photograph)
     assert session.suggested_name() == wanted
-    session.save(wanted)  # which can hold it
+    session.save(wanted)  # which supports this depth
     assert Session(session.folder).suggested_name() == ""
 
 
@@ -152,7 +152,7 @@ def test_app_says_what_it_lacks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["app", "--out", str(tmp_path / "gone"), "--no-open"]) == 2
-    assert "does not exist; make the folder first" in capsys.readouterr().err
+    assert "does not exist; create the folder first" in capsys.readouterr().err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2

@@ -1,4 +1,4 @@
-"""Edits that are kept: beside the photograph or in a folder of the user's, for every tab and the next start."""
+"""Stored edits: beside the photograph or in the user's state folder, for every tab and after a restart."""
 
 import shutil
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_an_edit_survives_the_program(shots: Path) -> None:
     assert not again.unsaved
     assert not again.can_undo
     assert again.trouble is None
-    again.set("tone", contrast=1.5)  # a drag that is not complete is not kept
+    again.set("tone", contrast=1.5)  # an unfinished drag is not stored
     assert Library(shots).open(shots / "cat.png").recipe == recipe
 
 
@@ -54,7 +54,7 @@ def test_the_file_is_one_for_apply(shots: Path) -> None:
     assert difference(read_photograph(shots / "out.png").pixels, session.recipe.apply(cat())) <= 1
     while session.undo():
         pass
-    assert not kept.exists()  # nothing to keep
+    assert not kept.exists()  # nothing to store
     session.redo()
     assert kept.exists()
 

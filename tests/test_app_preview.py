@@ -1,4 +1,4 @@
-"""The editor's preview: what it shows is what is saved, and what does not change is not worked out again."""
+"""The editor's preview: it shows what is saved, and does not recompute what has not changed."""
 
 from collections.abc import Callable
 
@@ -46,7 +46,7 @@ def test_what_is_shown_is_what_is_saved(colour: bool) -> None:
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
-    """What happens to steps from now on: ``filter`` for each one made, ``edit`` for each picture drawn."""
+    """Record events of steps: ``filter`` for each filter that is built, ``edit`` for each picture that is drawn."""
     events: dict[str, list[str]] = {edit: [] for edit in EDITS}
 
     def spied(step: Step, image: torch.Tensor, *, stride: float) -> Callable[[Step], torch.Tensor]:
@@ -181,7 +181,7 @@ def test_sampled_operator_is_a_sample_of_the_whole() -> None:
 
 
 def test_sampled_operator_in_colour_and_nearby() -> None:
-    """As close as the whole operator is with other landmarks; half or twice the spatial bandwidth is 2.4 levels off."""
+    """As close as the whole operator with other landmarks; half or twice the spatial bandwidth gives 2.4 levels."""
     image = cat(1)
     options = {"patch_size": 3, "photometric_bandwidth": 0.1, "spatial_bandwidth": 60.0, "num_landmarks": 200}
     whole = nonlocal_operator(image, guide_channels="all", **options) @ image  # type: ignore[arg-type]
@@ -222,7 +222,7 @@ def test_preview_of_a_large_photograph_shows_what_saving_gives(step: Step, limit
 
 
 def test_blocks_of_a_fractional_step() -> None:
-    """Pixels count by their share; the blocks are those of the picture with each pixel four times."""
+    """Pixels are weighted by their overlap; blocks equal those of the picture with each pixel repeated four times."""
     row = torch.tensor([0.0, 3.0, 6.0, 9.0, 12.0, 15.0]).expand(1, 1, 6, 6)
     torch.testing.assert_close(block_means(row, 1.5)[0, 0, 0], torch.tensor([1.0, 5.0, 10.0, 14.0]))
     twice = row.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)

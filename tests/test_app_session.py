@@ -1,4 +1,4 @@
-"""A session of the editor, without its page: its steps, its strokes and its history."""
+"""A session of the editor without its page: steps, strokes and history."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def test_undo_and_redo(session: Session) -> None:
     session.undo()
     session.set("abstract", edges=1.0)
     session.commit()
-    assert not session.redo()  # another way was taken
+    assert not session.redo()  # a new edit discards what was undone
 
 
 def test_undo_in_the_midst_of_a_drag_takes_it_back_whole(session: Session) -> None:
@@ -66,7 +66,7 @@ def test_strokes(session: Session) -> None:
 
 
 def test_the_first_region_begins_with_the_sliders_of_the_rest(session: Session) -> None:
-    """So that a scribble changes nothing by itself."""
+    """A scribble alone therefore changes nothing."""
     session.set("detail", alpha=(3.0, 3.0, 4.0, 1.05))
     before = session.render()
     session.add_stroke("detail", LINE, 0.03, "in")
@@ -78,7 +78,7 @@ def test_the_first_region_begins_with_the_sliders_of_the_rest(session: Session) 
 
 
 def test_the_last_step_of_an_edit_is_the_one_at_work(session: Session) -> None:
-    """A first one is put where it usually comes."""
+    """The first step of a kind is inserted in its usual place."""
     session.load(Recipe((Step("abstract"), Step("tone"), Step("detail"), Step("tone", clarity=3.0))))
     session.set("tone", contrast=0.9)
     assert [step["contrast"] for step in session.recipe.steps if step.edit == "tone"] == [1.2, 0.9]
@@ -115,6 +115,6 @@ def test_presets_come_back(session: Session) -> None:
     assert session.recipe == recipe
     session.undo()
     assert session.recipe == Recipe()
-    with pytest.raises(ValueError, match=r"photo\.jpg is no preset: it is not JSON"):
+    with pytest.raises(ValueError, match=r"photo\.jpg is not a preset: it is not JSON"):
         session.load_preset(b"\xff\xd8\xff", "photo.jpg")
     assert session.recipe == Recipe()

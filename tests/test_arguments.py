@@ -1,4 +1,4 @@
-"""Numbers, responses and scales that functions and edits must refuse, or warn of, in one sentence."""
+"""Numbers, responses and scales that functions and edits must refuse, or warn about, in one sentence."""
 
 import re
 import warnings
@@ -47,7 +47,7 @@ NAN, INFINITY = float("nan"), float("inf")
 
 
 def sentence(call: Callable[[], object], name: str) -> None:
-    """``name`` is refused in one sentence."""
+    """Check that ``name`` is refused in one sentence."""
     with pytest.raises((TypeError, ValueError)) as caught:
         call()
     assert re.fullmatch(rf"{name} must .+, got .+; .+", str(caught.value)), caught.value
@@ -108,7 +108,7 @@ def test_numbers_and_tensors_of_them_are_taken(function: str, value: float | Ten
     assert found.isfinite().all()
 
 
-# --- numbers that are no tensors, and integers
+# --- plain numbers and integers
 
 PLAIN: dict[str, Callable[[Any], object]] = {
     "guide_blur": lambda v: sharpen(IMAGE, guide_blur=v, **OPTIONS),
@@ -190,7 +190,7 @@ def test_a_constant_response_may_be_learned() -> None:
     torch.testing.assert_close(gain.grad.float(), 4 * unit.square().sum(), rtol=1e-4, atol=0)
 
 
-# --- values and bandwidths that do not go together
+# --- incompatible values and bandwidths
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -1,4 +1,4 @@
-"""A folder edited by several processes: each photograph once, broken ones named, interruptions taken up."""
+"""Editing a folder by several processes: each photograph once, broken ones reported, interrupted work resumed."""
 
 import json
 import os
@@ -50,13 +50,13 @@ def environment(**more: object) -> dict[str, str]:
 
 
 def finished(folder: Path) -> dict[str, tuple[int, int]]:
-    """Names of the pictures, and what a second writing would change."""
+    """Return the names of the finished pictures, with the inode and time that writing them again would change."""
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.glob("[!.]*")}
 
 
 @pytest.mark.slow
 def test_two_hundred_killed_in_the_middle(tmp_path: Path) -> None:
-    """Every good picture is done exactly once, none is corrupt, the five broken ones are named."""
+    """Every good picture is edited exactly once, none is corrupt, and the five broken ones are reported."""
     source, target = tmp_path / "in", tmp_path / "out"
     broken = (3, 50, 51, 120, 199)
     names = [f"{number:03}.png" for number in broken]
@@ -75,7 +75,7 @@ def test_two_hundred_killed_in_the_middle(tmp_path: Path) -> None:
     before = finished(target)
     assert 60 <= len(before) < 195
     for name in before:
-        assert np.asarray(Image.open(target / name)).shape == (48, 48, 3)  # the whole file is there
+        assert np.asarray(Image.open(target / name)).shape == (48, 48, 3)  # the file is complete
     (target / ".007.png.0123abcd.part").write_bytes(b"half")
 
     second = subprocess.run(arguments, cwd=ROOT, env=environment(), capture_output=True, text=True, check=False)
@@ -98,13 +98,13 @@ def test_two_hundred_killed_in_the_middle(tmp_path: Path) -> None:
     alone = np.asarray(Image.open(tmp_path / "one.png")).astype(int)
     for name in after:
         assert np.asarray(Image.open(target / name)).shape == (48, 48, 3)
-    assert abs(np.asarray(Image.open(target / "008.png")) - alone).max() <= 1  # threads may round otherwise
+    assert abs(np.asarray(Image.open(target / "008.png")) - alone).max() <= 1  # rounding depends on threads
 
 
 @pytest.mark.slow
 @needs_gloo
 def test_ranks_share_the_folder(tmp_path: Path) -> None:
-    """The same command under torchrun: no picture twice, and a broken one does not end the other rank."""
+    """The same command under torchrun edits no picture twice, and a broken picture does not stop the other rank."""
     source, target = tmp_path / "in", tmp_path / "out"
     fill(source, 12, broken=(0,))
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
@@ -173,7 +173,7 @@ def test_wrong_ranks(monkeypatch: pytest.MonkeyPatch, rank: str, size: str) -> N
 
 
 def test_ranks_without_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scheduler's numbers are enough to share the work; each rank reports its own."""
+    """The rank variables of a scheduler are enough to share the work; each rank reports its own files."""
     monkeypatch.delenv("MASTER_ADDR", raising=False)
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "2")
@@ -182,7 +182,7 @@ def test_ranks_without_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def copy_or_fail(source: str, target: str) -> None:
-    """An edit whose process dies over some files, and that meets an error nobody thought of."""
+    """An edit whose process dies on some files and raises an unexpected error on others."""
     if Path(source).stem in ("1", "4"):
         os.kill(os.getpid(), signal.SIGKILL)
     if Path(source).stem == "2":
@@ -272,7 +272,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A preset and options reach the edit and the record; cores are shared among workers and local ranks."""
+    """A preset and options reach the edit and the record file; cores are divided among workers and local ranks."""
     fill(tmp_path / "in", 9)
     seen = {}
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""The benchmarks run and tell the truth about what they could not measure; how fast they are is not tested."""
+"""The benchmarks run, and report what they could not measure; speed is not tested."""
 
 import copy
 import itertools
@@ -37,7 +37,7 @@ MEASURED = ("main", "comparisons", "pictures", "pauses", "slow", "dense", "autog
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """What a quick run writes, read back."""
+    """The results that a quick run writes."""
     path = tmp_path_factory.mktemp("speed") / "new" / "speed.json"
     measure(["--quick", "--only", *MEASURED, "--out", str(path)])
     return json.loads(path.read_text())
@@ -73,7 +73,7 @@ def test_report_of_a_run_has_its_tables_and_plots(results, tmp_path):
         "## Two at a time, alternating",
     ):
         assert part in text
-    assert "not measured" in text  # of a quick run, no claim is judged
+    assert "not measured" in text  # no claim of a quick run is judged
     assert "holds" not in text
     for name in ("speed_growth.png", "speed_peers.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
@@ -164,7 +164,7 @@ COMPARED = {
 
 @pytest.fixture(scope="module")
 def compared():
-    """The records of a quick run of all comparisons, as JSON holds them."""
+    """The records of a quick run of all comparisons, as read from JSON."""
     return json.loads(json.dumps(list(comparisons(QUICK))))
 
 
@@ -172,7 +172,7 @@ def test_every_comparison_has_two_timings_and_their_ratio(compared):
     assert {record["label"] for record in compared} == {*COMPARED, THREADS, "an operator of crops"}
     for record in compared:
         first, second = (timing["median"] for timing in record["timings"].values())
-        assert record["ratio"]["pairs"] == 1  # of a single pair, all three are its ratio
+        assert record["ratio"]["pairs"] == 1  # with a single pair, all three equal its ratio
         assert [record["ratio"][name] for name in ("lower", "median", "upper")] == pytest.approx([second / first] * 3)
     assert compared[0]["case"]["width"] == 2 * compared[0]["case"]["height"]  # the doubled one is the second
 
@@ -214,7 +214,7 @@ def test_the_worst_of_several_comparisons_counts(compared):
 
 
 def test_a_slow_moment_does_not_change_the_ratio_of_calls_that_alternate(monkeypatch):
-    """B takes twice as long as A; between A and B of the third of five pairs the machine becomes ten times slower."""
+    """B takes twice as long as A; from B of the third of five pairs on, the machine is ten times slower."""
     order, now = [], [0.0]
 
     def call(name, cost):
@@ -228,7 +228,7 @@ def test_a_slow_moment_does_not_change_the_ratio_of_calls_that_alternate(monkeyp
     timings, ratio = compare({"a": call("a", 1.0), "b": call("b", 2.0)}, threads=1, seconds=0.0, least=5)
     rounds = [name for name, previous in zip(order, [None, *order], strict=False) if name != previous]
     assert rounds == ["a", "b"] * 6  # a warm-up, then five pairs
-    assert timings["b"].median / timings["a"].median == pytest.approx(20)  # what the medians alone would say
+    assert timings["b"].median / timings["a"].median == pytest.approx(20)  # the ratio of the medians
     assert ratio.pairs == 5
     assert [ratio.lower, ratio.median, ratio.upper] == pytest.approx([2.0] * 3)
     assert {timing.samples for timing in timings.values()} == {5}

@@ -1,4 +1,4 @@
-"""The benchmark on a GPU says when there is none; what it computes is tried on the processor."""
+"""The GPU benchmark reports when there is no GPU; its computations are tested on the CPU."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it keeps, and one sentence with exit status 2 for everything it cannot use."""
+"""The command line: its output, the metadata it keeps, and one sentence with exit status 2 for unusable input."""
 
 import json
 import signal
@@ -79,7 +79,7 @@ def test_all_channels_are_edited_on_request(photo: Path, tmp_path: Path, cat: to
 def test_alpha_of_ones_gives_the_file_back(
     tmp_path: Path, cat: torch.Tensor, suffix: str, depth: Depth, channels: int
 ) -> None:
-    """Depth, alpha, profile and EXIF stay; integer pixels come back exactly, floats to rounding."""
+    """Depth, alpha, profile and EXIF are kept; integer pixels are exact, floats equal to rounding."""
     exif = Image.Exif()
     exif[ExifTags.Base.Make] = "Maker"
     exif[ExifTags.Base.Orientation] = 1
@@ -132,7 +132,7 @@ def test_a_file_can_replace_itself(photo: Path) -> None:
 
 def test_inspect_writes_pictures_and_figures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "looks"
-    for _ in range(2):  # the folder may be there
+    for _ in range(2):  # the folder may exist
         assert main(["inspect", str(photo), str(folder), "--landmarks", "40", "--bandwidth", "20"]) == 0
     names = {"eigenvectors.png", "eigenvalues.png", "response.png", "diagnostics.json"}
     assert {file.name for file in folder.iterdir()} == names
@@ -166,7 +166,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one sentence of a refusal, without the name of the program."""
+    """Return the sentence of a refusal, without the name of the program."""
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     captured = capsys.readouterr()
@@ -180,7 +180,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     ("options", "sentence"),
     [
         (["--alpha", "3"], "--alpha must have at least two numbers, such as 3,3,4,1.05, got '3'"),
-        (["--alpha", "3,x"], "--alpha must be numbers with commas between, such as 3,3,4,1.05, got '3,x'"),
+        (["--alpha", "3,x"], "--alpha must be numbers separated by commas, such as 3,3,4,1.05, got '3,x'"),
         (["--alpha", "3,nan"], "--alpha must be finite numbers, such as 3,3,4,1.05, got '3,nan'"),
         (["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels, such as 20, or auto, got '0'"),
         (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),
@@ -214,7 +214,7 @@ def test_wrong_inputs(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "half.png").write_bytes(photo.read_bytes()[:3000])
     sentences = {
         "none.png": "none.png does not exist; check the name and the folder",
-        "empty.png": "empty.png is empty; copy it again from where it came",
+        "empty.png": "empty.png is empty; copy it again from its source",
         "text.jpg": "text.jpg is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these",
         "half.png": "half.png is damaged or cut short (",
     }
@@ -234,8 +234,12 @@ def test_outputs_that_cannot_be(photo: Path, tmp_path: Path, capsys: pytest.Capt
         ("in.png", "nowhere/out.png", "does not exist; make it first"),
         ("in.png", "out.gif", "out.gif must end in .png, .jpg, .webp, .avif or .tif, got '.gif'"),
         ("rgba.png", "out.jpg", "JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"),
-        ("deep.png", "out.jpg", "JPEG has no 16 bits a channel; write a PNG or TIFF file or choose a depth of 8 bits"),
-        ("float.tif", "out.png", "PNG has no floats a channel; write a TIFF file or choose a depth of 16 bits"),
+        (
+            "deep.png",
+            "out.jpg",
+            "JPEG has no 16 bits per channel; write a PNG or TIFF file or choose a depth of 8 bits",
+        ),
+        ("float.tif", "out.png", "PNG has no floats per channel; write a TIFF file or choose a depth of 16 bits"),
     ):
         assert sentence in refused(capsys, "detail", tmp_path / source, tmp_path / target)
     assert "does not exist; make it first" in refused(capsys, "inspect", photo, tmp_path / "no" / "where")
@@ -250,9 +254,12 @@ def test_too_large_for_memory(
     free = psutil.virtual_memory()._replace(available=1_000_000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     sentence = refused(capsys, "tone", photo, tmp_path / "out.png")  # not even in tiles
-    assert "in.png needs 21 MB of memory at least, but 1 MB may be used; allow more, or use fewer landmarks" in sentence
+    assert (
+        "in.png needs at least 21 MB of memory, but only 1 MB may be used; allow more, or use fewer landmarks"
+        in sentence
+    )
     sentence = refused(capsys, "inspect", photo, tmp_path)  # needs all pixels at once
-    assert "has 90x60 pixels and needs about 34 MB of memory, but 1 MB is free; use fewer landmarks" in sentence
+    assert "has 90x60 pixels and needs about 34 MB of memory, but only 1 MB is free; use fewer landmarks" in sentence
 
 
 def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,7 +305,7 @@ def test_flat_and_tiny_pictures_are_looked_at(size: tuple[int, int], tmp_path: P
     source = tmp_path / "flat.png"
     write_photograph(Photograph(torch.full((1, 1, *size), 0.5), "uint8"), source)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of fewer pixels than landmarks
+        warnings.simplefilter("ignore")  # about fewer pixels than landmarks
         assert main(["inspect", str(source), str(tmp_path / "looks")]) == 0
     names = ["diagnostics.json", "eigenvalues.png", "eigenvectors.png", "response.png"]
     assert sorted(path.name for path in (tmp_path / "looks").iterdir()) == names
@@ -329,7 +336,7 @@ def test_an_interrupt_that_python_loses_comes_again(
 ) -> None:
     class Busy:
         def __del__(self) -> None:
-            raise KeyboardInterrupt  # as where Ctrl-C comes at this moment
+            raise KeyboardInterrupt  # as if Ctrl-C were pressed at this moment
 
     def work(*_: object, **__: object) -> None:
         Busy()

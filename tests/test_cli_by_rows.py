@@ -1,4 +1,4 @@
-"""Detail by rows on the command line: the result of one in memory, and what happens when something breaks."""
+"""`detail` by rows on the command line: the result equals that in memory, and failures are handled."""
 
 import os
 import resource
@@ -23,12 +23,12 @@ from nlfilter_torch.io.photographs import Photograph, read_photograph, write_pho
 from nlfilter_torch.io.tiff import TiffRows
 from tests.test_streaming_files import PROFILE, Array, cat
 
-LITTLE = "0.03"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
 
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples and blocks in proportion to small pictures."""
+    """Reduce samples and blocks in proportion to small pictures."""
     monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 8000)
     monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
 
@@ -89,7 +89,7 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     picture = cat(200, 300)
     zarr.create_array(store=tmp_path / "in.zarr", data=picture, chunks=(64, 64, 3))
     write_photograph(Photograph(torch.from_numpy(picture).permute(2, 0, 1)[None] / 255), tmp_path / "in.png")
-    for _ in range(2):  # the second time it takes the place of the first
+    for _ in range(2):  # the second output replaces the first
         assert detail(tmp_path / "in.zarr", tmp_path / "out.zarr", "--full") == 0
     assert detail(tmp_path / "in.png", tmp_path / "out.png") == 0
     wanted = read_photograph(tmp_path / "out.png").pixels[0].permute(1, 2, 0).numpy() * 255
@@ -98,9 +98,9 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
     (tmp_path / "folder.zarr").mkdir()
     for source, target, message in (
-        ("in.zarr", "folder.zarr", "is a folder, but no array of zarr that could be replaced"),
-        ("folder.zarr", "new.zarr", "is no array of zarr"),
-        ("none.zarr", "new.zarr", "is no array of zarr"),
+        ("in.zarr", "folder.zarr", "is a folder, not a zarr array that can be replaced"),
+        ("folder.zarr", "new.zarr", "is not a zarr array"),
+        ("none.zarr", "new.zarr", "is not a zarr array"),
         ("in.zarr", "no/new.zarr", "does not exist; make it first"),
         ("in.zarr", "new.gif", "must end in .png, .jpg, .webp, .avif or .tif"),
     ):
@@ -112,7 +112,7 @@ def test_zarr_in_and_out(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     zarr.create_array(store=tmp_path / "deep.zarr", data=np.zeros((5, 5), np.uint32))
     for depth in ((), ("--depth", "8")):
         assert detail(tmp_path / "deep.zarr", tmp_path / "new.zarr", *depth) == 2
-        assert "deep.zarr stores its channels as uint32, which is not handled" in capsys.readouterr().err
+        assert "deep.zarr stores its channels as uint32, which is not supported" in capsys.readouterr().err
 
 
 def test_zarr_is_needed_for_zarr(
@@ -140,7 +140,7 @@ def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPat
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The sentence of a `detail` that fails, which must leave no trace in the folder of its output."""
+    """Return the error sentence of a `detail` that fails, and check that it leaves nothing in the output folder."""
     folder = Path(str(arguments[1])).parent
     before = set(folder.iterdir())
     assert detail(*arguments) == 2
@@ -180,7 +180,7 @@ def test_damage_in_the_middle_is_named(photo: Path, tmp_path: Path, capsys: pyte
 
 @pytest.fixture
 def file_limit() -> Any:
-    """A limit in bytes to the size of files, which a full disk has, too."""
+    """A limit on the size of files in bytes, in place of a full disk."""
     from contextlib import contextmanager
 
     @contextmanager
@@ -200,8 +200,8 @@ def test_a_full_disk_is_named(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], file_limit: Any, target: str
 ) -> None:
     with file_limit(20_000):
-        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE, "--threshold", "0")  # nothing between
-    assert f"{target} cannot be written: File too large; make room there or write elsewhere" in sentence
+        sentence = refused(capsys, photo, tmp_path / target, "--memory", LITTLE, "--threshold", "0")  # no temporaries
+    assert f"{target} cannot be written: File too large; free some space there or write elsewhere" in sentence
 
 
 def test_a_folder_that_cannot_be_written_is_named(
@@ -218,7 +218,10 @@ def test_what_is_too_large_to_be_put_together_is_named(
 ) -> None:
     assert "needs " in refused(capsys, photo, tmp_path / "out.tif", "--memory", "0.001")
     sentence = refused(capsys, photo, tmp_path / "out.png", "--memory", "0.003")
-    assert "out.png takes 4 MB to be put together, but 3 MB may be used; write a TIFF file, or allow more" in sentence
+    assert (
+        "out.png needs 4 MB of memory to be encoded, but only 3 MB may be used; write a TIFF file, or allow more"
+        in sentence
+    )
     write_photograph(read_photograph(photo), photo.with_suffix(".png"))
     sentence = refused(capsys, photo.with_suffix(".png"), tmp_path / "out.tif", "--memory", "0.0001")
     assert "in.png has 300x200 pixels and needs about" in sentence
@@ -241,7 +244,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
 ) -> None:
     program = (
         "import signal, sys, time\n"
-        # A shell's background jobs, which these tests may be one of, ignore this signal, and so would their children.
+        # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from nlfilter_torch.tiled import pictures, tiles\n"
         "from nlfilter_torch.tiled.source import Tiled\n"
@@ -270,7 +273,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         process.wait()
     assert not (tmp_path / target).exists()
     left = list(tmp_path.glob(".*"))
-    assert bool(left) == (number == signal.SIGKILL)  # only what could not tidy up leaves a hidden part
+    assert bool(left) == (number == signal.SIGKILL)  # only a killed process leaves a hidden part
     if left:
         assert detail(photo, tmp_path / target, "--memory", LITTLE) == 0
-        assert not list(tmp_path.glob(".*"))  # and the next run tidies up
+        assert not list(tmp_path.glob(".*"))  # which the next run removes

@@ -1,4 +1,4 @@
-"""The edits as commands: what they make of files, strokes, masks and rectangles, and what they refuse."""
+"""The edits as commands: files, strokes, masks and rectangles, and input that is refused."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def run(verb: str, source: Path, *arguments: object) -> torch.Tensor:
 
 
 def is_written(found: torch.Tensor, wanted: torch.Tensor) -> bool:
-    """As close as eight bits allow."""
+    """Check that a file equals the expected image, to the rounding of eight bits."""
     return bool((found - wanted.clamp(0, 1)).abs().max() < 0.6 / 255)
 
 
@@ -78,7 +78,7 @@ def test_recolor(photo: Path, strokes: Path, pixels: torch.Tensor) -> None:
 
 
 def test_colorize(photo: Path, strokes: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
-    """Grey files become colour files; a photograph in colour is taken for a grey one."""
+    """Grey files become colour files; a photograph in colour is converted to grey first."""
     grey = (pixels * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
     write_photograph(Photograph(grey, "uint16", icc=b"a profile for grey"), tmp_path / "grey.png")
     mask = box(8, 10, 6, 8)
@@ -197,12 +197,12 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ),
         ("recolor", ["--region", "-1,2,5,4:red"], "--region must lie within the photograph"),
         ("recolor", ["--region", "1,2,5,4:red", "--keep", "99,9,9,9"], "--keep must lie within the photograph"),
-        ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H alone here, got"),
+        ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H only, got"),
         ("recolor", ["--region", "1,2,5,4:red", "--reach", "1"], "Invalid value for '--reach'"),
-        ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H alone here"),
+        ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H only, got"),
         ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "Invalid value for '--radius': "),
         ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
-        ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers with commas between"),
+        ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers separated by commas"),
         ("detail", ["--region", "1,2,5,4", "--reach", "1"], "Invalid value for '--reach': "),
         ("abstract", ["--tones", "1"], "Invalid value for '--tones'"),
         ("abstract", ["--edge-width", "0"], "Invalid value for '--edge-width': "),
@@ -229,19 +229,19 @@ def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     def sentence(verb: str, source: str, *options: object) -> str:
         return refused(capsys, verb, tmp_path / source, out, *options)
 
-    assert "small.png must be as large as the photograph, 64x48, but is 30x20; resize one" in sentence(
+    assert "small.png must be as large as the photograph, 64x48, but is 30x20; resize it" in sentence(
         "recolor", "in.png", "--strokes", tmp_path / "small.png"
     )
     assert "small.png must be as large as the photograph" in sentence(
         "defocus", "in.png", "--mask", tmp_path / "small.png"
     )
-    assert "clear.png is transparent everywhere; paint at least one stroke" in sentence(
+    assert "clear.png is transparent everywhere; draw at least one scribble" in sentence(
         "colorize", "in.png", "--strokes", tmp_path / "clear.png"
     )
-    assert "in.png has no transparency, so that every pixel of it would be a stroke" in sentence(
+    assert "in.png has no transparency, so every pixel would count as a scribble" in sentence(
         "colorize", "in.png", "--strokes", photo
     )
-    assert "black.png is black everywhere; paint white" in sentence(
+    assert "black.png is black everywhere; paint the selected area white" in sentence(
         "defocus", "in.png", "--mask", tmp_path / "black.png"
     )
     assert "text.png is not a PNG" in sentence("recolor", "in.png", "--strokes", tmp_path / "text.png")

@@ -1,4 +1,4 @@
-"""What ``denoise`` says about the noise that it found and what it did, in memory and in tiles."""
+"""Messages of ``denoise`` about the measured noise and the change, in memory and in tiles."""
 
 import re
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_noise_that_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str],
     photo, out = write(tmp_path / "in.tif", 10.0, alpha=alpha), tmp_path / "out.tif"
     assert main(["denoise", str(photo), str(out), "--landmarks", "40", *(["--full"] if tiled else [])]) == 0
     said = re.fullmatch(
-        r"denoise: noise of ([\d.]+) grey levels found; pixels changed by ([\d.]+) grey levels \(root mean square\)\n",
+        r"denoise: estimated noise of ([\d.]+) grey levels; pixels changed by ([\d.]+) grey levels \(RMS\)\n",
         capsys.readouterr().out,
     )
     assert said is not None
@@ -55,7 +55,7 @@ def test_noise_that_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str],
 def test_nothing_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str], tiled: bool) -> None:
     photo, out = write(tmp_path / "in.tif", 0.0), tmp_path / "out.tif"
     assert main(["denoise", str(photo), str(out), "--landmarks", "40"]) == 0
-    assert "less than 0.1: nothing to do, all pixels are as they were" in capsys.readouterr().out
+    assert "less than 0.1; no pixel changed\n" in capsys.readouterr().out
     np.testing.assert_array_equal(pixels(photo), pixels(out))
 
 
@@ -63,14 +63,14 @@ def test_a_level_that_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str
     photo = write(tmp_path / "in.tif", 2.0)
     arguments = ["denoise", str(photo), str(tmp_path / "out.tif"), "--landmarks", "40", "--noise-level"]
     assert main([*arguments, "3"]) == 0
-    assert "noise of 3.00 grey levels given; pixels changed by" in capsys.readouterr().out
+    assert "given noise of 3.00 grey levels; pixels changed by" in capsys.readouterr().out
     assert main([*arguments, "0.2"]) == 0
-    assert "which is hardly visible\n" in capsys.readouterr().out
+    assert "which is barely visible\n" in capsys.readouterr().out
 
 
 def test_little_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     photo = write(tmp_path / "in.tif", 0.3)
     assert main(["denoise", str(photo), str(tmp_path / "out.png"), "--landmarks", "40"]) == 0
-    assert "which is hardly visible; --strength 2 takes more away" in capsys.readouterr().out
+    assert "which is barely visible; --strength 2 removes more" in capsys.readouterr().out
     with Image.open(tmp_path / "out.png") as opened:
         assert opened.size == (96, 64)

@@ -1,4 +1,4 @@
-"""The command line on bad numbers, odd files, links and signals: one sentence, and nothing left behind."""
+"""The command line with bad numbers, odd files, links and signals: one sentence, and no files left."""
 
 import ast
 import fcntl
@@ -35,7 +35,7 @@ def photo(tmp_path: Path) -> Path:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one sentence of a refusal."""
+    """Return the sentence of a refusal."""
     assert main([str(argument) for argument in arguments]) == 2
     captured = capsys.readouterr()
     assert not captured.out
@@ -86,8 +86,8 @@ def test_numbers_without_sense(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("[" * 100_000, "is no preset: it is nested too deeply"),
-        ('{"alpha": ' * 100_000, "is no preset: it is nested too deeply"),
+        ("[" * 100_000, "is not a preset: it is nested too deeply"),
+        ('{"alpha": ' * 100_000, "is not a preset: it is nested too deeply"),
         ('{"alpha": ' + "[" * 900 + "]" * 900 + "}", "must be a list of 2 to 100 numbers"),
         (f'{{"alpha": [1, {LONG}]}}', "must be a list of 2 to 100 numbers"),
         (f'{{"alpha": [1, 1], "bandwidth": {LONG}}}', "must be a positive number of grey levels, from 0.01 to"),
@@ -163,7 +163,7 @@ def test_an_unreadable_file_is_told(photo: Path, monkeypatch: pytest.MonkeyPatch
         raise PermissionError(13, "Permission denied", str(photo))
 
     monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(ValueError, match=r"in\.png cannot be read: Permission denied; ask its owner"):
+    with pytest.raises(ValueError, match=r"in\.png cannot be read: Permission denied; check its permissions"):
         read_photograph(photo)
 
 
@@ -172,7 +172,7 @@ def test_what_is_written_to_a_link_goes_where_it_points(photo: Path, tmp_path: P
     there, link = tmp_path / "there" / f"real{suffix}", tmp_path / f"link{suffix}"
     there.parent.mkdir()
     link.symlink_to(there)
-    for _ in range(2):  # first to a name that nothing has yet
+    for _ in range(2):  # the target does not exist the first time
         assert main(["detail", str(photo), str(link), "--alpha", "1,1"]) == 0
         assert link.is_symlink()
         assert link.readlink() == there
@@ -190,12 +190,12 @@ def test_links_that_lead_nowhere(photo: Path, tmp_path: Path, capsys: pytest.Cap
 
 def test_a_file_is_no_array_of_zarr(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "out.zarr").write_text("mine")
-    assert "is a file, but no array of zarr" in refused(capsys, "detail", photo, tmp_path / "out.zarr")
+    assert "is a file, not a zarr array" in refused(capsys, "detail", photo, tmp_path / "out.zarr")
     assert (tmp_path / "out.zarr").read_text() == "mine"
 
 
 def test_damaged_tiff_is_one_sentence(photo: Path, tmp_path: Path) -> None:
-    """In a process of its own: pytest has a handler for logs, without which they go to the error stream."""
+    """In a separate process, since pytest handles log messages, which otherwise go to standard error."""
     whole = tmp_path / "whole.tif"
     tifffile.imwrite(whole, np.zeros((16, 20, 3), np.uint8))
     (tmp_path / "cut.tif").write_bytes(whole.read_bytes()[:100])
@@ -210,8 +210,8 @@ def test_damaged_tiff_is_one_sentence(photo: Path, tmp_path: Path) -> None:
 def test_odd_names(
     photo: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rich takes square brackets for markup, and `[/]` alone for an error."""
-    monkeypatch.setenv("COLUMNS", "500")  # no line of a long path is broken
+    """Rich treats square brackets as markup, and `[/]` alone as an error."""
+    monkeypatch.setenv("COLUMNS", "500")  # long paths are not wrapped
     folder = tmp_path / "[" / "b]"
     folder.mkdir(parents=True)
     source = folder / name
@@ -221,7 +221,7 @@ def test_odd_names(
 
 
 def part_of(path: Path) -> Path:
-    """What a process that was killed while it wrote ``path`` leaves."""
+    """Make the file that a process leaves when it is killed while writing ``path``."""
     part = files.name_beside(path)
     part.write_text("half")
     return part
@@ -230,7 +230,7 @@ def part_of(path: Path) -> Path:
 def test_stale_parts_of_the_same_output_are_removed(photo: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.png"
     stale, other = part_of(out), part_of(tmp_path / "other.png")
-    unlike = tmp_path / ".out.png.mine.part"  # of someone else
+    unlike = tmp_path / ".out.png.mine.part"  # of another file
     unlike.write_text("mine")
     assert main(["detail", str(photo), str(out), "--alpha", "1,1"]) == 0
     assert not stale.exists()
@@ -241,7 +241,7 @@ def test_stale_parts_of_the_same_output_are_removed(photo: Path, tmp_path: Path)
 def test_parts_that_are_being_written_stay(tmp_path: Path) -> None:
     out, claimed = tmp_path / "out.txt", part_of(tmp_path / "out.txt")
     with claimed.open() as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)  # as another process that writes it
+        fcntl.flock(stream, fcntl.LOCK_EX)  # like another process that is writing it
         with open_beside(out) as first:
             first.write(b"first")
             with open_beside(out) as second:
@@ -266,14 +266,14 @@ def test_names_too_long_are_told(photo: Path, tmp_path: Path, capsys: pytest.Cap
 def test_signals_while_modules_are_imported(
     photo: Path, tmp_path: Path, number: signal.Signals, status: int, told: str
 ) -> None:
-    """Also where the module that is imported takes every exception for something else."""
+    """Also if the imported module converts every exception into another one."""
     (tmp_path / "torch.py").write_text(
         f"import os, time\ntry:\n    os.kill(os.getpid(), {int(number)})\n    time.sleep(60)\n"
         "except BaseException as error:\n    raise ImportError('no torch') from error\n"
     )
     program = (
         "import signal, sys\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of shells ignore it
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
         "from nlfilter_torch.cli import main\n"
         f"sys.path.insert(0, {str(tmp_path)!r})\n"
         "sys.exit(main(sys.argv[1:]))\n"
@@ -350,7 +350,7 @@ def test_commands_that_need_no_filter_import_none(arguments: list[str]) -> None:
 
 
 def test_public_names_are_one_table() -> None:
-    """What type checkers see is what :func:`__getattr__` gives."""
+    """Names seen by type checkers are those that :func:`__getattr__` returns."""
     tree = ast.parse(Path(nlfilter_torch.__file__).read_text())
     typed = {
         alias.asname: statement.module

@@ -1,4 +1,4 @@
-"""What the command line says and shows of scribbles: their colours, notes, shares of the picture, a picture of it."""
+"""Messages and pictures of scribbles on the command line: colours, notes, positions in per cent, and `--show`."""
 
 from pathlib import Path
 
@@ -65,7 +65,7 @@ def test_colours_notes_and_a_picture(
     region = ("--region", "24,28,10,8:blue")
     assert main(["recolor", str(photo), str(out), *region, "--keep", "80,4,8,8", "--show", str(shown), *memory]) == 0
     said = capsys.readouterr()
-    assert "--region 24,28,10,8: 80 pixels, most of them about #c" in said.out
+    assert "--region 24,28,10,8: 80 pixels, median colour #c" in said.out
     assert "--keep 80,4,8,8: 64 pixels" in said.out
     assert "note" not in said.err
     before, after = rgb(photo), rgb(shown)
@@ -79,7 +79,7 @@ def test_colours_notes_and_a_picture(
 
 def test_a_scribble_over_unlike_things(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["recolor", str(photo), str(tmp_path / "out.png"), "--region", "40,28,18,8:blue"]) == 0
-    assert "note: --region 40,28,18,8 covers very different pixels" in capsys.readouterr().err
+    assert "note: --region 40,28,18,8 covers very different colours" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

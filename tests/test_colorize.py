@@ -1,4 +1,4 @@
-"""Colourising: colours come back from strokes, and luminance stays what it was."""
+"""Colourising: colours are recovered from strokes, and the luminance is unchanged."""
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def test_a_line_between_equal_greys_keeps_their_colours_apart() -> None:
     left, right = box(10, 24, size=(40, 60)), box(26, 33, size=(40, 60))
     found = colorize(grey, paint(0.8, 0.2, 0.2, left) + paint(0.2, 0.2, 0.8, right), left + right, num_landmarks=40)
     redder = (found[:, 0] - found[:, 2])[0]
-    # By similarity alone a quarter of the right would be red.
+    # With similarity alone, a quarter of the right half would be red.
     assert (redder[:, :28] > 0).float().mean() > 0.97
     assert (redder[:, 32:] < 0).float().mean() > 0.97
 

@@ -1,4 +1,4 @@
-"""Defocus: the subject stays sharp, the rest does not, and neither bleeds into the other."""
+"""Defocus: the subject stays sharp, the rest is blurred, and neither bleeds into the other."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The demo writes pictures that show something, and the figures are laid out to the pixel."""
+"""The demo writes its pictures, and figures are laid out to the pixel."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before, after = panels[35:547, 15:527].astype(int), panels[35:547, 542:1054].astype(int)
     assert np.abs(before - skimage.data.astronaut()).max() <= 1
     assert np.abs(after - before).mean() > 5
-    # The selection covers the suit that it started on and nothing of the background.
+    # The selection covers the suit, on which the region lies, and nothing of the background.
     with Image.open(folder / "5-selection.png") as picture:
         mask = np.asarray(picture.convert("L"))[35:547, 542:1054] / 255
     assert mask[300:320, 60:80].mean() > 0.8
@@ -67,7 +67,7 @@ def test_grey_images_and_rows(tmp_path: Path) -> None:
 
 
 def test_large_titles_take_several_lines(tmp_path: Path) -> None:
-    """As high as they are asked to be, above the pictures and no wider than these."""
+    """Titles have the requested height, and are above the pictures and no wider than they are."""
     white = torch.ones(1, 3, 100, 200)
     for title, lines in (("one", 1), ("several words in a row, on some lines", 4)):
         figure = rendered(show_images({title: white, "b": white}, side=200, letters=27), tmp_path)
@@ -82,7 +82,7 @@ def test_large_titles_take_several_lines(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("constant", [False, True])
 def test_figures_of_any_image(tmp_path: Path, constant: bool) -> None:
-    """A constant image has empty layers and few eigenvectors; its figures are drawn all the same."""
+    """A constant image has empty layers and few eigenvectors; its figures can still be drawn."""
     noise = torch.rand(1, 3, 24, 30, generator=torch.Generator().manual_seed(0))
     image = torch.full_like(noise, 0.4) if constant else noise
     operator = nonlocal_operator(image, num_landmarks=12)

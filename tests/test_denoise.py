@@ -1,4 +1,4 @@
-"""Denoising: photographs come closer to what they were, and noise is estimated."""
+"""Denoising: photographs come closer to the originals, and noise is estimated."""
 
 import pytest
 import torch

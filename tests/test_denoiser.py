@@ -1,4 +1,4 @@
-"""The trained denoiser: nothing without noise, tiles without seams, all kinds of noise, gradients, and its file."""
+"""The trained denoiser: no change without noise, no seams between tiles, kinds of noise, gradients, and its file."""
 
 import json
 from pathlib import Path
@@ -70,12 +70,21 @@ def test_tiles_put_together_what_they_took_apart(size: tuple[int, int]) -> None:
     torch.testing.assert_close(in_tiles(image, noise, lambda x, n: x + n), image + noise, rtol=0, atol=1e-6)
 
 
+def test_tiles_cover_images_of_every_size() -> None:
+    for length in range(1, 600):
+        tiles = module._divided(length)
+        assert [tile.start for tile in tiles] == [STEP * n for n in range(len(tiles))]
+        assert tiles[-1].stop >= length + 2 * module.BORDER
+        assert all(tile.stop - tile.start == SIDE for tile in tiles[:-1])
+        assert tiles[-1].stop - tiles[-1].start <= SIDE
+
+
 def test_rows_that_begin_at_a_tile_are_those_of_the_whole() -> None:
     image = noisy(colour("chelsea", 300, 150)[:, :1], 0.1)
     noise = torch.full_like(image, 0.1)
     with torch.no_grad():
-        whole = in_tiles(image, noise, TRAINED_ONE.noise_in)
-        lower = in_tiles(image[..., STEP:, :], noise[..., STEP:, :], TRAINED_ONE.noise_in)
+        whole = in_tiles(image, noise, TRAINED_ONE.estimate_noise)
+        lower = in_tiles(image[..., STEP:, :], noise[..., STEP:, :], TRAINED_ONE.estimate_noise)
     torch.testing.assert_close(lower[..., SIDE:, :], whole[..., STEP + SIDE :, :], rtol=0, atol=1e-5)
 
 
@@ -107,7 +116,7 @@ def test_turns_are_averaged_and_better() -> None:
         half = TRAINED_ONE(image.rot90(2, (2, 3)), 0.1).rot90(2, (2, 3))
     scores = [decibels(found[turns], CAT) for turns in (1, 2, 4)]
     assert scores == sorted(scores)
-    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # of other tiles
+    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # the tiles differ
     with pytest.raises(ValueError, match="turns must be 1, 2 or 4, got 3"):
         TRAINED_ONE(image, 0.1, turns=3)
 
@@ -196,7 +205,7 @@ def test_noise_that_grows_with_the_light_is_found() -> None:
 
 
 def test_noise_is_not_that_of_the_dark() -> None:
-    """A bright disc before black: the flattest windows are black, and say little about the disc."""
+    """A bright disc on black: the flattest windows are black, and their noise is not that of the disc."""
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 200), indexing="ij")
     radius = (rows.square() + columns.square()).sqrt()
     clean = torch.where(radius < 0.85, 0.6 - 0.25 * radius, 0.0)[None, None]
@@ -208,7 +217,7 @@ def test_noise_is_not_that_of_the_dark() -> None:
 
 @pytest.mark.parametrize("level", [5, 15, 25, 50])
 def test_noise_is_found_beside_texture(level: int) -> None:
-    """Half of the picture is gravel, whose finest detail is as strong as noise of 20 levels."""
+    """Half of the picture is gravel, whose finest detail is as strong as noise of 20 grey levels."""
     gravel = picture("gravel", 160, 160, torch.float32)
     clean = torch.cat([gravel, torch.linspace(0.3, 0.7, 160).expand(1, 1, 160, 160)], dim=3)
     found = 255 * estimate_noise(noisy(clean, level / 255))
@@ -247,11 +256,13 @@ def test_bad_input(image: Tensor, noise: object, error: type[Exception], message
 
 
 def test_the_edit_refuses_what_it_cannot_take() -> None:
-    with pytest.raises(ValueError, match=r"noise_level must be a number or \(B,\) for the rule, got a map"):
+    with pytest.raises(
+        ValueError, match=r"noise_level must be a number or have shape \(B,\) for method rule, got a map"
+    ):
         denoise(CAT, noise_level=torch.zeros_like(CAT), method="rule")
     with pytest.raises(ValueError, match="method must be one of 'network', 'rule', got 'luck'"):
         denoise(CAT, method="luck")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="denoise takes no argument landmark"):
+    with pytest.raises(TypeError, match="denoise has no argument landmark"):
         denoise(CAT, landmark=3)
 
 
@@ -311,5 +322,7 @@ def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.Monkey
 
     image = torch.zeros(1, 1, 400, 300)
     in_tiles(image, noise_map(0.1, image), watched)
-    assert {size[1:] for size in seen} == {(module.SIDE, module.SIDE)}
-    assert max(size[0] for size in seen) <= module.TOGETHER
+    sides = {side for size in seen for side in size[1:]}
+    assert min(sides) >= module.SMALLEST
+    assert max(sides) == module.SIDE
+    assert max(size[0] for size in seen) <= module.TILE_BATCH

@@ -1,4 +1,4 @@
-"""Data-parallel training: two processes see half of a batch each, and learn what one process learns from all of it."""
+"""Data-parallel training: two processes with half of a batch each learn what one process learns from all of it."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ STEPS = 3
 
 
 class Network(nn.Module):
-    """Convolutions that make the guide, and a filter all of whose parts learn."""
+    """A convolution that computes the guide, and a filter with all parameters learned."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,5 +72,5 @@ def test_two_processes_learn_what_one_learns(tmp_path: Path) -> None:
     for name, expected in alone.state_dict().items():
         torch.testing.assert_close(states[0][name], states[1][name], atol=0, rtol=0)
         torch.testing.assert_close(states[0][name], expected, atol=1e-5, rtol=1e-4)
-        if name != "guide.bias":  # a guide that is brighter all over makes the same filter
+        if name != "guide.bias":  # a constant added to the guide does not change the filter
             assert not torch.allclose(expected, start[name], atol=1e-4), f"{name} did not learn"

@@ -1,4 +1,4 @@
-"""The pages of docs/ build without a warning or a look at the network; their code runs, and what they say is so."""
+"""The pages of docs/ build without warnings and without network access; their code runs, and their claims hold."""
 
 import inspect
 import re
@@ -24,13 +24,13 @@ CLIENTS = (
     "onnxscript",
     "pytorch_lightning",
     "huggingface_hub",
-)  # what the page of that name imports and not every installation has
+)  # imported by the page of that name, and not part of every installation
 PAGES = {page.path.stem: page for page in DOCS}
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with the photograph that the pages speak of in it."""
+    """The current folder, containing the photograph that the pages use."""
     Image.fromarray(skimage.data.coffee()[::4, ::4]).save(tmp_path / "photo.jpg")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -40,7 +40,7 @@ def test_there_are_pages() -> None:
     assert {"index", "presets", "choosing", "how-it-works", "training", "paper"} <= PAGES.keys()
 
 
-# torch's own, and Lightning's advice.
+# Warnings of torch itself, and advice of Lightning.
 @pytest.mark.filterwarnings("ignore:`isinstance.treespec, LeafSpec.` is deprecated:FutureWarning")
 @pytest.mark.filterwarnings("ignore:The 'train_dataloader' does not have many workers")
 @pytest.mark.filterwarnings("ignore:The number of training batches")
@@ -67,7 +67,7 @@ def test_links_modules_and_targets_are_there(page: Page) -> None:
 
 
 class Loaded(HTMLParser):
-    """What a page loads when it is looked at."""
+    """Addresses that a page loads when it is opened."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
 
 
 def test_the_reference_has_every_public_name(site: Path) -> None:
-    """On the page of its topic, which the first page of the reference links."""
+    """Each name is on the page of its topic, to which the first page of the reference links."""
     first = (site / "reference.html").read_text(encoding="utf-8")
     pages = {page.stem: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
     for name in nlfilter_torch.__all__:
@@ -124,7 +124,7 @@ def test_pictures_are_small() -> None:
         assert picture.stat().st_size < 600_000, picture
 
 
-# --- what the pages say
+# --- claims of the pages
 
 
 def test_every_equation_and_figure_of_the_paper_has_a_line() -> None:

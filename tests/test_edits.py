@@ -1,4 +1,4 @@
-"""What is true of every edit: dtypes, batches, repetition, gradients and bad input."""
+"""Properties of every edit: dtypes, batches, repetition, gradients and bad input."""
 
 from collections.abc import Callable
 
@@ -71,7 +71,7 @@ def test_edits_have_finite_gradients(name: str) -> None:
 @each_edit
 def test_edits_refuse_integers_and_other_shapes(name: str) -> None:
     image, edit = EDITS[name]
-    with pytest.raises(TypeError, match="must be of a floating-point dtype with values in"):
+    with pytest.raises(TypeError, match="must have a floating-point dtype with values in"):
         edit((image * 255).byte())
     with pytest.raises(ValueError, match=r"must have shape \(B, C, H, W\)"):
         edit(image[0])

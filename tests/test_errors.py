@@ -37,7 +37,7 @@ NAN, INFINITY = float("nan"), float("inf")
 
 
 def raises(call: Callable[[], object], error: type[Exception], message: str) -> None:
-    """``<argument> must <requirement>, got <value>; <remedy>``, on one line, which begins with ``message``."""
+    """Check for ``<argument> must <requirement>, got <value>; <remedy>`` on one line that begins with ``message``."""
     with pytest.raises(error) as caught:
         call()
     found = str(caught.value)
@@ -48,7 +48,7 @@ def raises(call: Callable[[], object], error: type[Exception], message: str) -> 
 
 # --- images
 
-FLOATS = "must be of a floating-point dtype with values in [0, 1], got"
+FLOATS = "must have a floating-point dtype with values in [0, 1], got"
 BAD_IMAGES: dict[str, tuple[Any, type[Exception], str]] = {
     "array": (np.zeros((2, 1, 8, 9)), TypeError, "must be a torch.Tensor, got ndarray"),
     "list": ([[0.0]], TypeError, "must be a torch.Tensor, got list"),
@@ -90,7 +90,7 @@ def test_bad_images(function: str, bad: str) -> None:
 
 
 def test_empty_batches_are_refused_where_they_make_no_sense() -> None:
-    fits = ("nonlocal_operator", "estimate_bandwidth")  # all others have two images beside none
+    fits = ("nonlocal_operator", "estimate_bandwidth")  # all others: two images against an empty batch
     for function, (name, call) in TAKE_AN_IMAGE.items():
         if function not in fits:
             name = "image" if function == "NonlocalFilter" else name
@@ -176,7 +176,9 @@ def test_bad_rank(rank: Any, error: type[Exception], message: str) -> None:
 
 def test_dense_matrix_of_a_large_image_is_refused() -> None:
     operator = nonlocal_operator(noise(1, 1, 129, 128), num_landmarks=5, photometric_bandwidth=0.5)
-    with pytest.raises(ValueError, match=r"must have at most 16384 pixels to be dense, got 16512; use a smaller image"):
+    with pytest.raises(
+        ValueError, match=r"must have at most 16384 pixels for a dense matrix, got 16512; use a smaller image"
+    ):
         operator.to_dense()
 
 
@@ -185,7 +187,7 @@ def test_dense_matrix_of_a_large_image_is_refused() -> None:
 TWO = "must have at least two entries, got 1"
 BAD_SLIDERS: list[tuple[Any, type[Exception], str]] = [
     ([1.0, 1.0], TypeError, "must be a torch.Tensor, got list; convert"),
-    (torch.tensor([1, 1]), TypeError, "must be of a floating-point dtype, got torch.int64"),
+    (torch.tensor([1, 1]), TypeError, "must have a floating-point dtype, got torch.int64"),
     (torch.ones(1), ValueError, TWO),
     (torch.ones(2, 1), ValueError, TWO),
     (torch.ones(2, 1, 8, 9), ValueError, TWO),
@@ -223,16 +225,20 @@ BAD_MASKS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: diffusion_mask(SPECTRUM, PAINTED, width=0.0), ValueError, f"width {POSITIVE} 0.0"),
     (lambda: diffusion_mask(SPECTRUM, PAINTED, width="4"), TypeError, f"width {NUMBER} str"),
     (lambda: diffusion_mask(SPECTRUM, -PAINTED), ValueError, "region must be non-negative, got -1"),
-    (lambda: diffusion_mask(SPECTRUM, EMPTY), ValueError, "region must each hold a pixel of positive weight, got an"),
+    (
+        lambda: diffusion_mask(SPECTRUM, EMPTY),
+        ValueError,
+        "region must hold a pixel of positive weight in every mask, got an",
+    ),
     (
         lambda: segment_mask(SPECTRUM, torch.cat([PAINTED, EMPTY], dim=1)),
         ValueError,
-        "regions must each hold a pixel of positive weight, got an empty one",
+        "regions must hold a pixel of positive weight in every mask, got an empty one",
     ),
     (
         lambda: diffusion_mask(SPECTRUM, PAINTED, negative=PAINTED.expand(-1, 3, -1, -1)),
         ValueError,
-        "negative must have 1 channel or the region's 1, got 3",
+        "negative must have 1 channel or those of region, 1, got 3",
     ),
 ]
 
@@ -242,12 +248,12 @@ def test_bad_arguments_of_masks(call: Callable[[], object], error: type[Exceptio
     raises(call, error, message)
 
 
-# --- what an error or a warning leaves behind
+# --- state after an error or a warning
 
 
 @pytest.mark.parametrize(("landmarks", "alarm"), [(100, 1.0), (20, 0.0)], ids=["too many landmarks", "no balance"])
 def test_warnings_point_at_the_caller(landmarks: int, alarm: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    # No small image leaves the row sums off by what is worth a warning, so any deviation has to do.
+    # Row sums of small images are too accurate for a warning, so here any deviation raises one.
     monkeypatch.setattr("nlfilter_torch.operator.balancing.ALARM", {GUIDE.dtype: alarm})
     monkeypatch.setattr("nlfilter_torch.operator.balancing.TOLERANCE", {GUIDE.dtype: 1e-17})
     with warnings.catch_warnings(record=True) as caught:

@@ -1,4 +1,4 @@
-"""Image files: every type and depth keeps its exact values, its alpha, EXIF and profile; bad ones get one sentence."""
+"""Image files: every type and depth keeps exact values, alpha, EXIF and profile; bad files get one sentence."""
 
 import contextlib
 import io
@@ -23,7 +23,7 @@ CHANNELS = (1, 2, 3, 4)  # grey, grey + alpha, RGB, RGBA
 
 
 def stored_values(channels: int, depth: str) -> np.ndarray:
-    """(5, 7, channels) pseudo-random values of ``depth``, the extremes among them."""
+    """Pseudo-random values (5, 7, channels) of ``depth``, including the extremes."""
     draw = np.random.default_rng(channels)
     if depth.startswith("float"):
         return draw.normal(0.5, 1, (5, 7, channels)).astype(depth)
@@ -34,7 +34,7 @@ def stored_values(channels: int, depth: str) -> np.ndarray:
 
 
 def photograph(values: np.ndarray, **fields: bytes) -> Photograph:
-    """What reading ``values`` from a file must give."""
+    """The photograph expected from a file with ``values``."""
     integer = np.issubdtype(values.dtype, np.integer)
     kind = np.float64 if values.dtype == np.float64 else np.float32
     scaled = values.astype(kind) / (np.iinfo(values.dtype).max if integer else 1)
@@ -199,7 +199,7 @@ def test_stored_kinds_are_made_plain(tmp_path: Path) -> None:
     assert torch.equal(clear[0, 0], torch.from_numpy(np.asarray(palette) != 1).float())
     assert torch.equal(read_photograph(tmp_path / "bits.png").pixels[0, 0], torch.eye(4))
 
-    bare = {"metadata": None, "software": False}  # tifffile else describes the array in tags of its own
+    bare = {"metadata": None, "software": False}  # otherwise tifffile describes the array in its own tags
     grey, rgba = stored_values(1, "uint16")[..., 0], stored_values(4, "uint16")
     tifffile.imwrite(tmp_path / "inverted.tif", grey, photometric="miniswhite", byteorder=">")
     assert torch.equal(read_photograph(tmp_path / "inverted.tif").pixels, photograph(65535 - grey[..., None]).pixels)
@@ -307,7 +307,7 @@ def bad_file(folder: Path, kind: str) -> Path:
         ("cmyk", "is stored in CMYK colours"),
         ("cmyk TIFF", "is stored in SEPARATED colours"),
         ("int16 TIFF", "stores its channels as int16"),
-        ("12 bit TIFF", "has 12 bits a channel"),
+        ("12 bit TIFF", "has 12 bits per channel"),
         ("five channel TIFF", "has 5 channels"),
         ("volume TIFF", "has the axes"),
         ("nan TIFF", "holds NaN or infinite pixels"),
@@ -343,7 +343,7 @@ def test_floats_of_64_bits_need_twice_the_memory(tmp_path: Path, monkeypatch: py
 
 def test_a_decompression_bomb_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_photograph(photograph(stored_values(3, "uint8")), tmp_path / "in.png")
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)  # between once and twice as much, Pillow warns
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)  # between this limit and twice as much, Pillow warns
     read_photograph(tmp_path / "in.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 3)
     with pytest.raises(MemoryError, match="is too large"):
@@ -361,11 +361,11 @@ def test_a_decompression_bomb_is_too_large(tmp_path: Path, monkeypatch: pytest.M
             "out.jpeg",
             "uint16",
             3,
-            "JPEG has no 16 bits a channel; write a PNG or TIFF file or choose a depth of 8 bits",
+            "JPEG has no 16 bits per channel; write a PNG or TIFF file or choose a depth of 8 bits",
         ),
-        ("out.webp", "uint16", 3, "WebP has no 16 bits a channel"),
-        ("out.avif", "uint16", 3, "AVIF has no 16 bits a channel"),
-        ("out.png", "float32", 3, "PNG has no floats a channel; write a TIFF file or choose a depth of 16 bits"),
+        ("out.webp", "uint16", 3, "WebP has no 16 bits per channel"),
+        ("out.avif", "uint16", 3, "AVIF has no 16 bits per channel"),
+        ("out.png", "float32", 3, "PNG has no floats per channel; write a TIFF file or choose a depth of 16 bits"),
     ],
 )
 def test_outputs_that_cannot_hold_the_picture(

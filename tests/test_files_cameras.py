@@ -14,12 +14,12 @@ from nlfilter_torch.io.cameras import is_heic
 from nlfilter_torch.io.photographs import TooLarge, read_photograph
 
 SCENE = skimage.data.astronaut()[60:124, 130:210]
-# From CIE XYZ to the linear RGB of sRGB, which is the camera's here.
+# From CIE XYZ to linear sRGB, the colour space of this camera.
 SRGB = np.linalg.inv([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
 
 def write_dng(path: Path, scene: np.ndarray, orientation: int = 1) -> None:
-    """What a camera with a Bayer filter, white at 16,000, saw of a scene in sRGB."""
+    """Write a scene in sRGB as the file of a camera with a Bayer filter and white at 16,000."""
     light = scene / 255.0
     light = np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)
     mosaic = light[..., 1].copy()
@@ -64,13 +64,13 @@ def test_a_command_takes_raw(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["tone", str(tmp_path / "in.dng"), str(tmp_path / "out.png"), *options]) == 0
     assert read_photograph(tmp_path / "out.png").depth == "uint16"
     assert main(["tone", str(tmp_path / "in.dng"), str(tmp_path / "out.jpg"), *options]) == 2
-    assert "JPEG has no 16 bits a channel; write a PNG or TIFF file or choose" in capsys.readouterr().err
+    assert "JPEG has no 16 bits per channel; write a PNG or TIFF file or choose" in capsys.readouterr().err
     assert main(["tone", str(tmp_path / "in.dng"), str(tmp_path / "out.jpg"), *options, "--depth", "8"]) == 0
     assert main(["tone", str(tmp_path / "in.dng"), str(tmp_path / "out.dng"), *options]) == 2
     assert "must end in .png, .jpg, .webp, .avif or .tif, got '.dng'" in capsys.readouterr().err
     (tmp_path / "bad.cr2").write_bytes(b"II*\0 nothing of a camera")
     assert main(["tone", str(tmp_path / "bad.cr2"), str(tmp_path / "out.png")]) == 2
-    assert "bad.cr2 is no RAW file that can be read, or is damaged" in capsys.readouterr().err
+    assert "bad.cr2 cannot be read as a RAW file, or is damaged" in capsys.readouterr().err
 
 
 def test_heic_is_read_upright_with_its_notes(tmp_path: Path) -> None:
@@ -117,5 +117,5 @@ def test_without_the_extra_it_says_so(
 ) -> None:
     (tmp_path / name).write_bytes(b"\0\0\0\x1cftypheic\0\0\0\0mif1heic" + bytes(40))
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ValueError, match=rf"which is missing; install nlfilter-torch\[{extra}\]"):
+    with pytest.raises(ValueError, match=rf"which is not installed; install nlfilter-torch\[{extra}\]"):
         read_photograph(tmp_path / name)

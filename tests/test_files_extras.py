@@ -1,4 +1,4 @@
-"""XMP and the resolution in print: carried from every file to every other, in memory and in tiles."""
+"""XMP and the print resolution are copied from every file type to every other, in memory and in tiles."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def test_files_hold_them(tmp_path: Path, name: str, depth: str) -> None:
     path = tmp_path / name
     write_photograph(Photograph(cat(4), depth, extras=EXTRAS), path)  # type: ignore[arg-type]
     check(path)
-    with Image.open(path) as opened:  # as another program finds them
+    with Image.open(path) as opened:  # as read by another program
         opened.load()
     assert read_photograph(path).extras == read_extras(path)
 

@@ -1,4 +1,4 @@
-"""What image files say beside their pixels: fields without sense are ignored, and the others are kept."""
+"""Metadata of image files: invalid fields are ignored, and the others are kept."""
 
 import struct
 from pathlib import Path
@@ -13,7 +13,7 @@ from tests.test_files import photograph, stored_values, tags
 
 
 def odd_exif(kind: str) -> bytes:
-    """A block with the maker's name, and a field that makes no sense."""
+    """An EXIF block with the maker's name and an invalid field."""
 
     def field(tag: int, number_type: int, count: int, value: bytes) -> bytes:
         return struct.pack("<HHL", tag, number_type, count) + value

@@ -69,7 +69,7 @@ def test_distance_does_not_count_unless_asked_for() -> None:
 
 
 def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sums over several references are those of a mean one: balancing, means, noise and all."""
+    """Several equal references give the same result as one: balancing, means and noise are averages."""
     monkeypatch.setattr("nlfilter_torch.operator.build.choose_landmarks", lambda features, *_: features[:, :, :1900:48])
     frame = crop(90, 190)
     for step in STEPS:
@@ -94,13 +94,13 @@ def test_steps_follow_each_other() -> None:
     found = FilmEdit(Recipe(steps), [frame], PASSES)(frame)
     apart = np.abs(found - edited(steps[1], edited(steps[0], frame).clip(0, 1)))
     assert apart.mean() < 0.02 / 255
-    assert apart.max() < 2 / 255  # rounding decides which pixels are candidates for a landmark
+    assert apart.max() < 2 / 255  # candidates for landmarks depend on rounding
 
 
 def test_strokes_are_refused() -> None:
     stroke = Stroke(((0.5, 0.5),), 0.1, "in")
     for step in (Step("detail", (stroke,)), Step("recolor"), Step("defocus", (stroke,))):
-        with pytest.raises(ValueError, match="edits of a film must be without strokes, got"):
+        with pytest.raises(ValueError, match="edits of a film must not have strokes, got"):
             FilmEdit(Recipe((step,)), [crop(0, 0)], PASSES)
 
 
@@ -173,7 +173,7 @@ def copy(source: Path, target: Path, edit: Any = lambda frame: frame) -> int:
 
 
 def facts(path: Path) -> dict[str, Any]:
-    """What a film must keep."""
+    """Properties that an edited film must keep."""
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
         context = stream.codec_context
@@ -217,7 +217,7 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
     seen: list[np.ndarray] = []
     assert copy(source, target, lambda frame: seen.append(frame) or frame) == 10
     found, wanted = facts(target), facts(source)
-    if options.get("varying"):  # a mean over gaps between frames as they are stored, which is not in their order
+    if options.get("varying"):  # the mean gap between frames in storage order, which is not their display order
         assert abs(found.pop("rate") / wanted.pop("rate") - 1) < 0.1
     for each in (found, wanted):
         each["length"] = round(float(each["length"]), 2)  # the file counts thousandths of a second
@@ -233,7 +233,7 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
 
 
 def test_colours_are_those_that_the_tags_say(tmp_path: Path) -> None:
-    """A colour stored by the formula of each matrix is found again, in films without a tag by their height."""
+    """A colour stored with each matrix is recovered; in films without a tag, the height determines the matrix."""
     colour = np.array([0.8, 0.3, 0.2])
     for tag, size, (red, blue) in (
         (1, 48, (0.2126, 0.0722)),
@@ -268,7 +268,7 @@ def test_samples_are_spread_over_the_film(tmp_path: Path) -> None:
         places = [next(i for i, frame in enumerate(frames) if np.array_equal(frame, sample)) for sample in samples]
         assert places[0] < 4 < places[1] < 8 < places[2]
         assert 1 <= len(film.sample(100)) <= 12
-        count = write_film(film, tmp_path / "out.mp4", lambda frame: frame, lambda number: None)  # from the start again
+        count = write_film(film, tmp_path / "out.mp4", lambda frame: frame, lambda number: None)  # again from the start
     assert count == 12
 
 
@@ -322,13 +322,13 @@ def test_films_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     odd = write(tmp_path / "odd.mov", codec="mjpeg", pix_fmt="yuvj420p", size=(49, 63), options={"strict": "-1"})
     assert "is cut short: it has" in refused(capsys, tmp_path / "cut.mp4", out)
     for name in ("head.mp4", "text.mov"):
-        assert "is no film that can be read, or is cut short" in refused(capsys, tmp_path / name, out)
+        assert "cannot be read as a film, or is cut short" in refused(capsys, tmp_path / name, out)
     assert "is empty; copy it again" in refused(capsys, tmp_path / "empty.mov", out)
     assert "does not exist; check the name" in refused(capsys, tmp_path / "none.mp4", out)
-    assert "holds no film stream that can be decoded" in refused(capsys, tmp_path / "sound.mp4", out)
+    assert "holds no video stream that can be decoded" in refused(capsys, tmp_path / "sound.mp4", out)
     assert "must have an even width and height to be stored as yuv420p, got 63x49" in refused(capsys, odd, out)
-    assert "must end in .mp4 or .mov, as films do, got '.avi'" in refused(capsys, film, tmp_path / "out.avi")
-    assert "must be a film that ends in .mp4 or .mov, or a folder" in refused(capsys, Path(__file__), out)
+    assert "must end in .mp4 or .mov, got '.avi'" in refused(capsys, film, tmp_path / "out.avi")
+    assert "must be a film (.mp4 or .mov) or a folder" in refused(capsys, Path(__file__), out)
     assert not out.exists()
     assert not list(tmp_path.glob(".*.part"))
 
@@ -337,7 +337,7 @@ def test_transparency_is_refused(tmp_path: Path) -> None:
     path = write(
         tmp_path / "film.mov", codec="prores_ks", pix_fmt="yuva444p10le", sound=None, options={"profile": "4444"}
     )
-    with pytest.raises(ValueError, match="has transparency or a palette, which are not handled"), open_film(path):
+    with pytest.raises(ValueError, match="has transparency or a palette, which are not supported"), open_film(path):
         pass
 
 
@@ -346,7 +346,7 @@ def test_without_the_extra_it_says_so(
 ) -> None:
     film = write(tmp_path / "film.mp4")
     monkeypatch.setitem(sys.modules, "av", None)
-    assert "films need the package av, which is missing; install nlfilter-torch[films]" in refused(
+    assert "films need the package av, which is not installed; install nlfilter-torch[films]" in refused(
         capsys, film, tmp_path / "out.mp4"
     )
 
@@ -380,7 +380,7 @@ def test_a_film_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str
         with open_film(target) as film:
             for frame, rows in zip(film.frames(), before, strict=True):
                 wanted, found = edit(rows).clip(0, 1), film.pixels(frame)
-                # Chroma has half the resolution in the file, so that only brightness can agree.
+                # Chroma has half the resolution in the file, so only brightness can agree.
                 assert np.abs(_grey(found) - _grey(wanted)).mean() < 3 / 255
                 assert np.abs(_grey(wanted) - _grey(rows)).mean() > np.abs(_grey(found) - _grey(wanted)).mean()
         assert facts(target)["sound"] == facts(source)["sound"]
@@ -393,22 +393,22 @@ def _grey(rows: np.ndarray) -> np.ndarray:
 def test_options_of_other_edits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film, out = tmp_path / "film.mp4", tmp_path / "out.mp4"
     (tmp_path / "tone.json").write_text('{"version": 1, "steps": [{"edit": "tone"}]}')
-    assert "--contrast must come with --edit tone, got it with detail" in refused(capsys, film, out, "--contrast", 2)
-    assert "--alpha must come with --edit detail or look, got it with tone" in refused(
+    assert "--contrast must be used with --edit tone, got --edit detail" in refused(capsys, film, out, "--contrast", 2)
+    assert "--alpha must be used with --edit detail or look, got --edit tone" in refused(
         capsys, film, out, "--edit", "tone", "--alpha", "2,1"
     )
     assert "--edit must be one of denoise, detail, tone, sharpen, abstract, look, got 'recolor'" in refused(
         capsys, film, out, "--edit", "recolor"
     )
-    assert "--edit must be left out where there is a preset, got tone with crisp" in refused(
+    assert "--edit must not be given together with --preset, got tone and crisp" in refused(
         capsys, film, out, "--edit", "tone", "--preset", "crisp"
     )
-    assert "--landmarks must be left out where --preset holds another edit than detail" in refused(
+    assert "--landmarks must not be given with a --preset of edits other than detail" in refused(
         capsys, film, out, "--preset", tmp_path / "tone.json", "--landmarks", 9
     )
     painted = Recipe((Step("defocus", (Stroke(((0.5, 0.5),), 0.1, "in"),)),))
     (tmp_path / "paint.json").write_text(painted.to_json())
-    assert "edits of a film must be without strokes, got defocus" in refused(
+    assert "edits of a film must not have strokes, got defocus" in refused(
         capsys, film, out, "--preset", tmp_path / "paint.json"
     )
     assert "--bandwidth must be a positive number of grey levels, such as 20, got 'auto'" in refused(

@@ -1,4 +1,4 @@
-"""Responses, sliders, layers and captured energy: against the dense paper, and against each other."""
+"""Responses, sliders, layers and captured energy, compared with the dense reference and with each other."""
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_detail_layers_have_no_mean_and_the_smooth_one_has_it_all() -> None:
 
 @pytest.mark.parametrize("residual", [None, 0.0, 1.0])
 def test_sliders_are_those_of_the_dense_paper(residual: float | None) -> None:
-    """With every pixel a landmark V is complete, so the residual has nothing to weigh."""
+    """With every pixel a landmark, V is complete and the residual is zero."""
     image, y = photograph("astronaut", 20, 24), photograph("coffee", 20, 24)
     operator = nonlocal_operator(
         torch.from_numpy(image.copy())[None, None], photometric_bandwidth=20 / 255, num_landmarks=480
@@ -294,7 +294,7 @@ def test_coefficients_of_another_image_are_refused() -> None:
         ValueError, match=r"coefficients must have shape \(1, 1, 10\), got \(1, 3, 10\); take spectrum.coe"
     ):
         spectral_filter(spectrum, image, torch.sqrt, coefficients=held)
-    with pytest.raises(TypeError, match=r"coefficients must be a torch\.Tensor, got list; take"):
+    with pytest.raises(TypeError, match=r"coefficients must be a torch\.Tensor, got list; use"):
         spectral_filter(spectrum, image, torch.sqrt, coefficients=held.tolist())  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""``nlfilter-torch fit`` and ``detail --preset``: an edit goes into a file, and from there onto another photograph."""
+"""``nlfilter-torch fit`` and ``detail --preset``: an edit is saved to a file and applied to another photograph."""
 
 import json
 from pathlib import Path
@@ -59,7 +59,7 @@ def test_an_edit_of_another_kind_is_explained_in_part(before: Path, capsys: pyte
     after = before.with_name("after.png")
     pixels = read_photograph(before).pixels
     brighter = pixels.clone()
-    brighter[..., :40, :] = brighter[..., :40, :] + 0.1  # a place is nothing that the filter knows of
+    brighter[..., :40, :] = brighter[..., :40, :] + 0.1  # the filter does not depend on position
     write_photograph(Photograph(brighter), after)
     assert fit(before, after, before.with_name("look.json"), "--bandwidth", 10) == 0
     explained = float(capsys.readouterr().out.split("explained: ")[1].split(" %")[0])
@@ -99,18 +99,18 @@ def test_preset_keeps_every_entry() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("alpha = 1", "look.json is no preset: it is not JSON"),
-        ("[1, 2]", "look.json is no preset: it must hold a list of steps"),
-        ('{"bandwidth": 3}', "look.json is no preset: it must hold a list of steps"),
-        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must be a file with one step, of detail and without"),
-        ('{"alpha": [1]}', "alpha in look.json must be a list of 2 to 100 numbers, none beyond 1000000, got [1]"),
+        ("alpha = 1", "look.json is not a preset: it is not JSON"),
+        ("[1, 2]", "look.json is not a preset: it must hold a list of steps"),
+        ('{"bandwidth": 3}', "look.json is not a preset: it must hold a list of steps"),
+        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step without"),
+        ('{"alpha": [1]}', "alpha in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got [1]"),
         ('{"alpha": [1, NaN]}', "alpha in look.json must be a list of 2 to 100 numbers"),
         ('{"alpha": [1, 1], "bandwidth": 0}', "bandwidth in look.json must be a positive number of grey levels"),
         ('{"alpha": [1, 1], "spatial_bandwidth": "far"}', "spatial_bandwidth in look.json must be a positive number"),
         ('{"alpha": [1, 1], "patch_size": 4}', "patch_size in look.json must be an odd number from 1 to 99, got 4"),
         ('{"alpha": [1, 1], "landmarks": true}', "landmarks in look.json must be a whole number from 1 to 10000"),
         ('{"alpha": [1, 1], "sampling": "best"}', 'sampling in look.json must be "kmeans", "uniform" or "random"'),
-        ('{"alpha": [1, 1], "colour": 1}', "look.json must hold no other entries than alpha, inside, residual"),
+        ('{"alpha": [1, 1], "colour": 1}', "look.json must have no entries other than alpha, inside, residual"),
     ],
 )
 def test_a_preset_that_is_none_is_told(

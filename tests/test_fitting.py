@@ -1,4 +1,4 @@
-"""Sliders from a pair of images: what went in comes out, through rounding, clipping, masks and other losses."""
+"""Sliders from a pair of images are recovered despite rounding and clipping, with masks and with other losses."""
 
 import io
 
@@ -59,7 +59,7 @@ def test_an_8_bit_png_gives_its_sliders_to_5_per_cent(name: str, alpha: tuple[fl
 
 
 def test_rounding_misleads_plain_least_squares() -> None:
-    # Why errors below half a level are left out: on this picture they are no noise.
+    # Errors below half a level are therefore ignored: on this picture they do not behave like noise.
     image = grey("camera", 192)
     operator = nonlocal_operator(image, photometric_bandwidth=10 / 255)
     wanted = torch.tensor(ALPHAS[0])
@@ -158,7 +158,7 @@ def test_another_loss_is_made_small_by_descent() -> None:
     operator = nonlocal_operator(image, num_landmarks=50)
     wanted = torch.tensor([2.0, 1.5, 0.7, 1.0])
     target = polynomial_filter(operator, image, wanted)
-    target[torch.rand(target.shape, generator=seeded()) < 0.05] = 1.0  # dust, which least squares falls for
+    target[torch.rand(target.shape, generator=seeded()) < 0.05] = 1.0  # dust, which misleads least squares
     absolute = fit_alpha(operator, image, target, loss=torch.nn.functional.l1_loss)
     assert (absolute[0] - wanted).abs().max() < 0.02
     assert (fit_alpha(operator, image, target)[0] - wanted).abs().max() > 0.2
@@ -213,7 +213,7 @@ def test_half_precision_and_autocast_change_the_dtype_alone() -> None:
         ),
         ({"target": torch.rand(1, 3, 8, 8)}, ValueError, r"target must have 1 channel\(s\), got 3"),
         ({"target": torch.rand(3, 1, 8, 8)}, ValueError, r"target must have batch size 1 or 2, got 3"),
-        ({"target": torch.ones(1, 1, 8, 8, dtype=torch.uint8)}, TypeError, "target must be of a floating-point dtype"),
+        ({"target": torch.ones(1, 1, 8, 8, dtype=torch.uint8)}, TypeError, "target must have a floating-point dtype"),
         ({"image": torch.rand(2, 1, 9, 8)}, ValueError, "image must have the height and width of the operator"),
         ({"mask": torch.zeros(1, 1, 8, 8)}, ValueError, "mask must hold a pixel of positive weight"),
         ({"mask": -torch.ones(1, 1, 8, 8)}, ValueError, "mask must be non-negative, got -1"),
@@ -238,7 +238,7 @@ def test_bad_input_is_one_clear_sentence(changes: dict[str, object], error: type
 def test_layers_that_are_tiny_multiples_of_others_rest(
     level: float, bandwidth: float | str, dtype: torch.dtype
 ) -> None:
-    """Under a constant guide the second layer of any image is some billionths of its first."""
+    """With a constant guide the second layer of any image is a few billionths of its first."""
     operator = nonlocal_operator(
         torch.full((1, 1, 13, 9), level, dtype=dtype), photometric_bandwidth=bandwidth, num_landmarks=40
     )

@@ -1,4 +1,4 @@
-"""A filter fitted to one image and applied to others: exact on its own, alike for equal patches, without flicker."""
+"""A filter fitted to one image and applied to others: exact on its own image, equal for equal patches, no flicker."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -48,7 +48,7 @@ def test_on_its_own_image_it_is_the_filter(completion: str, spatial_bandwidth: f
 
 
 def test_a_tile_is_a_part_of_the_whole() -> None:
-    """With the margin of half a patch around it, to which its own border is padding."""
+    """The tile has a margin of half a patch, whose border is padded."""
     image = picture("astronaut", 40, 44)
     operator = build(image, num_landmarks=60, photometric_bandwidth=0.2, spatial_bandwidth=15.0)
     fitted, whole = fit_filter(operator, image), detail_layers(operator, image)
@@ -94,7 +94,7 @@ def test_gradients_reach_frame_and_reference() -> None:
 
 
 def pan(count: int, step: int, height: int = 100, width: int = 120) -> list[torch.Tensor]:
-    """Frames of a camera that moves over the astronaut, ``step`` pixels to the right and down each time."""
+    """Frames of a camera that moves over the astronaut by ``step`` pixels to the right and down."""
     scene = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / 255
     return [
         scene[..., 60 + step * i : 60 + step * i + height, 130 + step * i : 130 + step * i + width]
@@ -103,7 +103,7 @@ def pan(count: int, step: int, height: int = 100, width: int = 120) -> list[torc
 
 
 def flicker(edited: list[torch.Tensor], step: int) -> float:
-    """Mean difference of successive frames, moved back."""
+    """Return the mean difference of successive frames after alignment."""
     pairs = pairwise(edited)
     return float(torch.stack([(a[..., step:, step:] - b[..., :-step, :-step]).abs().mean() for a, b in pairs]).mean())
 
@@ -116,7 +116,7 @@ def test_ten_frames_of_a_pan_do_not_flicker() -> None:
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
     each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
     assert flicker(together, step) <= flicker(each, step) / 4
-    # And it is the same edit: the frames differ from those edited alone by less than the edit changes them.
+    # The edit is the same: frames differ from frames edited alone by less than the edit changes them.
     change = torch.stack([(a - b).abs().mean() for a, b in zip(each, film, strict=True)]).mean()
     apart = torch.stack([(a - b).abs().mean() for a, b in zip(each, together, strict=True)]).mean()
     assert apart < change / 3
@@ -160,7 +160,7 @@ def test_frames_are_read_one_at_a_time() -> None:
     ("arguments", "sentence"),
     [
         ({"references": []}, "references must hold at least one frame, got none"),
-        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must be a single frame where"),
+        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must hold a single frame if"),
         (
             {"references": [*pan(1, 1, 20, 20), *pan(1, 1, 20, 21)]},
             "references must have the height and width of the first",
@@ -176,7 +176,7 @@ def test_bad_references(arguments: dict, sentence: str) -> None:
 def test_bad_fits_and_frames() -> None:
     image = noise(1, 1, 12, 13)
     operator = build(image, num_landmarks=20)
-    with pytest.raises(ValueError, match=r"image must be one image, as the operator's must, got 2 and 1"):
+    with pytest.raises(ValueError, match=r"image and operator must have batch size 1, got 2 and 1"):
         fit_filter(operator, image.expand(2, -1, -1, -1))
     with pytest.raises(ValueError, match="order must be at least 1, got 0"):
         fit_filter(operator, image, order=0)
@@ -246,8 +246,8 @@ def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
     write_photograph(Photograph(pan(1, 1, 20, 22)[0]), tmp_path / "film" / "b.png")
     assert "is no folder; name the one that holds the frames" in refused(tmp_path / "none", tmp_path / "out")
     assert "holds no PNG, JPEG, TIFF, WebP or AVIF file" in refused(tmp_path / "empty", tmp_path / "out")
-    assert "must be another folder than that of the frames" in refused(tmp_path / "film", tmp_path / "film")
+    assert "must not be the folder of the frames" in refused(tmp_path / "film", tmp_path / "film")
     assert "does not exist; make it first" in refused(tmp_path / "film", tmp_path / "no" / "where")
     assert "is a file, not a folder" in refused(tmp_path / "film", tmp_path / "film" / "a.png")
-    assert "must have the size and the colours of the other frames" in refused(tmp_path / "film", tmp_path / "out")
+    assert "must have the size and channels of the first frame" in refused(tmp_path / "film", tmp_path / "out")
     assert not (tmp_path / "out").exists()

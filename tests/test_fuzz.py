@@ -1,4 +1,4 @@
-"""The fuzzer of ``benchmarks.fuzz`` for a minute, on images of at most 32x32 pixels, and what its checks notice."""
+"""The fuzzer ``benchmarks.fuzz`` for a minute on images of at most 32x32 pixels, and the faults its checks detect."""
 
 import random
 import warnings
@@ -20,7 +20,7 @@ from nlfilter_torch import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.core.checks import check_positive, warn
 from tests.problems import noise
 
-# Hypothesis draws every choice, and so makes a case that fails simpler.
+# Hypothesis draws every choice, so that it can simplify a failing case.
 sources = st.randoms(use_true_random=False)
 
 
@@ -98,7 +98,7 @@ def test_the_largest_eigenvalue_is_found_without_a_dense_matrix(monkeypatch, sca
     generator = torch.Generator().manual_seed(0)
     factor = torch.randn(3, 6, 40, generator=generator, dtype=torch.float64) * scale
     diagonal = torch.rand(3, 40, generator=generator, dtype=torch.float64)
-    factor[2] = 0  # the largest entry of the diagonal is then the answer
+    factor[2] = 0  # the largest eigenvalue is then the largest entry of the diagonal
     exact = Exact(factor, diagonal)
     _, dense = exact.eigenvalue_range()
     monkeypatch.setattr("benchmarks.fuzz.truth.DENSE", 0)
@@ -133,7 +133,7 @@ def test_legal_arguments_may_not_be_refused() -> None:
     ("text", "kept"),
     [
         ("row sums are off by 1; raise num_landmarks", True),
-        ("row sums are off by 1; use completion='diagonal'", False),  # which is in force
+        ("row sums are off by 1; use completion='diagonal'", False),  # already in use
         ("row sums are off by 1", False),
     ],
 )
@@ -152,7 +152,7 @@ def test_a_warning_needs_a_remedy_that_is_not_in_force(text: str, kept: bool) ->
 def test_every_public_function_is_called() -> None:
     import nlfilter_torch
 
-    # Made by the functions, not called by users.
+    # Returned by functions, not called by users.
     results = {"Certificate", "Diagnostics", "FittedFilter", "FittedLook", "NonlocalOperator", "Spectrum"}
     assert set(nlfilter_torch.__all__) - results <= FUNCTIONS.keys()
 
@@ -160,7 +160,7 @@ def test_every_public_function_is_called() -> None:
 @pytest.mark.parametrize("kind", [[], ["--functions"], ["--pictures"]])
 def test_a_seed_gives_the_same_cases_and_a_broken_promise_exit_status_1(kind, monkeypatch, tmp_path, capsys) -> None:
     if not kind:
-        monkeypatch.setattr(checks, "SLACK", {torch.float32: -1.0, torch.float64: -1.0})  # no residual is good enough
+        monkeypatch.setattr(checks, "SLACK", {torch.float32: -1.0, torch.float64: -1.0})  # every residual is too large
     runs = []
     for _ in range(2):
         with pytest.raises(SystemExit) as stopped:

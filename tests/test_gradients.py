@@ -1,4 +1,4 @@
-"""Gradients of the whole way: against finite differences, plain autograd, float64, and where eigenvalues meet."""
+"""Gradients end to end: against finite differences, plain autograd and float64, and with repeated eigenvalues."""
 
 from collections.abc import Callable
 
@@ -29,7 +29,7 @@ from tests.problems import noise, picture, seeded
 SIZE = (5, 4)
 COMPLETIONS = ("diagonal", "none")
 ALPHA = (3.0, 0.5, 2.0, 1.05)
-# Without completion a small bandwidth breaks the method itself.
+# Without completion, the method itself breaks down at a small bandwidth.
 BANDWIDTHS = {"diagonal": 0.2, "none": 0.8}
 
 
@@ -47,7 +47,7 @@ def build(guide: Tensor, completion: str, **options: object) -> NonlocalOperator
 
 
 def weighted(tensor: Tensor, seed: int = 9) -> Tensor:
-    """A number that depends on every entry, each in its own way."""
+    """A sum with a different weight for every entry."""
     return (tensor * torch.randn(tensor.shape, generator=seeded(seed), dtype=tensor.dtype)).sum()
 
 
@@ -144,7 +144,7 @@ def test_eigenvalues_energy_and_product(completion: str) -> None:
         operator = build(guide, completion)
         spectrum = operator.spectrum()
         image = noise(1, 1, *SIZE, seed=1)
-        # The first eigenvalue is 1 whatever the guide, held there by rounding and a clamp.
+        # The first eigenvalue is 1 for any guide, to rounding and a clamp.
         return spectrum.eigenvalues[:, 1:], captured_energy(spectrum, image), operator @ image
 
     assert gradcheck(call, (small(),), fast_mode=completion == "none")
@@ -183,17 +183,17 @@ def test_gradient_is_that_of_plain_autograd_through_unrolled_balancing(completio
         assert (found - expected).abs().max() <= 1e-6 * expected.abs().max()
 
 
-# Eigenvalues that meet ----------------------------------------------------------------------------------------------
+# Repeated eigenvalues -----------------------------------------------------------------------------------------------
 
 
 def degenerate_guides() -> dict[str, Tensor]:
-    """Images whose filter has repeated eigenvalues, by symmetry or for want of different pixels."""
+    """Images whose filter has repeated eigenvalues, by symmetry or for lack of different pixels."""
     half = noise(1, 1, 8, 5, seed=5)
     images = {name: torch.from_numpy(hard_images()[name][:8, 18:28].copy()) for name in ("constant", "checkerboard")}
     images["two colours"] = torch.from_numpy(hard_images()["two colours"][:8, 19:29].copy())
     guides = {name: image[None, None] for name, image in images.items()}
     guides["mirrored"] = torch.cat([half, half.flip(-1)], dim=3)
-    # Four different patches in all, so that some of the eight landmarks are the same.
+    # There are only four different patches, so that some of the eight landmarks coincide.
     guides["duplicated landmarks"] = noise(1, 1, 2, 2, seed=6).repeat(1, 1, 4, 5)
     return guides
 
@@ -204,7 +204,7 @@ GUIDES = degenerate_guides()
 def directional(
     function: Callable[[Tensor], Tensor], at: Tensor, directions: list[Tensor], step: float = 1e-5
 ) -> tuple[Tensor, Tensor]:
-    """Derivatives along some directions: by backward, and by central differences of fourth order."""
+    """Return directional derivatives by backward and by central differences of fourth order."""
     at = at.detach().requires_grad_()
     gradient = torch.autograd.grad(function(at), at)[0]
     found, expected = [], []
@@ -226,7 +226,7 @@ def test_divided_differences_are_finite_differences(name: str, response: Callabl
     spectrum = nonlocal_operator(
         GUIDES[name], landmarks="uniform", num_landmarks=8, photometric_bandwidth=0.3
     ).spectrum()
-    # Moved into [0.1, 1.1], where even the root may be looked at on both sides; what meets still meets.
+    # Shifted into [0.1, 1.1], where even the root has differences on both sides; repeated eigenvalues stay repeated.
     matrix = spectrum.ritz.matrix + 0.1 * torch.eye(8, dtype=torch.float64)
     eigenvalues = torch.linalg.eigvalsh(matrix)[0]
     if name != "mirrored":
@@ -252,7 +252,7 @@ def mask_sum(spectrum: Spectrum, image: Tensor) -> Tensor:
 
 
 def directions_that_keep_the_rank(guide: Tensor) -> list[Tensor]:
-    """Changes that leave alike pixels alike: of each grey level by an amount of its own."""
+    """Changes that keep equal pixels equal: each grey level changes by an amount of its own."""
     _, level = guide.flatten().unique(return_inverse=True)
     return [noise(int(level.max()) + 1, seed=seed)[level].view_as(guide) - 0.5 for seed in range(5)]
 
@@ -266,7 +266,7 @@ def test_gradient_in_a_degenerate_guide_is_the_finite_difference(
     image = noise(*GUIDES[name].shape, seed=7)
 
     def loss(guide: Tensor) -> Tensor:
-        # The grid, since k-means assigns pixels that are alike to another centroid as soon as they differ.
+        # Uniform landmarks, since k-means may assign equal pixels to other centroids as soon as they differ.
         operator = nonlocal_operator(
             guide, landmarks="uniform", num_landmarks=8, photometric_bandwidth=0.8, completion=completion
         )
@@ -278,7 +278,7 @@ def test_gradient_in_a_degenerate_guide_is_the_finite_difference(
 
 @pytest.mark.parametrize("name", GUIDES)
 def test_spectrum_and_products_agree_where_eigenvalues_meet(name: str) -> None:
-    # Without completion W lies in the span of its eigenvectors, and products know nothing of eigenvalues.
+    # Without completion W lies in the span of its eigenvectors, and products do not depend on eigenvalues.
     image, alpha = noise(*GUIDES[name].shape, seed=7), torch.tensor(ALPHA, dtype=torch.float64)
     gradients = []
     for by_spectrum in (False, True):
@@ -358,7 +358,7 @@ def test_second_derivatives_through_the_operator_are_refused(inputs: str) -> Non
 
 
 def test_gradient_of_the_factor_is_an_ordinary_tensor_to_whoever_looks() -> None:
-    # Inside it is a product of two thin matrices, which are joined when gradients are added.
+    # Internally it is a product of two low-rank factors, which are concatenated when gradients are added.
     operator = build(small(), "diagonal")
     image = noise(1, 2, *SIZE, seed=1)
 
@@ -371,6 +371,6 @@ def test_gradient_of_the_factor_is_an_ordinary_tensor_to_whoever_looks() -> None
     torch.testing.assert_close(gradient(once + twice), gradient(once) + gradient(twice))
     assert isinstance(gradient(once), OuterProduct)
     assert gradient(once)[0, 0].tolist() == gradient(once).clone()[0, 0].tolist()
-    wide = weighted(operator @ noise(1, 20, *SIZE, seed=2))  # of so many channels that the whole is smaller
+    wide = weighted(operator @ noise(1, 20, *SIZE, seed=2))  # with so many channels that the full matrix is smaller
     assert not isinstance(gradient(wide), OuterProduct)
     torch.testing.assert_close(gradient(once + wide), gradient(once) + gradient(wide))

@@ -1,4 +1,4 @@
-"""What installing does: the kernels in C are compiled where that is possible, and nothing fails where it is not."""
+"""Installation: the kernels in C are compiled where possible, and nothing fails where they are not."""
 
 import platform
 import shutil
@@ -20,7 +20,7 @@ POSSIBLE = platform.machine() == "x86_64" and sys.platform == "linux" and shutil
 
 
 class Application:
-    """What the builder shows to the one who installs."""
+    """The messages that the builder shows to the user."""
 
     def __init__(self) -> None:
         self.shown: list[str] = []

@@ -1,4 +1,4 @@
-"""The operators of ``torch.ops.nlfilter`` are what torch expects of an operator, by the kernels in C and without."""
+"""The operators of ``torch.ops.nlfilter`` meet torch's requirements, with and without the kernels in C."""
 
 from contextlib import nullcontext
 from typing import Any
@@ -21,7 +21,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
-    """Arguments of every operator, by its name."""
+    """Arguments of every operator, by name."""
     features, landmarks = random(BATCH, SIZE, PIXELS).to(dtype), random(BATCH, SIZE, LANDMARKS, seed=1).to(dtype)
     inputs = (features, landmarks, inverse_cholesky(landmarks))
     factor, norms = columns.columns(*inputs, limited=True)

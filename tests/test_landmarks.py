@@ -1,4 +1,4 @@
-"""Features to landmarks: three samplings, their determinism, and images that hold few distinct patches."""
+"""Features to landmarks: three samplings, determinism, and images with few distinct patches."""
 
 import pytest
 import torch
@@ -81,7 +81,7 @@ def test_kmeans_landmarks_are_means_of_their_pixels() -> None:
     x = torch.cat([cloud(seed=1)[..., :300] - 20, cloud(seed=2)[..., :300] + 20], dim=2)
     landmarks = choose_landmarks(x, (HEIGHT, WIDTH), 2, "kmeans", seeded())[0].sort(dim=1).values
     expected = torch.stack([x[0, :, :300].mean(1), x[0, :, 300:].mean(1)], dim=1)
-    torch.testing.assert_close(landmarks, expected, atol=0.5, rtol=0)  # k-means looks at a part of the pixels
+    torch.testing.assert_close(landmarks, expected, atol=0.5, rtol=0)  # k-means uses a subset of the pixels
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
@@ -127,8 +127,8 @@ def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(
     dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     x = 0.5 * cloud(2, 3000).to(dtype)
-    x[0, :, :300] *= 0.01  # many alike
-    x[0, :, 7:2900:1000] += 50.0 * torch.arange(1, 4)  # and three that are like no other
+    x[0, :, :300] *= 0.01  # many similar points
+    x[0, :, 7:2900:1000] += 50.0 * torch.arange(1, 4)  # and three unlike all others
 
     def residual() -> torch.Tensor:
         pivots = _pivots(x, 300, seeded())
@@ -183,7 +183,7 @@ def test_landmarks_pass_gradients_to_the_features(sampling: str) -> None:
 def test_kmeans_does_not_mind_an_offset() -> None:
     x = torch.from_numpy(photograph("camera", 20, 30).copy()).float().view(1, 1, -1) * 10
     near, far = (choose_landmarks(x + shift, (20, 30), 20, "kmeans", seeded()) - shift for shift in (0.0, 4096.0))
-    # Grey levels are often as far from one centre as from another. Rounding decides; what the centres are worth stays.
+    # Grey levels are often equally far from two centres, and rounding decides; the quality of the centres is the same.
     spread, spread_far = ((x - marks.mT).square().amin(1).mean() for marks in (near, far))
     assert spread_far < 1.1 * spread
 

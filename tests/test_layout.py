@@ -1,4 +1,4 @@
-"""The layout of the package: its rooms, imports that only go down them, no cycles, and how deep imports are."""
+"""The layout of the package: top-level modules, imports in their order only, no cycles, and the depth of imports."""
 
 import ast
 from pathlib import Path
@@ -20,13 +20,13 @@ ROOMS = (
     "app",
     "cli",
 )
-INTERFACES = ("app", "cli")  # each counts as one where depth is concerned
+INTERFACES = ("app", "cli")  # each counts as one module for the depth
 DEEPEST = 15  # levels of imports; the aim is 9
 Imports = dict[str, set[str]]
 
 
 def imports_of(sources: dict[str, str]) -> Imports:
-    """Modules of the package that each module imports, anywhere in it, from their texts."""
+    """Modules of the package that each module imports anywhere in its source."""
     imports: Imports = {}
     for module, text in sources.items():
         found: set[str] = set()
@@ -54,7 +54,7 @@ def room(module: str) -> str:
 
 
 def upward(imports: Imports) -> list[str]:
-    """Imports from a room of one that comes later."""
+    """Imports of a room that comes later in the list."""
     places = {name: place for place, name in enumerate(ROOMS)}
     return [
         f"{module} imports {other}"
@@ -68,7 +68,7 @@ def depth(imports: Imports) -> int:
     """Length of the longest chain of imports.
 
     Raises:
-        ValueError: where a chain comes back to itself.
+        ValueError: if there is a cycle.
     """
     known: dict[str, int] = {}
 
@@ -83,7 +83,7 @@ def depth(imports: Imports) -> int:
 
 
 def folded(imports: Imports) -> Imports:
-    """The same with each interface as one module, and without the lists of names at the top."""
+    """Return the imports with each interface as one module, and without the top-level module of public names."""
     whole: Imports = {}
     for module, others in imports.items():
         if room(module) not in ("", "__main__"):

@@ -1,4 +1,4 @@
-"""Values that spread from scribbles over neighbouring pixels."""
+"""Values that diffuse from scribbles over neighbouring pixels."""
 
 from typing import Any
 
@@ -27,13 +27,13 @@ def halves(height: int = 24, width: int = 40) -> Tensor:
 
 
 def spread(image: Tensor, mask: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Values times influence, and influence."""
+    """Return values times influence, and influence, of a mask."""
     places = mask.flatten().nonzero().squeeze(1)
     return local(image, places, mask.flatten(2)[:, :, places], values.flatten(2)[:, :, places])
 
 
 def local(image: Tensor, places: Tensor, weights: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """The same, from scribbled pixels."""
+    """Return values times influence, and influence, of scribbled pixels."""
     step = block_size((image.shape[2], image.shape[3]))
     guide = InMemory(image).reduced(luminance, step)
     return LocalValues.of(guide, step, image.shape[3], places, weights, values)(image, 0)
@@ -65,7 +65,9 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, solved: int) -> None:
     generator = torch.Generator().manual_seed(1)
     image, values, weights = (torch.rand(1, c, 5, 6, generator=generator, dtype=torch.float64) for c in (1, 2, 1))
     places = torch.tensor([3, 7, 20, 29])
-    monkeypatch.setattr(local_values, "SCRIBBLE_WEIGHT", 2.0)  # differences of what is fixed have no digits left
+    monkeypatch.setattr(
+        local_values, "SCRIBBLE_WEIGHT", 2.0
+    )  # finite differences of fixed values would be lost in rounding
 
     def found(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         return local(0.1 * image, places, weights, values)

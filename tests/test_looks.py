@@ -1,4 +1,4 @@
-"""Looks: what they do to an image, in memory and in tiles, what is found from pairs, and files of them."""
+"""Looks: applying them in memory and in tiles, fitting them to pairs, and their files."""
 
 import gc
 import json
@@ -118,7 +118,7 @@ def test_gradients_reach_image_and_look() -> None:
         return apply_look(image, bands=bands, **parts).sum(1)
 
     with torch.no_grad():
-        image.add_(1e-3)  # off the knots of the curve, where it has no derivative
+        image.add_(1e-3)  # away from the knots of the curve, where it has no derivative
     assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid), fast_mode=True)
     apply_look(image, alpha=alpha, num_landmarks=20).square().mean().backward()
     assert alpha.grad is not None
@@ -233,7 +233,7 @@ def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
 
 
 def test_curves_never_fall() -> None:
-    after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # rises and falls
+    after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # a curve that rises and falls
     found = one(fit_look([(CAT, after)], parts=("curves",), step=FEW))
     curves = found.tensors["curves"]
     assert float(curves.diff(dim=1).min()) >= -1e-5
@@ -382,7 +382,7 @@ def test_the_command_fits_folders_and_draws(tmp_path: Path, capsys: pytest.Captu
         assert main([command, str(before), str(out), "--preset", str(look)]) == 0
         assert (read_photograph(out).pixels - in_bytes(CUP**0.6)).abs().mean() < 2 / 255
     assert main(["detail", str(before), str(out), "--preset", str(look), "--alpha", "1,2"]) == 2
-    assert "without options of detail" in capsys.readouterr().err
+    assert "must not be combined with other options of detail" in capsys.readouterr().err
 
 
 def test_the_command_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

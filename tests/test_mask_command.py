@@ -75,7 +75,7 @@ def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "give --region X,Y,W,H or --mask FILE: some of what is to be selected"),
+        ([], "give --region X,Y,W,H or --mask FILE to mark part of the object"),
         (["--region", "70,60,20,20"], "--region must lie within the photograph"),
         (["--region", REGION, "--background", REGION], "background must hold a painted pixel outside the scribbles"),
         (["--region", REGION, "--background", "0,0,0,0"], "--background must be at least 1 pixel wide and high"),

@@ -1,4 +1,4 @@
-"""Diffusion maps and masks: against the dense paper, and what every mask has to be."""
+"""Diffusion maps and masks: against the dense reference, and properties of every mask."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_distances_are_those_of_the_dense_map(spectrum, dense, time: float) -> N
             (found - found[:, pixel : pixel + 1]).square().sum(0),
             reference.diffusion_distance(expected, expected[pixel]),
             rtol=2e-3,
-            atol=2e-2,  # of distances up to several hundred
+            atol=2e-2,  # for distances up to several hundred
         )
 
 
@@ -105,7 +105,7 @@ def test_masks_keep_colours_apart() -> None:
     region = torch.zeros_like(guide)
     region[..., 2:5, 2:5] = 1
     mask = diffusion_mask(spectrum, region)
-    dark, light = mask[..., :20], mask[..., 28:]  # away from the patches that hold both
+    dark, light = mask[..., :20], mask[..., 28:]  # away from patches that contain both
     assert dark.min() > 0.95
     assert light.max() < 0.5
     parts = segment_mask(spectrum, torch.cat([region, region.flip(-1)], dim=1))
@@ -160,7 +160,7 @@ def test_gradients_are_finite_where_eigenvalues_meet(name: str) -> None:
         assert tensor.grad.abs().max() > 0
 
 
-# --- what the masks are for: a spot on the astronaut's suit
+# --- a mask from a spot on the astronaut's suit
 
 
 def astronaut(side: int) -> torch.Tensor:
@@ -224,9 +224,11 @@ def test_a_negative_region_takes_its_likes_out(spectrum) -> None:
     torch.testing.assert_close(diffusion_mask(spectrum, region, negative=region), plain / 2)
     both = diffusion_mask(spectrum, regions(2), negative=other)
     torch.testing.assert_close(both[:, :1], held)
-    with pytest.raises(ValueError, match=r"negative must have 1 channel or the region's 2, got 3; give one for all"):
+    with pytest.raises(
+        ValueError, match=r"negative must have 1 channel or those of region, 2, got 3; give one for all"
+    ):
         diffusion_mask(spectrum, regions(2), negative=regions(3))
-    with pytest.raises(ValueError, match=r"negative must each hold a pixel of positive weight"):
+    with pytest.raises(ValueError, match=r"negative must hold a pixel of positive weight in every mask"):
         diffusion_mask(spectrum, region, negative=torch.zeros_like(region))
 
 
@@ -304,7 +306,7 @@ def test_a_region_like_no_landmark_is_worth_a_warning() -> None:
     few = nonlocal_operator(image, photometric_bandwidth=0.03).spectrum()
     best = few.factor[0].square().sum(0).argmax()
     region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel like none
-    with pytest.warns(UserWarning, match="region 1 is like no landmark, so its mask may take in"):
+    with pytest.warns(UserWarning, match="region 1 resembles no landmark, so its mask may include"):
         mask = diffusion_mask(few, region)
     assert (mask > 0.5).double().mean((2, 3))[0, 0] < 0.01
     assert (mask > 0.5).double().mean((2, 3))[0, 1] > 0.9

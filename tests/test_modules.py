@@ -1,4 +1,4 @@
-"""The layers: the same numbers as the functions, with parameters that save, move and learn."""
+"""The layers: results equal to those of the functions, and parameters that can be saved, moved and learned."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""What of a layer learns, where it starts, what it may become, and sliders that come from elsewhere."""
+"""Learned parameters of the layers: their choice, initial values and ranges, and sliders passed to a call."""
 
 import math
 from collections.abc import Callable
@@ -138,7 +138,7 @@ def test_held_layers_take_sliders_of_a_call() -> None:
         (
             lambda: NonlocalFilter(learn="photometric_bandwidth"),
             ValueError,
-            "photometric_bandwidth must be a number to learn from, got 'auto'; pass",
+            "photometric_bandwidth must be a number if it is learned, got 'auto'; pass",
         ),
         (lambda: NonlocalFilter(landmarks=48), ValueError, "landmarks must be one of .*, got 48; .* num_landmarks"),
         (lambda: NonlocalAffinity(landmarks=48), ValueError, "landmarks must be one of .*, got 48; .* num_landmarks"),
@@ -158,7 +158,7 @@ def test_held_layers_take_sliders_of_a_call() -> None:
         (
             lambda: NonlocalFilter("1, 1"),
             TypeError,
-            "alpha must be numbers or rows of equal length of them, got '1, 1'",
+            "alpha must be numbers or rows of numbers of equal length, got '1, 1'",
         ),
         (lambda: DiffusionMask(time="long"), TypeError, "time must be a number or a tensor, got str"),
         (lambda: SegmentMask(time=-1.0), ValueError, "time must be positive"),
@@ -191,9 +191,9 @@ def test_bad_construction_is_one_clear_sentence(
         (lambda f: f(image(), alpha=torch.ones(2, 2, 2)), ValueError, "alpha must have shape"),
         (lambda f: f(image(), guide=image(batch=3)), ValueError, "batch size"),
         (lambda f: f(image(), mask=torch.ones(2, 1, 5, 5)), ValueError, "mask must have the height and width"),
-        (lambda f: f(image().to(torch.float8_e4m3fn)), TypeError, "must be of a floating-point dtype .*float8"),
-        (lambda f: f(image(), guide=image().to(torch.int32)), TypeError, "guide must be of a floating-point dtype"),
-        (lambda f: f(image().to(torch.complex64)), TypeError, "must be of a floating-point dtype"),
+        (lambda f: f(image().to(torch.float8_e4m3fn)), TypeError, "must have a floating-point dtype .*float8"),
+        (lambda f: f(image(), guide=image().to(torch.int32)), TypeError, "guide must have a floating-point dtype"),
+        (lambda f: f(image().to(torch.complex64)), TypeError, "must have a floating-point dtype"),
     ],
 )
 def test_bad_call_leaves_the_parameters_untouched(

@@ -1,4 +1,4 @@
-"""The training conventions that docs/training.md promises, but for the transforms of torch, a test for each row."""
+"""The training conventions listed in docs/training.md, except the transforms of torch; one test for each row."""
 
 import copy
 import pickle
@@ -19,7 +19,7 @@ def test_autocast_leaves_the_filter_in_full_precision(dtype: torch.dtype) -> Non
     layer.zero_grad()
     with torch.autocast("cpu", dtype=dtype):
         filtered = layer(image())
-        inside = backward(layer, image())  # torch advises against it: what is not of this package is rounded
+        inside = backward(layer, image())  # torch advises against it, as operations outside this package are rounded
     torch.testing.assert_close(filtered, expected, atol=0, rtol=0)
     layer.zero_grad()
     filtered.square().mean().backward()
@@ -49,10 +49,10 @@ def test_autocast_network_before_the_layer_learns(dtype: torch.dtype) -> None:
 def test_autocast_on_a_dtype_that_cannot_work_is_told() -> None:
     layer = everything()
     with untouched(layer):
-        # torch itself refuses to cast to it, says so, and goes on without autocast.
+        # torch refuses to cast to it, warns, and continues without autocast.
         with pytest.warns(UserWarning, match="autocast"), torch.autocast("cpu", dtype=torch.float64):
             torch.testing.assert_close(layer(image()), everything()(image()), atol=0, rtol=0)
-        with pytest.raises(TypeError, match="guide must be of a floating-point dtype"):
+        with pytest.raises(TypeError, match="guide must have a floating-point dtype"):
             layer(image(), guide=image().to(torch.float8_e5m2))
 
 
@@ -61,9 +61,9 @@ def test_gradient_checkpointing(reentrant: bool) -> None:
     layer = everything()
     exact = backward(layer, image())
     layer.zero_grad()
-    tracked = image().requires_grad_()  # the reentrant variant wants an input that needs a gradient
+    tracked = image().requires_grad_()  # the reentrant variant requires an input with a gradient
     checkpoint(layer, tracked, use_reentrant=reentrant).square().mean().backward()
-    for name, parameter in layer.named_parameters():  # to rounding: torch may add up contributions in another order
+    for name, parameter in layer.named_parameters():  # to rounding: torch may sum contributions in another order
         torch.testing.assert_close(parameter.grad, exact[name], atol=1e-8, rtol=1e-6)
 
 
@@ -79,7 +79,7 @@ def test_state_dict_pickle_and_deep_copy(generator: bool) -> None:
     if generator:
         copies[2].affinity.generator = seeded(3)
     expected = [layer(image()), layer(image())]
-    assert torch.equal(*expected) != generator  # a generator moves on, and each copy has its own
+    assert torch.equal(*expected) != generator  # a generator advances, and each copy has its own
     for other in copies:
         for output in expected:
             torch.testing.assert_close(other(image()), output, atol=0, rtol=0)

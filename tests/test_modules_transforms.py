@@ -1,4 +1,4 @@
-"""Layers and fitted operators under torch.compile, torch.export and torch.func, as docs/training.md promises."""
+"""Layers and fitted operators under torch.compile, torch.export and torch.func, as listed in docs/training.md."""
 
 import io
 import sys
@@ -33,7 +33,7 @@ def compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return torch.compile(function, backend="aot_eager")
 
 
-# The compiler's own.
+# Warnings of the compiler itself.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
 @pytest.mark.parametrize("learn", [("alpha",), EVERYTHING])
@@ -52,7 +52,7 @@ def test_compiled_layer_gives_the_same(learn: tuple[str, ...]) -> None:
     fast = compiled(run)
     for seed in (0, 1):
         expected, found = run(image(seed)), fast(image(seed))
-        torch.testing.assert_close(found, expected, atol=3e-6, rtol=0)  # its pixels are added up in another order
+        torch.testing.assert_close(found, expected, atol=3e-6, rtol=0)  # its pixels are summed in another order
         gradients = [torch.autograd.grad(y.square().mean(), parameters) for y in (found, expected)]
         for ours, theirs in zip(*gradients, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4 * theirs.abs().max().item())
@@ -107,11 +107,11 @@ def test_export_of_a_layer_that_builds_its_operator() -> None:
         torch.testing.assert_close(loaded(image(3, batch)), layer(image(3, batch)), atol=1e-5, rtol=0)
 
 
-# --- what a graph calls as a whole
+# --- operators that a graph calls
 
 
 def lonely() -> tuple[Tensor, Tensor]:
-    """A kernel (1, 3, 6) with negative affinities, and its diagonal: its last pixel resembles no other."""
+    """A factor (1, 3, 6) with negative affinities, and its diagonal: the last pixel resembles no other."""
     factor = torch.tensor([[[1.0, 0.9, 0.8, 0.9, 0.7, -0.6], [0, 0.3, 0.4, 0.1, 0.5, 0.1], [0, 0.1, 0.2, 0.3, 0, 0.2]]])
     return factor, (1 - factor.square().sum(1)).clamp(min=0)
 
@@ -168,7 +168,7 @@ def test_importing_and_running_does_not_load_the_compiler() -> None:
 
 
 class Fitted(nn.Module):
-    """An operator that is held, and sliders that it is applied with."""
+    """A fixed operator, applied with sliders."""
 
     def __init__(self, operator: NonlocalOperator) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ def test_export_of_applying_a_fitted_operator(strict: bool) -> None:
     stream.seek(0)
     loaded = torch.export.load(stream).module()
     for batch in (1, 2, 5):
-        # The exported program adds pixels up in another order, and the sliders raise its rounding fourfold.
+        # The exported program sums pixels in another order, and the sliders amplify its rounding fourfold.
         torch.testing.assert_close(loaded(image(3, batch)), fitted(image(3, batch)), atol=3e-6, rtol=0)
 
 

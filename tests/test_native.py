@@ -1,4 +1,4 @@
-"""The kernels in C compute what torch does without them, whatever the sizes, the threads and the instruction set."""
+"""The kernels in C agree with the definitions in torch for all sizes, threads and instruction sets."""
 
 from itertools import product
 from typing import Any
@@ -33,7 +33,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def sizes(pixels: list[int], marks: list[int], most: int = 8_000_000) -> list[tuple[int, int]]:
-    """Pairs of these, but for those of which both are large: blocks of either kind are full in the others."""
+    """Return the pairs except those of two large sizes; the others already have full blocks of either kind."""
     return [pair for pair in product(pixels, marks) if pair[0] * pair[1] <= most]
 
 
@@ -45,7 +45,7 @@ def level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> in
 
 @pytest.fixture
 def threads():
-    """Sets the number of threads; it is put back after the test."""
+    """Sets the number of threads, which is restored after the test."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -177,10 +177,10 @@ def test_landmarks(level: int, batch: int, size: int, points: int, marks: int) -
     cloud = random(batch, size, points)
     pivots = landmarks._pivots(cloud, marks, torch.Generator().manual_seed(1))
     expected = by_torch(landmarks._pivots, cloud, marks, torch.Generator().manual_seed(1))
-    assert torch.equal(pivots[:, :6], expected[:, :6])  # on a line that few explain all, and the rest is rounding
+    assert torch.equal(pivots[:, :6], expected[:, :6])  # on a line, the others are chosen by rounding
     assert torch.equal(pivots, expected) or size == 1
     start = cloud.gather(2, pivots.unsqueeze(1).expand(-1, size, -1))
-    start[:, :, marks // 2 :] += 100.0 * (marks > 3)  # far from all points, where they stay
+    start[:, :, marks // 2 :] += 100.0 * (marks > 3)  # far from all points, so that they do not move
     margin = landmarks.TIE * torch.finfo(torch.float32).eps
     assignment = lloyd(cloud, start, 5, margin)
     assert (assignment == by_torch(lloyd, cloud, start, 5, margin)).float().mean() > 0.95
@@ -281,7 +281,7 @@ def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
     alone, operator = results(), nonlocal_operator(guide, num_landmarks=30)
     threads(count)
     for one, many, again in zip(alone, results(), results(), strict=True):
-        torch.testing.assert_close(one, many, rtol=1e-5, atol=1e-6)  # sums are cut elsewhere
+        torch.testing.assert_close(one, many, rtol=1e-5, atol=1e-6)  # sums are divided differently
         assert torch.equal(many, again)
     torch.testing.assert_close(nonlocal_operator(guide, num_landmarks=30).scaling, operator.scaling)
 
@@ -294,7 +294,7 @@ def test_an_operator_is_that_of_the_dense_reference(level: int) -> None:
 
 
 class Exhausted:
-    """A library whose kernels find no memory."""
+    """A library whose kernels cannot allocate memory."""
 
     def __getattr__(self, name: str) -> Any:
         return lambda *_: -1
@@ -303,11 +303,11 @@ class Exhausted:
 def test_without_memory_for_its_buffers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "_library", Exhausted())
     x = random(1, 2, 9)
-    with pytest.raises(MemoryError, match="make the image smaller"):
+    with pytest.raises(MemoryError, match="use a smaller image"):
         nystrom_factor(x, x[:, :, :3], inverse_cholesky(x[:, :, :3]), "diagonal")
 
 
-@pytest.mark.filterwarnings("ignore:.torch.jit.script")  # torch's own way to forward derivatives
+@pytest.mark.filterwarnings("ignore:.torch.jit.script")  # torch's own forward derivatives
 def test_which_tensors_the_dispatcher_sends_to_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "_library", Exhausted())
     rows, factor = random(1, 2, 3), random(1, 3, 8)

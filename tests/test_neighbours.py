@@ -1,4 +1,4 @@
-"""Systems over the eight neighbours of each pixel, against dense ones."""
+"""Linear systems over the eight neighbours of each pixel, compared with dense ones."""
 
 import pytest
 import torch
@@ -62,7 +62,7 @@ def test_weights_anchors_and_values_have_gradients() -> None:
         weights = neighbour_weights(guide, lambda distances: torch.exp(-4 * distances))
         return solve_neighbours(weights, anchor, values)
 
-    anchor[..., 0, 0] = 2.0  # differences of 1e4 have no digits left
+    anchor[..., 0, 0] = 2.0  # finite differences would be lost in rounding beside 1e4
     given = tuple(tensor.requires_grad_() for tensor in (guide, anchor, values))
     assert torch.autograd.gradcheck(solved, given)
     assert torch.autograd.gradgradcheck(solved, given, fast_mode=True)

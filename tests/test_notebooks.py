@@ -1,4 +1,4 @@
-"""Every notebook runs, has the cells of the script it is paired with, and small results of the kinds that it gives."""
+"""Every notebook runs, has the cells of its paired script, and stores small results of the kinds that it produces."""
 
 import base64
 import io
@@ -17,7 +17,7 @@ from benchmarks.notebooks import WIDEST, tidy
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
-# Drags the first slider of the first notebook and tells what was drawn then.
+# Drags the first slider of the first notebook and prints what was drawn.
 DRAG = """
 drawn = []
 display = drawn.append
@@ -33,14 +33,14 @@ def test_there_are_notebooks() -> None:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_paired(script: Path) -> None:
-    """Same cells in both; refresh with ``make notebooks``."""
+    """The cells are the same; ``make notebooks`` updates them."""
     stored = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
     cells = [(cell.cell_type, cell.source) for cell in stored.cells]
     assert cells == [(cell.cell_type, cell.source) for cell in jupytext.read(script).cells]
 
 
 def kinds(notebook: nbformat.NotebookNode) -> list[list[str]]:
-    """What each cell printed or showed: text that differs between machines does not count."""
+    """Kinds of output of each cell, without their text, which differs between machines."""
     return [
         [min(output.data) if "data" in output else output.output_type for output in cell.get("outputs", [])]
         for cell in notebook.cells
@@ -48,7 +48,7 @@ def kinds(notebook: nbformat.NotebookNode) -> list[list[str]]:
 
 
 def test_results_are_small_pictures_and_text() -> None:
-    """Readable where nothing runs: no widgets, no errors, and two megabytes in all."""
+    """Readable without running them: no widgets, no errors, and two megabytes in total."""
     notebooks = sorted(FOLDER.glob("*.ipynb"))
     assert sum(path.stat().st_size for path in notebooks) < 2_000_000
     for path in notebooks:
@@ -67,7 +67,7 @@ def test_results_are_small_pictures_and_text() -> None:
 
 @pytest.fixture(scope="module")
 def kernel() -> Iterator[AsyncKernelManager]:
-    """One for all notebooks, since its start and the imports take longer than most of them."""
+    """One kernel for all notebooks, since its start and the imports take longer than most notebooks."""
     manager = AsyncKernelManager(kernel_name="python3")
     yield manager
     run_sync(manager.shutdown_kernel)(now=True)
@@ -80,7 +80,7 @@ def test_runs(script: Path, tmp_path: Path, kernel: AsyncKernelManager) -> None:
     notebook = jupytext.read(script)
     if script.stem == "01_first_filter":
         notebook.cells.append(nbformat.v4.new_code_cell(DRAG))
-    forget = nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}")  # as in a kernel of its own
+    forget = nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}")  # as in a new kernel
     notebook.cells.insert(0, forget)
     client = NotebookClient(notebook, km=kernel, timeout=300, resources={"metadata": {"path": tmp_path}})
     client.execute()

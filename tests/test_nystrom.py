@@ -80,7 +80,7 @@ def test_the_order_of_the_landmarks_does_not_matter(order: list[int]) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_common_offset_does_not_matter(dtype: torch.dtype) -> None:
-    x = (cloud(1, 4, 80) * 64).round().div(64)  # exact beside the offset, in float32 too
+    x = (cloud(1, 4, 80) * 64).round().div(64)  # exact relative to the offset, in float32 too
     tolerance = 2e-3 if dtype == torch.float32 else 1e-9
     results = []
     for offset in (0.0, 100.0):
@@ -116,7 +116,7 @@ def test_a_batch_is_its_images() -> None:
 
 @pytest.mark.parametrize("completion", ["diagonal", "none"])
 def test_gradients_are_those_of_the_formula(completion: str) -> None:
-    """The recomputing backward against autograd through the same three lines."""
+    """The backward pass with recomputation, compared with autograd through the same three lines."""
     x, z = cloud(2, 3, 50, spread=0.7).requires_grad_(), cloud(2, 3, 8, seed=1, spread=0.7).requires_grad_()
     a = inverse_cholesky(z.detach()).requires_grad_()
     weights = cloud(2, 9, 50, seed=2)

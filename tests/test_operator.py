@@ -1,4 +1,4 @@
-"""The operator: against the dense filter, and the invariants that hold for every image."""
+"""The operator: against the dense filter, and invariants for every image."""
 
 import warnings
 
@@ -78,11 +78,11 @@ def test_plain_uniform_is_the_papers_method(bandwidth: int) -> None:
     )
     s, v = reference.nystrom_eigenpairs(reference.features(image, 5, h_y), reference.uniform_samples(30, 40, 50))
     filtered = (operator @ torch.from_numpy(image.copy())[None, None]).ravel()
-    # The jitter of the library and the cut of small eigenvalues of the paper leave a grey level between them.
+    # The library's jitter and the paper's cut of small eigenvalues cause a difference of up to a grey level.
     np.testing.assert_allclose(filtered, reference.spectral_function(s, v, s, image.ravel()), atol=1 / 255)
 
 
-# --- what holds for every image
+# --- invariants for every image
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -352,7 +352,7 @@ def test_images_smaller_than_the_patch(size: tuple[int, int], patch_size: int) -
     assert operator.spectrum().eigenvalues[0, 0].item() == pytest.approx(1, abs=1e-6)
 
 
-# --- gradients, in short
+# --- gradients
 
 
 def test_backward_gives_finite_gradients_to_everything() -> None:

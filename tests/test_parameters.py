@@ -1,4 +1,4 @@
-"""Parameters of edits: declared once, within what functions take, and written down in the documentation."""
+"""Parameters of edits: declared once, within the ranges of the functions, and listed in the documentation."""
 
 import ast
 import inspect

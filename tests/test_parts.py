@@ -56,7 +56,7 @@ def whole(recipe: Recipe, source: NDArray[Any], passes: Passes) -> torch.Tensor:
 def test_a_part_is_that_of_the_whole(
     name: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if "sample" in options:  # and in blocks, as if it were large
+    if "sample" in options:  # and in blocks, like a large picture
         monkeypatch.setattr("nlfilter_torch.edits.mask.SOLVED", 2000)
         monkeypatch.setattr("nlfilter_torch.edits.local_values.SOLVED", 2000)
         monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP_PIXELS", 1000)
@@ -100,13 +100,13 @@ def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPa
         fresh.fit(Recipe(steps), passes)
         assert torch.equal(found, fresh.edited(place))
     fitted.clear()
-    parts.fit(Recipe((recolor,)), replace(passes, statistics="sample"))  # a sample gives others
+    parts.fit(Recipe((recolor,)), replace(passes, statistics="sample"))  # a sample gives other sums
     assert fitted == ["recolor"]
 
 
 @pytest.mark.parametrize("after", [1, 4, 8])
 def test_a_fit_that_is_interrupted_leaves_what_was_known(after: int) -> None:
-    """The report of the progress raises; the next fit is as good as the first."""
+    """The progress report raises an exception; the next fit equals an uninterrupted one."""
     source, recipe, place = (
         rows_of(cat(5)),
         Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=40), RECOLOR)),
@@ -131,7 +131,7 @@ def test_a_fit_that_is_interrupted_leaves_what_was_known(after: int) -> None:
 
 
 def test_a_part_of_a_picture_of_many_tiles_of_the_network() -> None:
-    """They stand at the same places as in the whole picture."""
+    """The tiles are at the same positions as in the whole picture."""
     image = torch.cat([cat(1), cat(1).flip(3)], dim=3)  # 900 pixels wide
     source, passes = rows_of(image), Passes("float32")
     recipe = Recipe((Step("denoise", noise_level=8.0),))

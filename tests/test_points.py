@@ -1,4 +1,4 @@
-"""Operators of weighted points: against the pixels that the points stand for, and against guides."""
+"""Operators of weighted points, compared with those of the pixels that the points represent, and of guides."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ FLOATS = (torch.float32, torch.float64)
 
 
 def features_of(image: Tensor) -> Tensor:
-    """Features (1, 9, N) of an image, as an operator makes them."""
+    """Features (1, 9, N) of an image, as an operator computes them."""
     operator = nonlocal_operator(image, patch_size=3, photometric_bandwidth=0.2, num_landmarks=2)
     return operator.kernel.recipe(image)
 
@@ -191,7 +191,7 @@ def test_an_operator_of_features_has_no_guide() -> None:
     operator = operator_from_features(noise(1, 2, 12), size=(3, 4), num_landmarks=4)
     layers = detail_layers(operator, noise(1, 1, 3, 4))
     assert layers.shape == (1, 4, 1, 3, 4)
-    with pytest.raises(ValueError, match=r"operator must come from nonlocal_operator .* use operator.at\(features\)"):
+    with pytest.raises(ValueError, match=r"operator must be built by nonlocal_operator .* use operator.at\(features\)"):
         fit_filter(operator, noise(1, 1, 3, 4)).layers(noise(1, 1, 3, 4))
     assert operator.diagnostics().photometric_bandwidth == [1.0]
 
@@ -201,16 +201,16 @@ def test_an_operator_of_features_has_no_guide() -> None:
     [
         ({"features": [1.0]}, TypeError, r"features must be a torch.Tensor"),
         ({"features": noise(3, 12)}, ValueError, r"features must have shape \(B, D, N\)"),
-        ({"features": noise(1, 3, 12).round().int()}, TypeError, r"features must be of a floating-point dtype"),
+        ({"features": noise(1, 3, 12).round().int()}, TypeError, r"features must have a floating-point dtype"),
         ({"features": noise(1, 3, 12) * torch.nan}, ValueError, r"features must be finite"),
         ({"size": 12}, TypeError, r"size must be integers \(H, W\) or \(N,\), got 12; pass \(12,\)"),
         ({"size": (3, 2, 2)}, TypeError, r"size must be integers \(H, W\) or \(N,\), got \(3, 2, 2\)"),
-        ({"size": (3, 5)}, ValueError, r"size must have as many pixels as there are features, 12, got 3x5"),
+        ({"size": (3, 5)}, ValueError, r"size must have one pixel for each of the 12 points, got 3x5"),
         ({"size": (-3, -4)}, ValueError, r"size must have as many pixels"),
         ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
         ({"weights": torch.zeros(12)}, ValueError, r"weights must be from 1e-06 to 1e\+06, got 0 to 0"),
         ({"weights": torch.full((12,), 1e7)}, ValueError, r"weights must be from 1e-06 to 1e\+06"),
-        ({"weights": torch.ones(12, dtype=torch.complex64)}, TypeError, "weights must be of a floating-point dtype"),
+        ({"weights": torch.ones(12, dtype=torch.complex64)}, TypeError, "weights must have a floating-point dtype"),
         ({"weights": 4.0}, TypeError, r"weights must be a torch.Tensor"),
         ({"landmarks": 5}, ValueError, r"num_landmarks"),
     ],
@@ -237,5 +237,5 @@ def test_more_landmarks_than_points_are_reduced() -> None:
 def test_columns_of_other_features_are_checked() -> None:
     operator = operator_from_features(noise(1, 3, 12), size=(3, 4), num_landmarks=4)
     assert operator.at(noise(1, 3, 5, dtype=torch.float32)).factor.shape == (1, 4, 5)
-    with pytest.raises(ValueError, match="features must have the 3 features of each point"):
+    with pytest.raises(ValueError, match="features must have 3 features per point"):
         operator.at(noise(1, 2, 5))

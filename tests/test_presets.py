@@ -1,4 +1,4 @@
-"""Presets that have a name: in Python, on the command line and in its list."""
+"""Named presets in Python, on the command line and in the output of ``presets``."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def test_command_and_function_agree(photo: Path, name: str) -> None:
 
 
 def test_each_does_what_it_says(photo: Path) -> None:
-    """Grain is looked at in the calmer half of the pixels, contrast in all."""
+    """Grain is measured in the flatter half of the pixels, contrast in all."""
     pixels = read_photograph(photo).pixels
     calm = grain(pixels) <= grain(pixels).median()
     edited = {name: preset.apply(pixels) for name, preset in PRESETS.items()}
@@ -72,7 +72,7 @@ def test_an_option_counts_for_more_than_a_name(photo: Path) -> None:
 def test_an_unknown_name_is_told(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["detail", str(photo), str(photo.with_name("out.png")), "--preset", "crips"]) == 2
     complaint = capsys.readouterr().err
-    assert "crips does not exist or is no file, nor is it one of the presets crisp, clear" in complaint
+    assert "crips is neither a file nor one of the presets crisp, clear" in complaint
     assert complaint.count("\n") == 1
     assert main(["presets", "crips"]) == 2
 

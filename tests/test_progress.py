@@ -1,4 +1,4 @@
-"""Progress as text and lines, edits that go to tiles by themselves, and saving in the editor with progress."""
+"""Progress as text and lines, edits that use tiles automatically, and progress of saving in the editor."""
 
 import time
 from pathlib import Path
@@ -26,9 +26,9 @@ def test_time_left() -> None:
     told("Averaging", 100, 200)
     assert told.seconds_left == pytest.approx(10)
     assert str(told) == "Averaging, 50 %, about 10 s left"
-    told("Averaging", 0, 200)  # a second pass of that name
+    told("Averaging", 0, 200)  # a second pass with the same name
     assert told.seconds_left is None
-    told("Writing", 1, 0)  # of nothing
+    told("Writing", 1, 0)  # of zero
     assert "Writing" in str(told)
 
 
@@ -37,13 +37,13 @@ def test_lines_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch, capsy
     said = ""
     with progress.stages() as report:
         report("Averaging", 0, 10)
-        for _ in range(1000):  # until a line is there
+        for _ in range(1000):  # until a line is printed
             said += capsys.readouterr().err
             if "Averaging" in said:
                 break
             time.sleep(0.01)
     assert "Averaging, 1 s so far\n" in said
-    assert "nlfilter-torch:" not in said  # which begins what is wrong, and notes
+    assert "nlfilter-torch:" not in said  # the prefix of errors and notes
     with progress.steps(2) as begin:
         begin("Reading")
     assert "\x1b" not in said + capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What an operator promises of itself, against W in float64: row sums, residuals, eigenvalues and its certificate."""
+"""Guarantees of operators against W in float64: row sums, residuals, eigenvalues and the certificate."""
 
 from dataclasses import replace
 
@@ -117,7 +117,7 @@ def test_the_damped_method_converges_from_any_start(start: float) -> None:
 
 
 def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
-    """One pixel of each kind has no partner in the sum: its d is above the bound of the sweeps."""
+    """The scaling d of a pixel exceeds the bound of the sweeps."""
     factor = torch.tensor([[[1.0, -0.9, -0.9, 0.4]]], dtype=torch.float64)
     diagonal = 1 - factor.square().sum(1) + 1e-3
     result = balance(factor, diagonal, completed=True)
@@ -128,7 +128,7 @@ def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
 
 def test_a_warning_names_a_remedy_that_is_not_in_force() -> None:
     factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])
-    with pytest.warns(UserWarning, match="row sums off by up to .*num_landmarks$") as caught:
+    with pytest.warns(UserWarning, match="row sums that differ from 1 by up to .*num_landmarks$") as caught:
         balance(factor, torch.zeros(1, 4), completed=True)
     assert "completion" not in str(caught[0].message)
 
@@ -170,7 +170,7 @@ def limited() -> tuple[Tensor, NonlocalOperator]:
 
 
 def test_a_limited_operator_is_the_unlimited_one_below_one() -> None:
-    """Only what exceeded 1 changes, and it becomes 1; many products stay bounded."""
+    """Only eigenvalues above 1 change, to 1; repeated products stay bounded."""
     image, operator = limited()
     whole = operator.kernel.recipe(image, origin=(0, 0), halo=(0, 0))
     factor, _ = replace(operator.kernel, limiter=None).factor(whole)
@@ -279,7 +279,7 @@ def test_eigenvectors_of_photographs_are_orthonormal(name: str) -> None:
 
 @pytest.mark.parametrize("options", [{"photometric_bandwidth": 2e-4}, {"spatial_bandwidth": 0.05}])
 def test_tiny_bandwidths_are_right_in_float32(options: dict[str, float]) -> None:
-    """Features are so large that squared distances would lose all their digits in float32."""
+    """Features are so large that squared distances would lose all digits in float32."""
     image = picture("camera", 40, 40).float()
     options = {"photometric_bandwidth": 0.1, "num_landmarks": 1600, "patch_size": 1, **options}
     operator = nonlocal_operator(image, **options)
@@ -291,7 +291,7 @@ def test_tiny_bandwidths_are_right_in_float32(options: dict[str, float]) -> None
 
 
 def test_landmarks_far_apart_for_their_bandwidth_have_a_cholesky_factor() -> None:
-    # 1e10 bandwidths apart, squared distances that are formed as products are off by 1e4 in float64.
+    # At 1e10 bandwidths, squared distances computed by products have errors of 1e4 in float64.
     points = 1e10 + torch.rand(1, 1, 60, generator=seeded(0), dtype=torch.float64).sort().values * 3
     features = torch.cat([points, -points], dim=2)
     operator = operator_from_features(features, size=(10, 12), num_landmarks=80)

@@ -1,4 +1,4 @@
-"""The README's code runs as it stands, its commands exist and its links lead somewhere."""
+"""The README's code runs unchanged, its commands exist and the targets of its links exist."""
 
 import re
 import subprocess
@@ -15,7 +15,7 @@ from tests.pages import README, ROOT
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the photograph that the README speaks of, and in it the current one."""
+    """The current folder, containing the photograph that the README uses."""
     Image.fromarray(skimage.data.coffee()[::4, ::4]).save(tmp_path / "photo.jpg")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -73,7 +73,7 @@ def test_links_and_pictures_are_there() -> None:
 
 
 def test_public_names_are_named() -> None:
-    """What the README's table promises is there."""
+    """Every name in the README's table is public."""
     import nlfilter_torch
 
     table = README.text.split("## What is in it")[1].split("\n\n")[1]

@@ -1,4 +1,4 @@
-"""Whole edits: what they do to an image, their files, and the verb that applies them."""
+"""Recipes: applying them to an image, their files, and the command ``apply``."""
 
 import json
 from dataclasses import replace
@@ -106,7 +106,7 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
         return mask * inside + (1 - mask) * outside
 
     assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
-    # The same sliders on both sides are those of the whole.
+    # With the same sliders inside and outside, the edit is that of the whole picture.
     same = Recipe((plain.changed(inside=ALPHA),)).apply(pixels)
     whole = Step("detail", alpha=ALPHA, bandwidth=30.0, limits="none", threshold=0.0)
     assert torch.allclose(same, Recipe((whole,)).apply(pixels), atol=1e-5)
@@ -135,14 +135,14 @@ def test_colours(pixels: torch.Tensor) -> None:
 def test_blur_and_painting(pixels: torch.Tensor) -> None:
     blurred = defocus(pixels, mask_of([IN], SIZE), radius=0.04 * 48, generator=seeded())
     assert torch.equal(Recipe((DEFOCUS,)).apply(pixels), blurred)
-    for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines get no thinner than what a pixel can show
+    for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines have a minimum width in pixels
         step = ABSTRACT.changed(edge_width=line)
         wanted = abstract(pixels, power=0.2, edges=0.5, edge_width=width, tones=5, generator=seeded())
         assert torch.equal(Recipe((step,)).apply(pixels), wanted)
 
 
 def test_steps_follow_one_another(pixels: torch.Tensor) -> None:
-    """In their order, and as often as they are there."""
+    """Steps are applied in their order, also several of the same edit."""
     crisp = Step("detail", alpha=INSIDE)
     for steps in ((crisp, DEFOCUS), (DEFOCUS, crisp), (crisp, Step("tone", clarity=2.0), crisp)):
         wanted = pixels
@@ -174,7 +174,7 @@ def test_all_options_of_detail_are_in_files(pixels: torch.Tensor) -> None:
 def test_idle_steps_change_nothing(edit: str, pixels: torch.Tensor) -> None:
     assert not Step.idle(edit).changes()
     assert Recipe((Step.idle(edit),)).apply(pixels) is pixels
-    changed: dict[str, Any] = {"matrix": (0.5,) * 9} if edit == "look" else {}  # a look by default is no change
+    changed: dict[str, Any] = {"matrix": (0.5,) * 9} if edit == "look" else {}  # the default look changes nothing
     assert Step(edit, (BLUE, IN), **changed).changes()
 
 
@@ -192,7 +192,7 @@ def test_files_hold_the_whole_edit() -> None:
 
 
 def test_files_from_before_there_was_a_list_of_steps() -> None:
-    """In the order that was fixed, with the names and units of then, and with what changes nothing left out."""
+    """Old files have a fixed order of steps, old names and units, and omit steps that change nothing."""
     strokes = [BLUE.entries()]
     text = json.dumps(
         {
@@ -220,7 +220,7 @@ def test_presets_are_edits(tmp_path: Path) -> None:
     path = tmp_path / "look.json"
     path.write_text(crisp.to_json())
     assert find_recipe(str(path)) == Recipe((crisp.step,))
-    assert Preset.from_json(find_recipe("crisp").to_json(), "it") == crisp  # so that detail --preset takes it too
+    assert Preset.from_json(find_recipe("crisp").to_json(), "it") == crisp  # so that detail --preset accepts it too
 
 
 @pytest.mark.parametrize(
@@ -229,11 +229,11 @@ def test_presets_are_edits(tmp_path: Path) -> None:
         ("{", "it is not JSON"),
         ("[1]", "it must hold a list of steps"),
         ('{"detial": {}}', "it must hold a list of steps"),
-        ('{"detail": 1}', "detail in edit.json must hold entries in braces"),
-        ('{"detail": {"power": 1}}', "must hold no other entries than alpha"),
+        ('{"detail": 1}', "detail in edit.json must be a JSON object"),
+        ('{"detail": {"power": 1}}', "must have no entries other than alpha"),
         (
             '{"abstract": {"strokes": []}}',
-            "must hold no other entries than power, edges, edge_width, tones, .*, got strokes",
+            "must have no entries other than power, edges, edge_width, tones, .*, got strokes",
         ),
         ('{"abstract": {"tones": 2.5}}', "tones of abstract in edit.json must be a whole number"),
         ('{"recolor": {"reach": 1}}', "reach of recolor in edit.json must be a number from 0 to 0.999, got 1"),
@@ -241,18 +241,18 @@ def test_presets_are_edits(tmp_path: Path) -> None:
         ('{"steps": []}', "version in edit.json must be 1, got null"),
         (
             '{"version": 2, "steps": []}',
-            "version in edit.json must be 1, got 2; newer files need a newer nlfilter-torch",
+            "version in edit.json must be 1, got 2; update nlfilter-torch to read newer files",
         ),
         ('{"version": 1, "steps": {}}', "steps in edit.json must be a list"),
-        ('{"version": 1, "steps": [], "detail": {}}', "no other entries than version, steps, got detail"),
-        ('{"version": 1, "steps": [{}]}', "step 1 in edit.json must hold an entry edit, one of denoise, detail"),
-        ('{"version": 1, "steps": [{"edit": ["tone"]}]}', "step 1 in edit.json must hold an entry edit"),
+        ('{"version": 1, "steps": [], "detail": {}}', "no entries other than version and steps, got detail"),
+        ('{"version": 1, "steps": [{}]}', "step 1 in edit.json must have an entry edit, one of denoise, detail"),
+        ('{"version": 1, "steps": [{"edit": ["tone"]}]}', "step 1 in edit.json must have an entry edit"),
         (
             '{"version": 1, "steps": [{"edit": "tone"}, {"edit": "tone", "clarity": "1"}]}',
             'clarity of tone, step 2 in edit.json must be a number from -1000000 to 1000000, got "1"',
         ),
         ('{"defocus": {"strokes": {}}}', "strokes of defocus in edit.json must be a list"),
-        ('{"defocus": {"strokes": [{"points": []}]}}', "must hold strokes with points, radius and paint"),
+        ('{"defocus": {"strokes": [{"points": []}]}}', "must have the entries points, radius and paint"),
         (
             '{"defocus": {"strokes": [{"points": [], "radius": 0.1, "paint": "in"}]}}',
             "points of a stroke in defocus in edit.json must be pairs of numbers",

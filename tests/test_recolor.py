@@ -1,4 +1,4 @@
-"""Recolouring: which pixels take a colour and which keep theirs, and the groups and means behind it."""
+"""Recolouring: which pixels change colour and which do not, and the underlying groups and means."""
 
 import torch
 import torch.nn.functional as F
@@ -37,7 +37,7 @@ def test_recolour_within_two_levels_outside_a_kept_region() -> None:
 
 
 def test_one_stroke_does_not_spill() -> None:
-    """Odd pixels under it, here of the backdrop, are painted but do not take their likes along."""
+    """Stray pixels under the stroke, here of the backdrop, are painted, but pixels similar to them are not."""
     image, stroke = colour("astronaut"), box(37, 8, 5, 5)
     image = torch.where(box(37, 8, 1, 5) > 0, image[..., 6:7, 42:43], image)
     edited = recolor(image, paint(0.1, 0.3, 0.9, stroke), stroke)
@@ -77,7 +77,7 @@ def test_two_colours_reach_their_own_likes() -> None:
 
 
 def test_overlapping_strokes_are_decided_by_the_colour_on_top() -> None:
-    """Strokes are one picture: what was painted last is what it shows."""
+    """Strokes are a single picture, which shows the colour painted last."""
     image = colour("astronaut")
     under, over = box(36, 8, 6, 6), box(37, 9, 4, 4)
     strokes = torch.where(over > 0, paint(0.1, 0.3, 0.9, over), paint(0, 0.8, 0, under))
@@ -111,7 +111,7 @@ def test_groups_of_colours_are_kept_apart_image_by_image() -> None:
     assert regions.shape == (2, 16, 1, 40)
     assert counts[0].all()
     assert counts[1].tolist() == [True] + [False] * 15
-    torch.testing.assert_close(regions[0].sum(0), torch.ones(1, 40))  # further ones joined the nearest
+    torch.testing.assert_close(regions[0].sum(0), torch.ones(1, 40))  # the remaining colours joined the nearest group
     assert torch.equal(means[1], torch.zeros(16, 3))
 
 

@@ -1,4 +1,4 @@
-"""The reference against itself: each of its lines compared with a slower or a different way to the same number."""
+"""Tests of the reference: each step is compared with a slower or different computation of the same number."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_filter_is_symmetric_doubly_stochastic_and_positive(w: np.ndarray) -> No
 
 
 def test_balanced_filter_is_close_to_the_row_normalised_one() -> None:
-    x = reference.features(SMALL, 5, 1.0)  # a wide kernel is nearly balanced by one division
+    x = reference.features(SMALL, 5, 1.0)  # one division nearly balances a wide kernel
     kernel = reference.affinity(x, x)
     np.testing.assert_allclose(reference.balanced(kernel), reference.row_normalised(kernel), rtol=0.3)
 
@@ -76,7 +76,7 @@ def test_truncation_is_the_best_of_its_rank(w: np.ndarray) -> None:
 def test_papers_method_with_every_pixel_sampled_is_the_dense_filter(w: np.ndarray) -> None:
     x = reference.features(SMALL, 5, H_Y)
     s, v = reference.nystrom_eigenpairs(x, np.arange(len(x)))
-    np.testing.assert_allclose((v * s) @ v.T, w, atol=1e-4)  # the eigenvalues below its tolerance are what is missing
+    np.testing.assert_allclose((v * s) @ v.T, w, atol=1e-4)  # only eigenvalues below its tolerance are missing
 
 
 def test_papers_method_gives_orthonormal_vectors_and_unit_row_sums() -> None:

@@ -1,4 +1,4 @@
-"""Region masks: the regression and the local solve against dense ones, what one scribble does, tiles, gradients."""
+"""Region masks: regression and local solve against dense ones, single scribbles, tiles and gradients."""
 
 import math
 from typing import Any
@@ -59,7 +59,7 @@ def test_the_regression_is_the_best_estimate_from_scribbles_and_the_frame() -> N
 
     first = estimate(front, front + back)
     weights = (front + back).flatten()
-    assert not bool(weights[places].any())  # here scribbles and frame are apart
+    assert not bool(weights[places].any())  # here the scribbles do not touch the frame
     weights[places] = torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
     expected = estimate(front, weights)
     np.testing.assert_allclose(found.flatten(), expected, atol=2e-5)
@@ -146,7 +146,7 @@ def test_gradients() -> None:
     for number, gradient in enumerate(gradients):
         step = 1e-6 * noise(*at[number].shape, seed=5) if at[number].ndim else torch.tensor(1e-6).double()
         if number == 1:
-            step = step * front  # weights stay above 0
+            step = step * front  # weights remain above 0
         ends = [loss(*(t + sign * step if i == number else t for i, t in enumerate(at))) for sign in (-1, 1)]
         assert float(ends[1] - ends[0]) / 2 == pytest.approx(float((gradient * step).sum()), rel=2e-3, abs=1e-12)
 
@@ -177,13 +177,13 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
     pixels = image[0].flatten(1).T.numpy()
     rows, columns = np.divmod(np.arange(count), width)
     near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= matting.WINDOW_RADIUS
-    share = near / near.sum(1, keepdims=True)  # of pixels in windows, and of windows around a pixel
+    share = near / near.sum(1, keepdims=True)  # weights of pixels in windows, and of windows around a pixel
     smooth = np.zeros((count, count))
     for middle in range(count):
         inside = near[middle].nonzero()[0]
         some = pixels[inside] - pixels[inside].mean(0)
         slopes = np.linalg.inv(some.T @ some / len(inside) + matting.NOISE * np.eye(3)) @ some.T / len(inside)
-        values = (pixels - pixels[inside].mean(0)) @ slopes + 1 / len(inside)  # of every pixel by those inside
+        values = (pixels - pixels[inside].mean(0)) @ slopes + 1 / len(inside)  # values of every pixel from those inside
         smooth[:, inside] += share[:, [middle]] * values
     trust = matting.LINEAR_ROUGH_CONFIDENCE * (np.square(2 * rough.numpy().ravel() - 1) + 0.01)
     certain = matting.LINEAR_SCRIBBLE_CONFIDENCE * (front + back).numpy().ravel()

@@ -1,4 +1,4 @@
-"""Single precision on images and bandwidths that break other implementations: everything finite, every promise kept."""
+"""Single precision on images and bandwidths that break other implementations: finite results, guarantees hold."""
 
 import warnings
 
@@ -13,7 +13,7 @@ IMAGES = hard_images()
 
 
 def promises(image: torch.Tensor, bandwidth: float, landmarks: str) -> None:
-    """Everything that an operator in float32 promises."""
+    """Check all guarantees of an operator in float32."""
     count = min(100, image.shape[-2] * image.shape[-1])
     operator = nonlocal_operator(image, photometric_bandwidth=bandwidth / 255, num_landmarks=count, landmarks=landmarks)
     for tensor in (operator.factor, operator.diagonal, operator.scaling, operator.residual):
@@ -27,8 +27,8 @@ def promises(image: torch.Tensor, bandwidth: float, landmarks: str) -> None:
     v = spectrum.eigenvectors.flatten(2).double()
     assert v.isfinite().all()
     assert (v @ v.mT - torch.eye(v.shape[1])).abs().max() <= 1e-3
-    # Reported eigenvalues are clamped; the operator's own are not. With sampled landmarks negative affinities can be so
-    # many that they pass 1 (camera, one grey level: 1.06), which the diagnostics tell.
+    # Reported eigenvalues are clamped, those of the operator are not. With sampled landmarks they may exceed 1, because
+    # of negative affinities (camera, one grey level: 1.06), which the diagnostics report.
     assert landmarks == "uniform" or operator.diagnostics().largest_eigenvalue[0] <= 1.0001
 
     assert (polynomial_filter(operator, image, torch.ones(4)) - image).abs().max() <= 1e-5
@@ -58,7 +58,7 @@ def test_whole_photographs(name: str, bandwidth: int) -> None:
 def test_the_plain_method_is_finite_even_where_it_fails(name: str, bandwidth: int) -> None:
     image = torch.tensor(IMAGES[name], dtype=torch.float32)[None, None]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it says so itself when its row sums are off
+        warnings.simplefilter("ignore")  # it warns if its row sums are off
         operator = nonlocal_operator(
             image, photometric_bandwidth=bandwidth / 255, num_landmarks=20, landmarks="uniform", completion="none"
         )
@@ -70,12 +70,12 @@ def test_a_spatial_bandwidth_of_a_fraction_of_a_pixel() -> None:
     image = torch.tensor(IMAGES["uniform noise"], dtype=torch.float32)[None, None]
     operator = nonlocal_operator(image, photometric_bandwidth=0.1, spatial_bandwidth=0.01)
     assert (operator.row_sums() - 1).abs().max() <= 1e-4
-    torch.testing.assert_close(operator @ image, image, atol=1e-4, rtol=0)  # every pixel is like itself alone
+    torch.testing.assert_close(operator @ image, image, atol=1e-4, rtol=0)  # every pixel is similar only to itself
 
 
 def test_values_far_outside_of_0_to_1() -> None:
     image = torch.tensor(reduced("camera", 200), dtype=torch.float32)[None, None]
-    # Uniform, because k-means may send a pixel elsewhere when it is rounded: of 100 + y, float32 keeps y to 4e-6.
+    # Uniform, because rounding may change a pixel's centroid in k-means: of 100 + y, float32 keeps y to 4e-6.
     plain = nonlocal_operator(image, photometric_bandwidth=0.1, landmarks="uniform") @ image
     with pytest.warns(UserWarning, match="guide must be in"):
         shifted = nonlocal_operator(image + 100, photometric_bandwidth=0.1, landmarks="uniform") @ image

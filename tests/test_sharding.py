@@ -1,4 +1,4 @@
-"""One image over several processes: what each of them gets is what a single one gets for the same rows, gradients too.
+"""One image over several processes: results and gradients equal those of a single process for the same rows.
 
 Three processes are started once; groups of one, two and three of them take turns.
 """
@@ -41,7 +41,7 @@ pytestmark = [
 
 PROCESSES = 3
 HEIGHT, WIDTH = 24, 17
-# Processes of a group, and the first row of each and the end of the last. Some have fewer rows than a patch reaches.
+# Processes of a group, with the first row of each and the end of the last. Some have fewer rows than half a patch.
 GROUPS = {
     "one": ((1,), (0, 24)),
     "two": ((1, 2), (0, 9, 24)),
@@ -53,7 +53,7 @@ Problem = Callable[[slice, Any, torch.dtype], Results]
 
 
 def filtering(rows: slice, group: Any, dtype: torch.dtype) -> Results:
-    """Filter, mask and all gradients, with everything that may learn."""
+    """Filter, mask and all gradients, with every parameter learned."""
     whole = picture("astronaut", HEIGHT, WIDTH, dtype).expand(1, 2, -1, -1)
     guide = whole[:, :, rows].clone().requires_grad_()
     image = whole[:, :, rows].flip(1).clone().requires_grad_()
@@ -80,12 +80,12 @@ def filtering(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     filtered = polynomial_filter(operator, image, leaves["alpha"], residual=leaves["residual"])
     spectrum = operator.spectrum()
     region = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=dtype)
-    region[..., 8:14, 3:9] = 1  # no rank has all of it, some have nothing
+    region[..., 8:14, 3:9] = 1  # no rank contains all of it, and some contain none
     mask = diffusion_mask(
         spectrum, region[:, :, rows], time=leaves["time"], width=leaves["width"], negative=region.flip(3)[:, :, rows]
     )
     energy = captured_energy(spectrum, image)
-    # Of both signs: pixels that are all off by half a unit in the last place shall not add up to a wrong sum.
+    # Weights of both signs, so that errors of half a unit in the last place do not add up over all pixels.
     weights = noise(1, 2, HEIGHT, WIDTH, dtype=dtype)[:, :, rows] - 0.5
     share = (weights * filtered).sum() + (weights[:, :1] * mask).sum()
     share = share + energy.sum() / (1 if group is None else dist.get_world_size(group))
@@ -99,7 +99,7 @@ def filtering(rows: slice, group: Any, dtype: torch.dtype) -> Results:
 
 
 def options(rows: slice, group: Any, dtype: torch.dtype) -> Results:
-    """Other ways to an operator: automatic bandwidth, samplings, the plain method, a batch, one landmark a pixel."""
+    """Other options of the operator: automatic bandwidth, samplings, no completion, a batch, one landmark per pixel."""
     guide = torch.cat([picture(name, HEIGHT, WIDTH, dtype) for name in ("camera", "coffee")])
     exact = 1e-7 if dtype == torch.float32 else None
     found = {}
@@ -113,7 +113,7 @@ def options(rows: slice, group: Any, dtype: torch.dtype) -> Results:
         rank = 0 if group is None else dist.get_rank(group)
         own = guide[:, :, rows].clone().requires_grad_()
         arguments: dict[str, Any] = {"num_landmarks": 12, "tolerance": exact, "group": group} | kwargs
-        operator = nonlocal_operator(own, generator=seeded(rank), **arguments)  # the first rank's choices hold
+        operator = nonlocal_operator(own, generator=seeded(rank), **arguments)  # the choices of the first rank are used
         layers = detail_layers(operator, own, order=2)
         (layers * noise(2, 3, 1, HEIGHT, WIDTH, dtype=dtype)[..., rows, :]).sum().backward()
         found[f"rows {name}"] = layers.flatten(1, 2)
@@ -132,14 +132,14 @@ def fitted(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     alpha = torch.tensor([2.0, 3.0, 1.0], dtype=dtype, requires_grad=True)
     share = polynomial_filter(operator, image, alpha).pow(3).sum()
     first = torch.autograd.grad(share, (image, alpha), create_graph=True)
-    # A loss counts once: what all ranks hold alike enters with the part of one of them.
+    # A loss counts once: terms that are equal on all ranks are divided by the number of ranks.
     ranks = 1 if group is None else dist.get_world_size(group)
     second = torch.autograd.grad(first[0].square().sum() + first[1].square().sum() / ranks, (image, alpha))
     return {"layers": layers, "rows second": second[0], "second alpha": second[1]}
 
 
 def layer(rows: slice, group: Any, dtype: torch.dtype) -> Results:
-    """The layer, with sliders for each of two regions, all that it has learning."""
+    """The layer with sliders for each of two regions and all its parameters learned."""
     image = torch.cat([picture(name, HEIGHT, WIDTH, dtype) for name in ("astronaut", "coffee")])[:, :, rows]
     learned = NonlocalFilter(
         alpha=((2.0, 1.5, 1.0), (0.5, 3.0, 1.1)),
@@ -161,7 +161,7 @@ def layer(rows: slice, group: Any, dtype: torch.dtype) -> Results:
 
 
 def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
-    """Strokes, regions and the figures of an operator; some ranks have nothing painted."""
+    """Strokes, regions and the diagnostics of an operator; some ranks have no painted pixels."""
     guide = picture("coffee", HEIGHT, WIDTH, dtype)[:, :, rows].clone().requires_grad_()
     operator = nonlocal_operator(guide, photometric_bandwidth=0.2, spatial_bandwidth=8.0, num_landmarks=15, group=group)
     spectrum = operator.spectrum()
@@ -174,7 +174,7 @@ def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     regions = torch.cat([painted, painted.flip(2, 3)], dim=1)
     figures = asdict(operator.diagnostics())
     assert figures.pop("pixels") == HEIGHT * WIDTH
-    figures.pop("balancing_steps")  # samples of the ranks are others than those of the whole
+    figures.pop("balancing_steps")  # samples of the ranks differ from those of the whole image
     figures.pop("num_landmarks")
     found = {"rows spread": spread, "rows guide": guide.grad, "rows values": values.grad}
     found |= {name: leaf.grad for name, leaf in leaves.items()}
@@ -186,7 +186,7 @@ def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
 
 
 def sliders(rows: slice, group: Any, dtype: torch.dtype) -> Results:
-    """Sliders between two pictures: with the rounding of files, with none, with a mask."""
+    """Sliders fitted to a pair of pictures: with the rounding of files, without rounding, and with a mask."""
     image = picture("chelsea", HEIGHT, WIDTH, dtype)[:, :, rows]
     operator = nonlocal_operator(image, num_landmarks=12, photometric_bandwidth=0.3, group=group)
     edited = polynomial_filter(operator, image, torch.tensor([2.0, 3.0, 1.0, 1.1], dtype=dtype)).clamp(0, 1)
@@ -196,7 +196,7 @@ def sliders(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     masked = fit_alpha(operator, image, target, mask=mask, ridge=1e-4)
     ranks = 1 if group is None else dist.get_world_size(group)
     gradients = torch.autograd.grad(masked.square().sum() / ranks, (mask, target))
-    # Many sliders explain a rounded edit; which of them are found may depend on the order of sums.
+    # Many sliders explain a rounded edit; which ones are found may depend on the order of summation.
     again = polynomial_filter(operator, image, fit_alpha(operator, image, rounded, shared=True)).clamp(0, 1)
     return {
         "rows explained": ((again - rounded).abs() < 0.5 / 255 + 1e-6).to(dtype),
@@ -206,7 +206,7 @@ def sliders(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     }
 
 
-# Some gradients of the options are off by 1e-4 and more in float32, in one process too: whitening amplifies rounding.
+# Some gradients have errors above 1e-4 in float32 even in one process: the inverse Cholesky factor amplifies rounding.
 PROBLEMS: dict[str, tuple[Problem, torch.dtype, float]] = {
     "filtering": (filtering, torch.float64, 1e-9),
     "filtering in float32": (filtering, torch.float32, 1e-5),
@@ -220,7 +220,7 @@ PROBLEMS: dict[str, tuple[Problem, torch.dtype, float]] = {
 
 
 def refusals(group: Any, rank: int) -> dict[str, str]:
-    """What is refused, and how."""
+    """Calls that are refused, with their errors."""
     rows = noise(1, 1, 5, 6)
     operator = nonlocal_operator(rows, num_landmarks=5, group=group)
     calls: dict[str, Callable[[], object]] = {
@@ -263,7 +263,7 @@ def traffic(group: Any, rank: int) -> list[dict[str, int]]:
 
 
 def loss_of(call: Callable[[], object]) -> tuple[str, float]:
-    """What the loss of a rank is reported as, and after how many seconds."""
+    """The error that reports a lost rank, and the seconds until it is raised."""
     start = time.monotonic()
     try:
         call()
@@ -290,7 +290,7 @@ def work(rank: int, folder: str) -> None:
     world = dist.group.WORLD
     found = {"refusals": refusals(world, rank), "traffic": traffic(world, rank)}
     impatient = dist.new_group(timeout=timedelta(seconds=3))
-    if rank != 2:  # which is alive, but does not take part
+    if rank != 2:  # it is alive but does not take part
         found["absent"] = loss_of(lambda: nonlocal_operator(noise(1, 1, 5, 6), num_landmarks=5, group=impatient))
         Path(f"{folder}/{rank}.waited").touch()
     while not all(Path(f"{folder}/{other}.waited").exists() for other in range(2)):
@@ -299,15 +299,15 @@ def work(rank: int, folder: str) -> None:
     filtered = nonlocal_operator(rows, num_landmarks=5, group=world).matmul(rows)
     if rank == 2:
         torch.save(found, f"{folder}/end2.pt")
-        os._exit(0)  # as if killed, between forward and backward
+        os._exit(0)  # like a process killed between forward and backward
     found["dead"] = loss_of(filtered.square().sum().backward)
     torch.save(found, f"{folder}/end{rank}.pt")
-    os._exit(0)  # a group with a dead member cannot be taken down in order
+    os._exit(0)  # a group with a dead member cannot be shut down normally
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the processes found."""
+    """The folder with the results of the processes."""
     path = tmp_path_factory.mktemp("ranks")
     run_ranks(work, (str(path),), PROCESSES)
     return path
@@ -340,7 +340,7 @@ def test_halos_are_the_rows_of_the_neighbours(folder: Path) -> None:
                 first, last = max(0, start - margin), min(HEIGHT, stop + margin)
                 torch.testing.assert_close(extended, whole[:, :, first:last], atol=0, rtol=0)
                 assert halo == (start - first, last - stop)
-                # A row counts as often as it is seen, here and by the others.
+                # A row counts once for every rank whose halo contains it.
                 seen = torch.zeros(HEIGHT, dtype=whole.dtype)
                 for other in range(len(members)):
                     seen[max(0, cuts[other] - margin) : cuts[other + 1] + margin] += 1
@@ -376,7 +376,7 @@ def test_a_rank_that_is_gone_is_named_in_time(folder: Path) -> None:
 
 
 def test_without_a_group() -> None:
-    """Without a group nothing is exchanged: the same function, in one process."""
+    """Without a group the same functions work in one process and exchange nothing."""
     image = noise(1, 1, 6, 7)
     assert nonlocal_operator(image, num_landmarks=5, group=None).among is ALONE
     assert ALONE.with_halo(image, 2) == (image, (0, 0))

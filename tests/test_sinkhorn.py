@@ -64,7 +64,7 @@ def test_the_residual_is_that_of_the_scaling(completed: bool, pixels: int) -> No
 
 
 def test_one_slow_step_is_not_the_end() -> None:
-    """On this picture the residual falls by less than half once, at 1e-4, and goes on to rounding from there."""
+    """On this picture the residual decreases by less than half in one step, at 1e-4, and then converges to rounding."""
     image = torch.from_numpy(reduced("hubble_deep_field", 160).copy())[None, None]
     operator = nonlocal_operator(image, photometric_bandwidth=2 * estimate_bandwidth(image))
     assert operator.residual.item() <= 1e-12
@@ -85,7 +85,7 @@ def test_a_batch_is_its_images(completed: bool, pixels: int) -> None:
 
 
 def test_the_estimated_jacobian_leaves_the_gradient_exact() -> None:
-    """With a sample of the pixels and with all of them the solution, and so its gradient, is the same."""
+    """The solution, and so its gradient, is the same with a sample of the pixels and with all of them."""
     problems = [[t.requires_grad_() for t in problem(2, 4, 4000)] for _ in range(2)]
     gradients = []
     for (factor, diagonal), completed in zip(problems, (False, True), strict=True):
@@ -106,7 +106,9 @@ def test_few_sweeps_balance_a_photograph(name: str) -> None:
 
 def test_row_sums_that_stay_off_are_told() -> None:
     factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])  # a negative affinity, which plain Nystrom produces
-    with pytest.warns(UserWarning, match=r"balancing left row sums off by up to .*completion='diagonal'"):
+    with pytest.warns(
+        UserWarning, match=r"balancing left row sums that differ from 1 by up to .*completion='diagonal'"
+    ):
         result = balance(factor, torch.zeros(1, 4))
     assert result.scaling.isfinite().all()
     assert (result.scaling > 0).all()

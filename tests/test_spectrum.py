@@ -1,4 +1,4 @@
-"""Eigenvalues and eigenvectors. Eigenvectors of repeated eigenvalues are a choice: V f(S) V^T is what is compared."""
+"""Eigenvalues and eigenvectors. As those of repeated eigenvalues are not unique, tests compare V f(S) V^T."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_spectrum_is_in_order_in_range_and_orthonormal(
 @pytest.mark.parametrize("name", ["astronaut", "camera", "coffee", "chelsea"])
 @pytest.mark.parametrize("bandwidth", [10, 20, 40])
 def test_ritz_values_lie_where_they_must(name: str, bandwidth: int) -> None:
-    """Between the eigenvalues of W and those of its low-rank part, rank by rank (Courant and Fischer)."""
+    """Each lies between the eigenvalue of W of the same rank and that of its low-rank part (Courant and Fischer)."""
     operator = build(picture(name, 24, 24), photometric_bandwidth=bandwidth / 255, num_landmarks=60)
     dense = operator.to_dense()
     found = operator.spectrum().eigenvalues
@@ -108,7 +108,7 @@ def test_first_eigenvector_is_constant_and_positive(name: str, dtype: torch.dtyp
 
 @pytest.mark.parametrize("name", ["astronaut", "camera", "coffee"])
 def test_first_eigenvector_of_a_photograph_is_nearly_constant(name: str) -> None:
-    # The span of 60 landmarks holds the constant vector only up to what they miss of the kernel.
+    # The span of 60 landmarks contains the constant vector only up to the part of the kernel that they do not capture.
     spectrum = build(picture(name, 40, 48), photometric_bandwidth=30 / 255, num_landmarks=60).spectrum()
     first = spectrum.eigenvectors[0, 0]
     assert first.sum().item() / first.numel() ** 0.5 > 0.99

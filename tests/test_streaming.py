@@ -1,4 +1,4 @@
-"""Pictures that are read by rows: the result of one in memory, whatever the tiles, and errors that name their cause."""
+"""Pictures read by rows: the result in memory, for any tiles, and errors that name their cause."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -34,7 +34,7 @@ PLAIN: dict[str, Any] = {  # the filter as it is, as by nonlocal_operator
     "spatial_bandwidth": "none",
     "num_landmarks": 100,
 }
-FEW = 1 << 27  # bytes, with which rows are computed one at a time
+FEW = 1 << 27  # bytes that allow one row at a time
 
 
 def cat(height: int, width: int) -> Array:
@@ -43,7 +43,7 @@ def cat(height: int, width: int) -> Array:
 
 
 def in_memory(picture: Array, alpha: Tensor = ALPHA, residual: float | None = None, **options: Any) -> Array:
-    """What `nlfilter-torch detail` makes of a picture that fits the memory."""
+    """Return the result of `nlfilter-torch detail` for a picture in memory."""
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
     operator = nonlocal_operator(image, **{"tolerance": 1e-6, **options})
     edited = edit_luminance(image, lambda planes: polynomial_filter(operator, planes, alpha, residual=residual))
@@ -58,7 +58,7 @@ def streamed(picture: Array, alpha: Tensor = ALPHA, *, kind: str | None = None, 
 
 @dataclass
 class Rows:
-    """A source that keeps an account of what is read of it, and gives only few rows at once."""
+    """A source that counts the rows read, and allows only a few rows at once."""
 
     picture: Array
     most: int
@@ -77,7 +77,7 @@ class Rows:
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples and blocks in proportion to a small picture."""
+    """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 1500)
     monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
@@ -101,7 +101,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_full_passes_are_the_filter_in_memory(options: dict[str, Any]) -> None:
     picture = cat(83, 121)
     edited = streamed(picture, statistics="full", tile_rows=7, num_landmarks=50, **options)
-    # What the eigenvectors explain is found by dividing by small eigenvalues, whose rounding shows.
+    # The part captured by the eigenvectors involves division by small eigenvalues, which amplifies rounding.
     bound = 1e-5 if "residual" not in options else 5e-5
     assert np.abs(edited - in_memory(picture, num_landmarks=50, **options)).max() < bound
 
@@ -212,7 +212,7 @@ def test_draws_follow_the_rates_and_leave_no_gap() -> None:
         assert abs(int(counts.sum()) - float(rates.sum())) <= 1
         drawn[chosen] += counts
     assert (drawn[::50] == rounds).all()
-    # Six deviations of a count whose variance is at most that of independent draws.
+    # Six standard deviations of a count whose variance is at most that of independent draws.
     assert ((drawn / rounds - rates).abs() < 6 * (rates / rounds).sqrt()).all()
 
 
@@ -240,7 +240,7 @@ def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
             streamed(picture, statistics=statistics, sample=4000, num_landmarks=50, tile_rows=rows, **options)
             for rows in (1, 16, 4096)
         )
-        assert max(np.abs(other - first).max() for other in others) < 2.5e-7  # of the colours' conversion alone
+        assert max(np.abs(other - first).max() for other in others) < 2.5e-7  # of the colour conversion alone
 
 
 def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,9 +264,11 @@ def test_memory_gives_the_size_of_tiles() -> None:
     assert 200 * 85 * 4 * rows[0] < 5 * 10**7 < 200 * 85 * 4 * 4 * rows[0]
     assert rows[0] < rows[1] == rows[2]  # longer tiles are no faster
     assert rows_within(13 * 10**7, masked=True) < rows[1]
-    with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least, but 10 MB may be used; allow more"):
+    with pytest.raises(
+        MemoryError, match=r"source needs at least \d+ MB of memory, but only 10 MB may be used; allow more"
+    ):
         rows_within(10**7)
-    with pytest.raises(MemoryError, match="source needs 7 MB of memory at least, but 0 MB may be used"):
+    with pytest.raises(MemoryError, match="source needs at least 7 MB of memory, but only 0 MB may be used"):
         streamed(cat(60, 80), memory=1000)
 
 
@@ -334,7 +336,7 @@ def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -
 
 
 class Shrinking(Rows):
-    """A file that someone cuts short after it was looked at."""
+    """A file that is truncated after it was opened."""
 
     def __getitem__(self, rows: slice) -> Array:
         return super().__getitem__(rows)[: 5 if self.read > 40 else None]

@@ -1,4 +1,4 @@
-"""Files that are read and written by rows: every layout of TIFF, zarr, and everything that they hold."""
+"""Files read and written by rows: all layouts of TIFF, zarr, and their metadata."""
 
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,7 @@ def test_a_part_of_a_tiff_is_read_without_the_rest(tmp_path: Path) -> None:
 
 def test_a_tiff_in_one_piece_needs_memory_for_it(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", cat(), photometric="rgb", rowsperstrip=200, compression="zlib")
-    with pytest.raises(MemoryError, match=r"can only be read in pieces of 0 MB, .* save it in tiles"):
+    with pytest.raises(MemoryError, match=r"can only be read in pieces of 0 MB, .* save it in smaller tiles"):
         open_picture(tmp_path / "in.tif", 100_000).__enter__()
 
 
@@ -153,7 +153,7 @@ def test_a_zarr_array_that_changes_its_shape_is_named(tmp_path: Path, capsys: py
     with open_picture(tmp_path / "in.zarr", PLENTY) as picture:
         picture.rows[slice(0, 10)]
         array.resize((100, 150, 3))
-        with pytest.raises(ValueError, match=r"in\.zarr changed while it was read, from the shape \(200, 150, 3\)"):
+        with pytest.raises(ValueError, match=r"in\.zarr changed its shape while it was read, from \(200, 150, 3\)"):
             picture.rows[slice(10, 20)]
 
 

@@ -1,4 +1,4 @@
-"""Strokes on pictures that are read by rows: what they make of one in memory, whatever the tiles, and named errors."""
+"""Strokes on pictures read by rows: the result in memory, for any tiles, and errors that name their cause."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples and blocks in proportion to a small picture."""
+    """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 300)
     monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
@@ -165,7 +165,7 @@ def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch
     picture = cat(240, 60)
     painted = paint(240, 60)
     settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
-    source, *paints = (Rows(rows, most=10 + 2 * 40) for rows in (picture, *painted))  # with what masks and borders see
+    source, *paints = (Rows(rows, most=10 + 2 * 40) for rows in (picture, *painted))  # with surroundings
     edited = np.empty_like(picture)
     stream_recolor(source, edited, paints[0], paints[1], keep=paints[2], **settings)
     np.testing.assert_array_equal(edited, recoloured(picture, *painted[:2], keep=painted[2], **settings))
@@ -221,7 +221,7 @@ def test_report_tells_every_stage() -> None:
 
 def test_painted_pixels_need_memory() -> None:
     picture, (strokes, mask, _) = cat(180, 240), paint(180, 240)
-    with pytest.raises(MemoryError, match=r"the strokes on source cover \d+ pixels or more .* paint less"):
+    with pytest.raises(MemoryError, match=r"the strokes on source cover at least \d+ pixels .* paint less"):
         read_scribbles(
             Picture(picture),
             0 * mask + 1,
@@ -234,7 +234,7 @@ def test_painted_pixels_need_memory() -> None:
     for edit, reason in ((recoloured, "source needs"), (coloured, "the strokes on source cover")):
         with pytest.raises(MemoryError, match=reason):
             edit(picture, strokes, 0 * mask + 1, memory=7_000_000, num_landmarks=5)
-        with pytest.raises(MemoryError, match=r"source needs \d+ MB of memory at least"):
+        with pytest.raises(MemoryError, match=r"source needs at least \d+ MB of memory, but"):
             edit(picture, strokes, mask, memory=1_000_000)
 
 
@@ -253,9 +253,9 @@ def test_painted_pixels_need_memory() -> None:
         (
             lambda s, m: (s,),
             {},
-            "strokes must have 3 channels and a stroke_mask, or 4 channels and none, got 3 without",
+            "strokes must have 3 channels with a stroke_mask, or 4 channels without one, got 3 channels without",
         ),
-        (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 with one; add or drop it"),
+        (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 channels with a stroke_mask; add or drop it"),
         (lambda s, m: (s, s), {}, "stroke_mask must have 1 channel, got 3"),
         (lambda s, m: (Shrinking(s, most=100, read=50), m), {}, "strokes must keep its size while it is read"),
         (lambda s, m: (s, m), {"statistics": "some"}, "statistics must be one of"),
@@ -285,7 +285,7 @@ def test_what_only_one_of_them_takes_is_named() -> None:
         stream_recolor(picture, grey(picture), strokes, mask)
     with pytest.raises(ValueError, match=r"strength must be in \[0, 1\]"):
         coloured(picture, strokes, mask, strength=2.0)
-    with pytest.raises(ValueError, match="method must be regression where a picture is worked out by rows, got kmeans"):
+    with pytest.raises(ValueError, match="method must be regression for a picture processed in tiles, got kmeans"):
         coloured(picture, strokes, mask, method="kmeans")
     with pytest.raises(ValueError, match="target must have the height and width of the source, three colours"):
         stream_colorize(picture, grey(picture), strokes, mask)
@@ -303,7 +303,7 @@ def test_a_source_that_changes_its_size_is_named() -> None:
 
 # --- the command line
 
-LITTLE = "0.014"  # gigabytes: less than the picture takes whole, more than it takes by rows in small blocks
+LITTLE = "0.014"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
 
 
 @pytest.fixture
@@ -373,7 +373,7 @@ def test_what_cannot_be_done_by_rows_leaves_nothing(photo: Path, capsys: pytest.
         ("recolor", "in.tif", ("--strokes", folder / "small.png"), "small.png must be as large as the photograph"),
         ("recolor", "in.tif", ("--strokes", folder / "opaque.png"), "opaque.png has no transparency"),
         ("colorize", "in.tif", ("--strokes", folder / "clear.png"), "clear.png must hold a painted pixel, got none"),
-        ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H alone"),
+        ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H only"),
         ("colorize", "in.tif", ("--region", "1,2,5,4"), "--region must end in a colour"),
     ):
         assert run(verb, folder / source, folder / "out.tif", *options, "--memory", LITTLE) == 2

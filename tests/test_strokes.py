@@ -1,4 +1,4 @@
-"""Propagated strokes: against the same estimate worked out densely, invariants, gradients and bad input."""
+"""Propagated strokes: against a dense computation of the same estimate, invariants, gradients and bad input."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ PLACES = ((2, 3), (8, 15), (16, 5))
 def kriging(
     spectrum: Spectrum, strokes: np.ndarray, weights: np.ndarray, strength: float, reach: float, smoothness: float
 ) -> np.ndarray:
-    """The same estimate in its textbook form: covariances between pixels, one row and column per pixel."""
+    """The estimate in its textbook form, with the dense matrix of covariances between pixels."""
     factor, scaling = spectrum.factor[0].numpy(), spectrum.scaling[0].numpy()
     rows = factor * scaling
     basis, singular, _ = np.linalg.svd(rows.T, full_matrices=False)  # orthonormal over pixels
@@ -55,7 +55,7 @@ def kriging(
 
 
 def spectrum_remainder(spectrum: Spectrum) -> np.ndarray:
-    """The diagonal part r of W: what the factor's row sums lack of 1."""
+    """The diagonal part r of W, by which the row sums of the factor's part are below 1."""
     rows = (spectrum.factor[0] * spectrum.scaling[0]).numpy()
     return 1 - rows.T @ rows.sum(1)
 
@@ -74,7 +74,7 @@ def test_it_is_the_best_linear_estimate(spectrum: Spectrum, strength: float, rea
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("bandwidth", [0.001, 0.02, 0.05, 0.1])
 def test_pixels_that_the_landmarks_miss_do_not_run_away(bandwidth: float, dtype: torch.dtype) -> None:
-    """Their few millionths in common with others would have to be scaled up to reach what is painted on them."""
+    """Their affinities of a few millionths would have to be amplified to reach the painted values."""
     image, mask = noise(1, 1, 32, 32, dtype=dtype), spots((8, 8), (20, 20), height=32, width=32).to(dtype)
     strokes = torch.zeros_like(mask)
     strokes[..., 20:22, 20:22] = 1
@@ -117,7 +117,7 @@ def test_values_go_to_their_likes_and_fade_on_request() -> None:
     strokes[..., 4:6, 2:4], strokes[..., 4:6, 14:16] = 1.0, 0.5
     full = propagate_strokes(spectrum, strokes, mask)
     none = propagate_strokes(spectrum, strokes, mask, strength=0.0)
-    for found in (full, none):  # away from the borders, where patches mix
+    for found in (full, none):  # away from the borders, where patches contain both sides
         torch.testing.assert_close(found[..., 2:7], torch.ones(1, 1, 18, 5), atol=0.05, rtol=0)
         torch.testing.assert_close(found[..., 13:17], torch.full((1, 1, 18, 4), 0.5), atol=0.05, rtol=0)
     assert (none[..., 23:].abs() < 0.05).all()
@@ -127,7 +127,7 @@ def test_values_go_to_their_likes_and_fade_on_request() -> None:
 
 
 def test_a_dot_counts_beside_broad_strokes() -> None:
-    """On a large image a single pixel is still heeded, as whoever set it expects."""
+    """On a large image a single painted pixel still has an effect."""
     side = 256  # a spot is 43 pixels here
     image = torch.full((1, 1, side, side), 0.2)
     image[..., side // 2 :] = 0.8
@@ -173,7 +173,7 @@ def test_strokes_keep_their_dtype(spectrum: Spectrum, dtype: torch.dtype) -> Non
 
 @pytest.mark.parametrize("degenerate", [False, True])
 def test_gradients(degenerate: bool) -> None:
-    """Along the whole way, mask and parameters included; also where eigenvalues meet."""
+    """Gradients end to end, including mask and parameters, also with repeated eigenvalues."""
     image = torch.from_numpy(two_colours(6, 7))[None, None] if degenerate else noise(2, 1, 6, 7)
     batch = image.shape[0]
 
@@ -187,7 +187,7 @@ def test_gradients(degenerate: bool) -> None:
     strokes = noise(batch, 2, 6, 7, seed=1).requires_grad_()
     mask = (0.1 + 0.8 * noise(batch, 1, 6, 7, seed=2)).requires_grad_()
     parameters = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.7, 0.8, 1.3)]
-    # Where all pixels are equal the rank jumps with any change: there the gradient of the image has to be finite only.
+    # If all pixels are equal, any change alters the rank: the gradient in the image only has to be finite.
     image.requires_grad_(not degenerate)
     assert torch.autograd.gradcheck(way, (image, strokes, mask, *parameters))
     if degenerate:

@@ -1,4 +1,4 @@
-"""Table I and Fig. 20 of the paper, on reductions of the twelve pictures that benchmarks.tables measures in full."""
+"""Table I and Fig. 20 of the paper, on reduced versions of the twelve pictures of benchmarks.tables."""
 
 import pytest
 

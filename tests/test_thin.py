@@ -1,4 +1,4 @@
-"""Products with few rows are those of a matrix product, divided into parts or not."""
+"""Products with few rows equal plain matrix products, whether divided into parts or not."""
 
 import pytest
 import torch

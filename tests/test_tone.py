@@ -1,4 +1,4 @@
-"""Tone, sharpening and the detail of regions: what they raise, and what they leave alone."""
+"""Tone, sharpening and the detail of regions: what they change, and what they leave unchanged."""
 
 from typing import Any
 
@@ -74,7 +74,7 @@ def test_detail_reaches_the_likes_of_a_region_only() -> None:
     dot = enhance(image, sliders, box(40, 10, 1, 1))
     share = [((dot - image).abs()[place].mean() / (whole - image).abs()[place].mean()) for place in (SUIT, BACKGROUND)]
     assert share[0] > 3 * share[1]
-    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+    with pytest.raises(ValueError, match="negative must be given together with regions, got no regions"):
         enhance(image, sliders, negative=box(1, 1))
     with pytest.raises(ValueError, match=r"alpha must have shape \(1, k\+1\)"):
         enhance(image, torch.ones(2, 4), box(1, 1))

@@ -1,4 +1,4 @@
-"""The denoiser's training learns, can be taken up where it stopped, and refuses what it cannot use before it starts."""
+"""The denoiser's training: it learns, resumes, and refuses unusable input before it starts."""
 
 import copy
 import json

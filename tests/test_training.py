@@ -1,4 +1,4 @@
-"""Training that holds up: the loss falls whatever the seed, and a thousand steps on nasty crops give no NaN."""
+"""Robust training: the loss decreases for any seed, and a thousand steps on difficult crops give no NaN."""
 
 import math
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ EVERYTHING = ("alpha", "residual", "photometric_bandwidth", "spatial_bandwidth",
 
 
 class Denoiser(nn.Module):
-    """A small convolution that makes the guide, and a filter all of whose parts learn."""
+    """A small convolution that computes the guide, and a filter with all parameters learned."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class Denoiser(nn.Module):
 
 
 def crops(names: tuple[str, ...], side: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """Random crops (2, 1, side, side) of photographs without end."""
+    """An endless sequence of random crops (2, 1, side, side) of photographs."""
     pictures = [torch.from_numpy(photograph(name).copy()).float() for name in names]
     while True:
         batch = []
@@ -65,12 +65,12 @@ def test_loss_falls_on_every_seed(seed: int) -> None:
         optimizer.step()
         losses.append(loss.item())
     assert sum(losses[-5:]) / 5 < 0.8 * losses[0]
-    assert losses[-1] < 0.6 * NOISE**2  # it denoises, too
+    assert losses[-1] < 0.6 * NOISE**2  # it also removes noise
 
 
 @contextmanager
 def random_bandwidths(layer: NonlocalFilter, generator: torch.Generator) -> Iterator[None]:
-    """Bandwidths between a hundredth of what was learned and a hundred times as much."""
+    """Set bandwidths to between a hundredth and a hundred times their learned values."""
     logarithms = [layer.affinity.log_photometric_bandwidth, layer.affinity.log_spatial_bandwidth]
     learned = [p.detach().clone() for p in logarithms]
     for p in logarithms:
@@ -105,7 +105,7 @@ def test_a_thousand_steps_without_a_nan() -> None:
         for name, parameter in model.named_parameters():
             assert parameter.grad is not None, name
             assert parameter.grad.isfinite().all(), (step, name)
-        # Tiny bandwidths make gradients of any size; what is tested is that they are numbers.
+        # Tiny bandwidths give gradients of any size; they only have to be finite.
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
     assert all(p.isfinite().all() for p in model.parameters())

@@ -1,4 +1,4 @@
-"""Limits of brightness, calm areas, and sliders that do the same at any resolution."""
+"""Limits of brightness, flat areas, and sliders with the same effect at any resolution."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ EDITS: dict[str, Any] = {
 
 
 def drawn(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images of 8 bits with channels at both ends, and large changes of their luminance."""
+    """Images of 8 bits with channels at both ends of the range, and large changes of their luminance."""
     generator = torch.Generator().manual_seed(seed)
     image = torch.randint(0, 256, (2, 3, 40, 40), generator=generator).double() / 255
     image[0, 0, :9], image[1, 1, :9] = 0.0, 1.0  # no room in one direction
@@ -97,7 +97,7 @@ def test_limits_have_exact_gradients() -> None:
     still = torch.zeros(1, 1, 4, 5, dtype=torch.float64, requires_grad=True)
     change_luminance(image.detach(), still).sum().backward()
     assert still.grad is not None
-    torch.testing.assert_close(still.grad, torch.full_like(still, 3.0))  # sliders can leave 1 by gradients
+    torch.testing.assert_close(still.grad, torch.full_like(still, 3.0))  # gradients can move sliders away from 1
 
 
 @pytest.mark.parametrize("name", EDITS)
@@ -129,7 +129,7 @@ def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
         assert torch.equal(found, image)
 
 
-# --- calm areas
+# --- flat areas
 
 
 def test_calm_areas_are_strengthened_less_and_smoothed_alike() -> None:

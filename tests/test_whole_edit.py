@@ -1,4 +1,4 @@
-"""Whole edits on pictures that are read by rows: what they make of one in memory, and named errors."""
+"""Recipes on pictures read by rows: the result in memory, and errors that name their cause."""
 
 import errno
 from dataclasses import replace
@@ -89,11 +89,11 @@ def test_strokes_cover_the_same_by_rows(rows: slice) -> None:
 def test_an_edit_by_rows_is_the_one_in_memory(recipe: Recipe, tmp_path: Path) -> None:
     image = cat(5)
     edited = by_rows(recipe, rows_of(image), tmp_path, tile_rows=17)
-    # What differs by 1e-5 before recolouring may choose other landmarks: it takes what the steps before gave by rows.
+    # Differences of 1e-5 before recolouring may change its landmarks, so its input is that of the steps by rows.
     before, last = recipe.steps[:-1], recipe.steps[-1:]
     given = from_rows(by_rows(Recipe(before), rows_of(image), tmp_path, tile_rows=17)) if before else image
     wanted = rows_of(Recipe(last).apply(given))
-    # In memory the balancing ends at 1e-5.
+    # In memory the balancing stops at 1e-5.
     assert np.abs(edited - wanted).max() < (1e-4 if RECOLOR in last else 2e-5)
     assert not list(tmp_path.iterdir())
 
@@ -112,7 +112,7 @@ def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pyt
     few = by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)  # and so two tiles or more
     assert np.abs(few - by_rows(recipe, rows_of(image), tmp_path)).max() < 1e-5
     monkeypatch.setattr("nlfilter_torch.tiled.source.FINISH_FLOATS", 20_000)
-    with pytest.raises(MemoryError, match=r"scan.tif needs \d+ MB of memory at least, but 60 MB may be used"):
+    with pytest.raises(MemoryError, match=r"scan.tif needs at least \d+ MB of memory, but only 60 MB may be used"):
         by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)
 
 
@@ -141,7 +141,7 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     for name, options in zip(names, ([], ["--memory", "0.044", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
-    # The second step's k-means may turn another way by the rounding of the first.
+    # Rounding in the first step may change the k-means of the second.
     assert 0 < difference(whole, rows) < 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
 
@@ -159,7 +159,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("nlfilter_torch.tiled.intermediate.TemporaryFile", lambda **_: Full())
-    sentence = "No space left on device, where one step of the edit leaves 0.0 GB to the next"
+    sentence = "No space left on device, for a temporary file of 0.0 GB between two steps of the edit"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)
     assert raised.value.filename == str(tmp_path)
@@ -168,7 +168,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
 def test_negative_regions_come_with_regions_of_their_number() -> None:
     source = rows_of(cat())
     edited, two, three = np.empty_like(source), np.ones((100, 150, 2), np.float32), np.ones((100, 150, 3), np.float32)
-    with pytest.raises(ValueError, match="negative must come with regions, got it alone"):
+    with pytest.raises(ValueError, match="negative must be given together with regions, got no regions"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), negative=two)
     with pytest.raises(ValueError, match="negative must have 1 channel or one for each of the 2 regions, got 3"):
         stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=three)

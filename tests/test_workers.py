@@ -1,4 +1,4 @@
-"""Tiles by threads of their own: what torch's numbers of threads are inside, after and elsewhere."""
+"""Tiles in separate threads: torch's number of threads inside them, afterwards and elsewhere."""
 
 import os
 import signal
@@ -41,13 +41,13 @@ def test_single_threaded_holds_for_the_calling_thread_and_its_workers() -> None:
         assert list(in_order(lambda _: torch.get_num_threads(), range(3), 2)) == [3, 3, 3]
         assert (torch.get_num_threads(), of_new_thread()) == (1, 6)
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
-    with single_threaded(1):  # nothing else is at work then
+    with single_threaded(1):  # no other work runs then
         assert torch.get_num_threads() == 6
 
 
 @pytest.fixture
 def own_threads() -> Iterator[None]:
-    """Kernels on threads of their own."""
+    """Kernels on their own thread pool."""
     library.share_threads(library._library, None)
     yield
     library.share_threads(library._library, library._openmp())
@@ -74,6 +74,6 @@ def test_the_pool_serves_several_callers_at_once_and_a_forked_process() -> None:
             assert all(callers.map(many, range(8)))
         child = os.fork()
         if child == 0:
-            signal.alarm(60)  # instead of waiting for ever
+            signal.alarm(60)  # instead of hanging
             os._exit(0 if torch.equal(moment(factor, exact), sums) else 1)
         assert os.waitpid(child, 0)[1] == 0

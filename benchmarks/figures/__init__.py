@@ -1,7 +1,8 @@
-"""Counterparts of the paper's figures from photographs that ship with scikit-image: ``python -m benchmarks.figures``.
+"""Counterparts of the paper's figures, drawn from scikit-image's photographs: ``python -m benchmarks.figures``.
 
-Every entry of :data:`FIGURES` takes ``size``, the longer side of its photographs in pixels, and returns a matplotlib
-figure and its numbers. Its docstring is the caption. Figures 2, 4 and 5 are diagrams; 19 is part of Table I.
+Each function in :data:`FIGURES` takes ``size``, the longer side of its photographs in pixels, and returns a matplotlib
+figure and its numbers; its docstring is the caption. The paper's Figs. 2, 4 and 5 are diagrams; Fig. 19 is part of
+Table I.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.figures [--only 12,13] [--out out/figures] [--quick]``: PNG files, captions and one JSON."""
+"""``python -m benchmarks.figures [--only 12,13] [--out out/figures] [--quick]``: PNG files, captions and JSON."""
 
 import argparse
 import inspect
@@ -12,15 +12,15 @@ from benchmarks.figures import FIGURES, SIZE
 from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.plotting import save_figure
 
-QUICK = 72  # pixels
+QUICK = 72  # longer side of a photograph, in pixels
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Draw, print captions and numbers, and keep both."""
+    """Draw the figures, and print and save their captions and numbers."""
     parser = argparse.ArgumentParser(description="Counterparts of the paper's figures.")
-    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, with commas between")
-    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="the folder for them")
-    parser.add_argument("--quick", action="store_true", help=f"photographs of {QUICK} pixels, to see that it runs")
+    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, separated by commas")
+    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="folder for the figures")
+    parser.add_argument("--quick", action="store_true", help=f"photographs of {QUICK} pixels, to check that it runs")
     options = parser.parse_args(arguments)
     chosen = options.only.split(",") if options.only else list(FIGURES)
     unknown = [name for name in chosen if name not in FIGURES]
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def show(numbers: dict[str, object], indent: str = "  ") -> None:
-    """Print numbers, a line for every leaf or for every dictionary of leaves."""
+    """Print nested numbers, one line per value or per innermost dictionary."""
     for name, value in numbers.items():
         if isinstance(value, dict) and any(isinstance(inner, dict) for inner in value.values()):
             print(f"{indent}{name}")

@@ -11,13 +11,13 @@ from nlfilter_torch.plotting import show_images
 
 TONES, LINES = 8, 0.8
 PART = (95, 10, 170)  # left, top, side
-ROUNDS, RANGE, SPREAD = 4, 0.08, 3.0  # of the iterated bilateral filter
+ROUNDS, RANGE, SPREAD = 4, 0.08, 3.0  # of the bilateral filter: iterations, range sigma and spatial sigma
 
 
 def figure_18(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """W^k y with k = 0.1 (b), with lines and tones drawn on it (c), and the same drawn after a bilateral filter (d).
+    """W^k y with k = 0.1 (b), with edge lines and quantised tones (c), and a bilateral filter with both (d).
 
-    (d) is the method of the paper's [30]. Below, a part of each at three times the size.
+    (d) is the method of the paper's [30]. The lower row shows a part of each, magnified three times.
     """
     image, scale = scene("astronaut", size)
     panels = {
@@ -41,7 +41,7 @@ def figure_18(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def winnemoeller(image: Tensor) -> Tensor:
-    """The paper's [30]: a bilateral filter, four times over, then lines and tones."""
+    """Method of the paper's [30]: a bilateral filter applied four times, then edge lines and quantised tones."""
     from kornia.filters import bilateral_blur
 
     flat = image

@@ -9,16 +9,16 @@ from nlfilter_torch import estimate_bandwidth
 
 PICTURES = ("coffee", "chelsea", "astronaut", "camera")
 LEVELS = (2, 4, 6, 8, 10)  # h_y of the paper's Table I, in units of its own patch weights
-OWN_UNIT = 4.2  # as many times larger are bandwidths under patch weights of unit sum
+OWN_UNIT = 4.2  # ratio of a bandwidth under patch weights of unit sum to the paper's
 PAPER, DEFAULTS = tables.METHODS
 
 
 def figure_20(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """What the m leading eigenvectors of 150 samples miss of a photograph: relative RMSE in per cent, auto bandwidth.
+    """Residual of a photograph under the m leading eigenvectors of 150 landmarks: relative RMSE in %, auto bandwidth.
 
-    Left: the paper's method. Right: the library's defaults, whose eigenvectors hold less, since the span of the factor
-    need not hold the constant; its filters keep what they miss, the paper's drop it. The paper tells of about 1 % for
-    m > 75.
+    Left: the paper's method. Right: the library's defaults, whose eigenvectors capture less, since the span of the
+    factor need not contain the constant; the library's filters keep the residual, the paper's drop it. The paper
+    reports about 1 % for m > 75.
     """
     figure = Figure(figsize=(10, 4.5), dpi=100, layout="constrained")
     numbers: Numbers = {}
@@ -35,15 +35,15 @@ def figure_20(size: int = SIZE) -> tuple[Figure, Numbers]:
         axis.title.set_fontsize(10)
         axis.grid(alpha=0.3)
         axis.legend()
-    axes[0].set_ylim(bottom=0)  # once all curves are there
+    axes[0].set_ylim(bottom=0)  # after all curves are drawn
     return figure, numbers
 
 
 def table_1(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Energy in per cent that 100 eigenvectors hold, over the bandwidth in grey levels; mean gradients as in Fig. 19.
+    """Energy in per cent captured by 100 eigenvectors, over the bandwidth in grey levels; mean gradients as in Fig. 19.
 
-    Bandwidths are the paper's 2 to 10, whose patch weights sum to 1/4.2 of ours, and the automatic one. A dash: the
-    paper's method gave no filter (row sums off by more than 0.01).
+    Bandwidths are the paper's 2 to 10, multiplied by 4.2 to account for its patch weights, and the automatic one. A
+    dash means that the paper's method gave no filter (row sums off by more than 0.01).
     """
     numbers: Numbers = {}
     rows, labels = [], []

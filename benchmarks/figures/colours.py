@@ -22,13 +22,13 @@ TRUE: tuple[Box, ...] = (
     (60, 300, 40, 30),
     (520, 310, 40, 30),
 )
-TOLERANCE = 20.0  # of the replacement by colour range, in units of Lab
+TOLERANCE = 20.0  # of the colour-range replacement, in Lab units
 
 
 def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """One stroke on a motorcycle's tank recolours all of its red, beside replacing a range of colours.
+    """One stroke on a motorcycle's tank recolours all of its red, compared with replacing a range of colours.
 
-    (c) is where the colour goes. (e) takes the stroke's hue for all colours within 20 units of Lab, fading out; (f) is
+    (c) shows where colours change. (e) gives the stroke's chroma to all colours within 20 Lab units, fading out; (f) is
     the paper's mask, for comparison.
     """
     image, scale = scene("motorcycle", size)
@@ -49,7 +49,7 @@ def figure_14(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def figure_15(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Strokes of two colours on things of one red: the spatial term sends each colour to its own side."""
+    """Strokes of two colours on objects of the same red: the spatial term limits each colour to its own side."""
     image, scale = scene("motorcycle", size)
     colours, mask = strokes(
         image, scale, ((350, 205, 40, 20), BLUE), ((565, 272, 30, 14), BLUE), ((565, 190, 40, 40), GREEN)
@@ -65,9 +65,9 @@ def figure_15(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def figure_16(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """A grey photograph and a few strokes of its own colours; PSNR is against the photograph in its own colours.
+    """A grey photograph colorized from a few strokes of its original colours; PSNR is against the original.
 
-    (d) is the regression, the default; (e) the paper's k-means, whose pieces (c) shows; (f) Levin's optimisation.
+    (d) is regression, the default; (e) is the paper's k-means, whose segments (c) shows; (f) is Levin's optimisation.
     """
     image, scale = scene("coffee", size)
     grey = luminance(image)
@@ -85,13 +85,13 @@ def figure_16(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def reached(before: Tensor, after: Tensor) -> Tensor:
-    """Where chroma changed, and by how much of its largest change, (1, 1, H, W)."""
+    """Change in chroma relative to its 99th percentile, clamped to [0, 1], (1, 1, H, W)."""
     change = (split_luminance(after)[1] - split_luminance(before)[1]).norm(dim=1, keepdim=True)
     return (change / change.flatten().quantile(0.99).clamp(min=1e-6)).clamp(0, 1)
 
 
 def colour_range(image: Tensor, colours: Tensor, mask: Tensor) -> Tensor:
-    """What a colour replacement tool does: the stroke's chroma for all colours like those under it."""
+    """Colour-range replacement: give the stroke's chroma to all colours similar to those under the stroke."""
     lab = rgb_to_lab(image)
     under = (lab * mask).sum((2, 3), keepdim=True) / mask.sum()
     distance = (lab - under)[:, 1:].norm(dim=1, keepdim=True)

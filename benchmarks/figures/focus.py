@@ -31,15 +31,15 @@ MOTORCYCLE: tuple[Box, ...] = (
     (540, 330, 60, 60),
     (180, 310, 130, 20),
 )
-WIDE = 741 / 500  # the motorcycle's width over its height
-NEAR, FAR = 5.0, 14.0  # in pixels of disparity from the tank's: the subject, and what is behind it
+WIDE = 741 / 500  # aspect ratio of the motorcycle photograph
+NEAR, FAR = 5.0, 14.0  # limits of subject and background, in pixels of disparity from the region's
 
 
 def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """In focus is what the yellow spots touch, and what is like them and near; the depth of the second scene is known.
+    """In focus are the yellow spots and similar pixels nearby; the depth of the second scene is known.
 
-    (h) is blurred by the depth that a stereo camera measured. Gradient energy is that of
-    the result over that of the photograph.
+    (h) is blurred according to the depth measured by a stereo camera. Gradient energy is that of the result divided by
+    that of the photograph.
     """
     portrait, scale = scene("astronaut", size)
     portrait = portrait[..., : round(portrait.shape[-1] / WIDE), :]
@@ -76,13 +76,13 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def default_map(image: Tensor, region: Tensor) -> Tensor:
-    """The map that the defaults of defocus make."""
+    """Focus map computed with the defaults of :func:`defocus`."""
     share = DEFOCUS["spatial_bandwidth"].share * min(image.shape[-2:])
     return focus_of(region_mask(image, region, spatial_bandwidth=share))
 
 
 def _disparity(image: Tensor) -> Tensor:
-    """Of the motorcycle, (1, 1, H, W), unknown ones as on the farther side of the gap."""
+    """Disparity of the motorcycle scene, (1, 1, H, W), with gaps filled from their farther side."""
     known = torch.from_numpy(np.array(skimage.data.stereo_motorcycle()[2], dtype=np.float32))
     known = torch.where(torch.isfinite(known), known, torch.inf)
     while bool(torch.isinf(known).any()):

@@ -13,12 +13,12 @@ PLACES: dict[str, Box] = {"astronaut": (60, 300, 20, 20), "rocket": (300, 90, 40
 
 
 def figure_11(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Masks of a spot (yellow) on the suit and in the sky: white is alike. With larger time t they reach further."""
+    """Masks of a region (yellow) on the suit and in the sky; white is similar. Masks extend further with larger t."""
     panels, numbers = {}, {}
     for name, box in PLACES.items():
         image, scale = scene(name, size)
         region = spots(image, scale, box)
-        margin = (image.shape[-1] - image.shape[-2]) // 2  # square, as the other
+        margin = (image.shape[-1] - image.shape[-2]) // 2  # crop to a square, like the other
         image, region = (plane[..., margin : margin + plane.shape[-2]] for plane in (image, region))
         operator = nonlocal_operator(image, photometric_bandwidth=BANDWIDTH, guide_channels="all")
         spectrum = operator.spectrum()

@@ -1,4 +1,4 @@
-"""Figs. 12 and 13: detail in a region's mask, compared with editing everything and with unsharp masks."""
+"""Figs. 12 and 13: detail enhanced within a mask, compared with editing the whole image and with unsharp masks."""
 
 from collections.abc import Callable
 
@@ -15,23 +15,23 @@ from nlfilter_torch.plotting import show_images
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.0])
 BANDWIDTH = 25 / 255
-Window = tuple[int, int, int]  # column, row and side of what is shown, in pixels of the photograph as it ships
-STEPS = 24  # of a bisection
+Window = tuple[int, int, int]  # column, row and side of the part shown, in pixels of the full-size photograph
+STEPS = 24  # of the bisection
 STRONGEST = 40.0
 
 
 def figure_12(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Detail of a suit only, from one spot. (b) to (e) have the same gain of detail on what the mask (f) selects.
+    """Detail of the suit only, from one region. (b) to (e) have equal detail gain where the mask (f) selects.
 
-    Propagated, the edit leaves skin and backdrop as they are, and with them their noise.
+    The propagated edit leaves skin and background unchanged, including their noise.
     """
     return _compare("astronaut", size, ((60, 300, 20, 20),), time=2.0, width=4.0, window=(10, 40, 330))
 
 
 def figure_13(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Detail of a lawn only, from one spot. (b) to (e) have the same gain of detail on what the mask (f) selects.
+    """Detail of the lawn only, from one region. (b) to (e) have equal detail gain where the mask (f) selects.
 
-    Propagated, the edit leaves the sky as it is, and with it the sky's noise.
+    The propagated edit leaves the sky unchanged, including its noise.
     """
     return _compare("camera", size, ((300, 380, 40, 60),), time=1.0, width=2.0, window=(60, 130, 330))
 
@@ -78,7 +78,7 @@ def _adding(image: Tensor, detail: Tensor) -> Callable[[float], Tensor]:
 
 
 def _reach(method: Callable[[float], Tensor], before: Tensor, gain: float, where: Tensor) -> Tensor:
-    """The result that has the gain, or the strongest one where the method never gets there."""
+    """The result with the given detail gain, or the strongest result if the method cannot attain that gain."""
     low, high = 0.0, STRONGEST
     for _ in range(STEPS):
         middle = (low + high) / 2

@@ -18,7 +18,7 @@ RESPONSES: tuple[tuple[Sliders, str], ...] = (
     ((1, 12, 1, 1), "a band of finer detail"),
     ((1, 1, 20, 1), "a band of coarser detail"),
 )
-# The sliders under the paper's own figures.
+# Slider values printed under the paper's figures.
 FIG_7 = (*(sliders for sliders, _ in RESPONSES), (4, 3, 3, 1.05))
 FIG_8 = ((1, 1, 1, 1.5), (5, 1, 1, 1), (1, 10, 1, 1), (1, 1, 20, 1), (3, 5, 10, 1.1))
 FIG_9 = ((1, 1, 1, 1.4), (3, 1, 1, 1), (1, 8, 1, 1), (1, 1, 16, 1), (2, 3, 5, 1.1))
@@ -26,9 +26,9 @@ FIG_10 = ((1, 1, 1, 1.5), (5, 1, 1, 1), (1, 10, 1, 1), (1, 1, 20, 1), (3, 6, 10,
 
 
 def figure_6(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """The gain of eq. (14) over the eigenvalues for four settings of the sliders; dots are those of one photograph.
+    """Gain of eq. (14) over the eigenvalues for four slider settings; dots mark the eigenvalues of one photograph.
 
-    (a) raises contrast and leaves details, (b) is a high-pass filter, (c) and (d) are band-pass filters.
+    (a) raises contrast and keeps details, (b) is a high-pass filter, (c) and (d) are band-pass filters.
     """
     values = nonlocal_operator(luminance(scene("camera", size)[0])).spectrum().eigenvalues[0].double()
     line = torch.linspace(0, 1, 401, dtype=torch.float64)
@@ -51,7 +51,7 @@ def figure_6(size: int = SIZE) -> tuple[Figure, Numbers]:
 def figure_7(size: int = SIZE) -> tuple[Figure, Numbers]:
     """Contrast and detail of a motorcycle in a garage, with the sliders of the paper's Fig. 7.
 
-    Every edit is of the luminance, around its mean, so that the last slider raises contrast and not brightness.
+    Edits apply to the luminance relative to its mean, so the last slider raises contrast and not brightness.
     """
     return _compare("motorcycle", size, FIG_7)
 
@@ -59,7 +59,7 @@ def figure_7(size: int = SIZE) -> tuple[Figure, Numbers]:
 def figure_8(size: int = SIZE) -> tuple[Figure, Numbers]:
     """Contrast and detail of a cup of coffee, with the sliders of the paper's Fig. 8.
 
-    The paper prints 1 for the third slider of (e), as in no other figure of its kind; 20 is meant, as in Fig. 10.
+    The paper prints 1 for the third slider of (e), unlike its similar figures; 20 is used here, as in Fig. 10.
     """
     return _compare("coffee", size, FIG_8)
 

@@ -15,9 +15,9 @@ NEAR, NARROW = 20.0, 5 / 255  # h_x in pixels and h_y of Fig. 3
 
 
 def figure_1(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """Leading eigenvectors from luminance alone, 100 landmarks. The first ones hold the principal edges, later texture.
+    """Leading eigenvectors from luminance alone, 100 landmarks. The first contain the main edges, later ones texture.
 
-    The paper takes 0.01 % of a larger photograph's pixels. Red is above zero, blue below.
+    The paper samples 0.01 % of the pixels of a larger photograph. Red is positive, blue negative.
     """
     image = scene("camera", size)[0]
     operator = nonlocal_operator(luminance(image), num_landmarks=LANDMARKS)
@@ -25,9 +25,9 @@ def figure_1(size: int = SIZE) -> tuple[Figure, Numbers]:
 
 
 def figure_3(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """The same with a narrow spatial term, h_x = 20 pixels and h_y = 5 grey levels: piecewise smooth, local patterns.
+    """Eigenvectors with a narrow spatial term (h_x = 20 pixels, h_y = 5 grey levels): piecewise smooth, local patterns.
 
-    400 landmarks here, as local patterns are many. The paper's h_y is for patch weights of a sum 4.2 times smaller.
+    400 landmarks, as there are many local patterns. h_y is multiplied by 4.2 to account for the paper's patch weights.
     """
     image = scene("camera", size)[0]
     operator = nonlocal_operator(
@@ -50,7 +50,7 @@ def _draw(image: Tensor, spectrum: Spectrum) -> tuple[Figure, Numbers]:
 
 
 def coloured(values: Tensor) -> Tensor:
-    """Signed values (H, W) from blue over white to red, (1, 3, H, W)."""
+    """Map signed values (H, W) to colours (1, 3, H, W), from blue through white to red."""
     reach = values.abs().flatten().quantile(0.995).clamp(min=1e-6)
     shades = matplotlib.colormaps["RdBu_r"](((values / reach + 1) / 2).clamp(0, 1).numpy())
     return torch.from_numpy(shades[..., :3]).permute(2, 0, 1)[None].float()

@@ -1,1 +1,1 @@
-"""Random operators, pictures and calls, and what the library promises of each: ``python -m benchmarks.fuzz``."""
+"""Random operators, pictures and calls, checked against the library's promises: ``python -m benchmarks.fuzz``."""

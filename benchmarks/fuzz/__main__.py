@@ -1,8 +1,8 @@
-"""Random operators and what the library promises of each: ``python -m benchmarks.fuzz --cases 10000``.
+"""Check random operators against the library's promises: ``python -m benchmarks.fuzz --cases 10000``.
 
-One line for every promise: how often it was looked at and broken, and the worst value; then for every broken promise
-the command that runs its case again, alone. ``--pictures`` takes photographs instead, ``--functions`` calls every
-public function with random arguments, half of them with one argument that is wrong. Exits with status 1 if a promise is
+Prints one line per promise: how often it was checked and broken, and the worst value; then, for each kind of failure,
+the command that reruns its worst case alone. ``--pictures`` checks photographs instead; ``--functions`` calls every
+public function with random arguments, one of them invalid in half of the calls. Exits with status 1 if a promise is
 broken. The cases depend on the seed alone.
 """
 
@@ -28,7 +28,7 @@ CASES = 1000
 
 
 def report(found: list[Result], command: str) -> int:
-    """Print the table, and the first case of every kind of failure; the number of broken promises."""
+    """Print the table and the worst case of each kind of failure; return the number of broken promises."""
     print(f"{'promise':62} {'cases':>6} {'broken':>6}  worst")
     kinds: dict[tuple[str, str], list[tuple[Result, Figure]]] = {}
     for promise in PROMISES:
@@ -53,7 +53,7 @@ def report(found: list[Result], command: str) -> int:
 
 
 def details(check: Check, number: int) -> int:
-    """Run one case again and print every figure of it; the number of broken promises."""
+    """Run one case again and print all its figures; return the number of broken promises."""
     what, findings = check(number)
     print(what)
     for text in findings.warned:
@@ -65,15 +65,15 @@ def details(check: Check, number: int) -> int:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the cases that were asked for."""
+    """Run the requested cases."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__.partition("\n")[0])
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--pictures", action="store_true", help="photographs of scikit-image over a grid of settings")
     kind.add_argument("--functions", action="store_true", help="every public function with random arguments")
-    parser.add_argument("--cases", type=int, help=f"how many; default {CASES}, of pictures all")
-    parser.add_argument("--first", type=int, default=0, help="number of the first one; default 0")
-    parser.add_argument("--case", type=int, help="run this one alone and print every figure")
-    parser.add_argument("--seed", type=int, default=0, help="of all cases; default 0")
+    parser.add_argument("--cases", type=int, help=f"number of cases; default {CASES}, with --pictures all")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case; default 0")
+    parser.add_argument("--case", type=int, help="run only this case and print every figure")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of all cases; default 0")
     parser.add_argument("--workers", type=int, choices=range(1, WORKERS + 1), default=WORKERS, help="processes")
     parser.add_argument("--out", type=Path, help="JSON with every broken promise")
     options = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""Random guides and options of an operator, each from one source of randomness."""
+"""Random guides and options of an operator, each drawn from one random generator."""
 
 import math
 import random
@@ -15,20 +15,20 @@ SIDE = 64
 CROPPED = ("astronaut", "camera", "chelsea", "coffee", "moon", "page", "rocket", "text")
 HARD = ("checkerboard", "stripes", "two-valued", "spikes", "ramp", "photograph")  # drawn more often
 SAMPLINGS: tuple[Sampling, ...] = ("kmeans", "uniform", "random")
-ORDINARY = 1.5  # largest value of a guide for which an operator must always be found
+ORDINARY = 1.5  # largest guide value for which building an operator must succeed
 
 
 @dataclass(frozen=True)
 class Case:
-    """One operator to be made.
+    """One operator to build.
 
     Attributes:
-        name: what the guide shows, with its shape and precision.
+        name: content, shape and dtype of the guide.
         guide: (B, C, H, W).
-        options: of :func:`nonlocal_operator`, without the generator.
-        native: whether the kernels in C may be used.
+        options: keyword arguments of :func:`nonlocal_operator`, except the generator.
+        native: whether the C kernels may be used.
         backward: whether gradients are checked.
-        seed: of the landmarks, and of the image and the sliders that the operator is tried on.
+        seed: of the landmarks, and of the image and the sliders used in the checks.
     """
 
     name: str
@@ -40,18 +40,18 @@ class Case:
 
     @property
     def ordinary(self) -> bool:
-        """Are the values of the guide those of an image, so that no error is acceptable?"""
+        """Whether the guide has the value range of an image, so that no error is acceptable."""
         return float(self.guide.detach().abs().max()) <= ORDINARY
 
     def __str__(self) -> str:
-        """In one line."""
+        """Describe the case in one line."""
         shown = {name: _shown(value) for name, value in self.options.items()}
         options = ", ".join(f"{name}={value}" for name, value in shown.items())
         return f"{self.name}{', backward' * self.backward}{', no C' * (not self.native)}: {options}"
 
 
 def random_case(rng: random.Random, side: int = SIDE) -> Case:
-    """A guide of at most ``side`` by ``side`` pixels, and all options."""
+    """Draw a guide of at most ``side`` by ``side`` pixels, and all options."""
     batch, channels = rng.choice((1, 1, 2, 3)), rng.choice((1, 1, 2, 3, 4))
     height, width = _side(rng, side), _side(rng, side)
     dtype = rng.choice((torch.float32, torch.float32, torch.float64))
@@ -77,7 +77,7 @@ def random_case(rng: random.Random, side: int = SIDE) -> Case:
 
 
 def log_uniform(rng: random.Random, least: float, most: float) -> float:
-    """A number whose logarithm is uniform."""
+    """Draw a number whose logarithm is uniformly distributed."""
     return math.exp(rng.uniform(math.log(least), math.log(most)))
 
 
@@ -98,7 +98,7 @@ def _shown(value: object) -> str:
 
 
 def _content(rng: random.Random, channels: int, height: int, width: int) -> tuple[str, Tensor]:
-    """What an image shows, and the image (C, H, W) in float64."""
+    """Draw an image: the name of its content, and its values (C, H, W) in float64."""
     name = rng.choice(HARD if rng.random() < 0.4 else tuple(CONTENTS))
     image = CONTENTS[name](rng, channels, height, width)
     return name, image.expand(channels, height, width).double()
@@ -113,7 +113,7 @@ def _grid(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def _pair(rng: random.Random, mask: Tensor) -> Tensor:
-    """Two values, where a mask is and where it is not."""
+    """Draw two values, one inside a mask and one outside."""
     low, high = rng.choice(((0.0, 1.0), (0.25, 0.75), (0.5, 0.5 + log_uniform(rng, 1e-4, 0.1))))
     return torch.where(mask, high, low)
 

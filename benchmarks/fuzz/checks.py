@@ -1,4 +1,4 @@
-"""The promises, each with what was found and its limit; shared by the fuzzer and the tests."""
+"""The library's promises, each a measured value with a limit; shared by the fuzzer and the tests."""
 
 import re
 import traceback
@@ -34,15 +34,15 @@ PROMISES = (
     WARNINGS,
 )  # fmt: skip
 
-SLACK = {torch.float32: 2e-5, torch.float64: 1e-10}  # of a reported residual
-UNNOTICED = {torch.float32: 1e-4, torch.float64: 1e-9}  # errors of row sums that need no warning
+SLACK = {torch.float32: 2e-5, torch.float64: 1e-10}  # allowed beyond a reported residual
+UNNOTICED = {torch.float32: 1e-4, torch.float64: 1e-9}  # row-sum errors that need no warning
 ROUNDING = {torch.float32: 1e-5, torch.float64: 1e-12}
 PACKAGE = str(Path(nlfilter_torch.__file__).parent)
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What was measured of one promise, which is kept where it is at most its limit."""
+    """A value measured for one promise, which is kept if the value is at most its limit."""
 
     promise: str
     value: float
@@ -51,32 +51,32 @@ class Figure:
 
     @property
     def broken(self) -> bool:
-        """Not kept; NaN keeps nothing."""
+        """Whether the promise is broken; NaN breaks it."""
         return not self.value <= self.limit
 
 
 @dataclass
 class Findings:
-    """All figures of one case, and the warnings that it gave."""
+    """All figures of one case, and its warnings."""
 
     figures: list[Figure] = field(default_factory=list)
     warned: list[str] = field(default_factory=list)
 
     def note(self, promise: str, value: float | Tensor, limit: float = 0.0, detail: str = "") -> bool:
-        """Add a figure; True if the promise is kept."""
+        """Add a figure; return whether the promise is kept."""
         figure = Figure(promise, float(value), limit, detail)
         self.figures.append(figure)
         return not figure.broken
 
     def finite(self, tensor: Tensor, name: str) -> bool:
-        """Note how many values of a tensor are not finite; True if none."""
+        """Note the number of non-finite values of a tensor; return whether there are none."""
         values = tensor.detach()
         values = values if values.layout == torch.strided else values.to_dense()
         return self.note(FINITE, int((~values.isfinite()).sum()), 0, f"in {name} {tuple(tensor.shape)}")
 
     @property
     def broken(self) -> list[Figure]:
-        """The promises that are not kept."""
+        """Figures of the broken promises."""
         return [figure for figure in self.figures if figure.broken]
 
 
@@ -85,9 +85,9 @@ def judged(findings: Findings, *, legal: bool, completed: bool = False) -> Itera
     """Judge the exceptions and warnings of a block.
 
     Args:
-        findings: what they are added to.
-        legal: whether the arguments are, so that no exception is acceptable.
-        completed: whether the diagonal completion is in force, which is then no remedy.
+        findings: receives the figures and the warnings.
+        legal: whether the arguments are legal, so that no exception is acceptable.
+        completed: whether the diagonal correction is in use, so that no warning may suggest it as a remedy.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -110,19 +110,19 @@ def judged(findings: Findings, *, legal: bool, completed: bool = False) -> Itera
 
 
 def is_sentence(error: Exception) -> bool:
-    """Is it a ValueError or TypeError of this package, in one sentence with requirement and remedy?"""
+    """Whether it is a ValueError or TypeError of this package, in one sentence with requirement and remedy."""
     raised_in = traceback.extract_tb(error.__traceback__)[-1].filename
     one_sentence = re.fullmatch(r"\S[^\n]* must [^\n]*; [^\n]*\S", str(error)) is not None
     return type(error) in (ValueError, TypeError) and raised_in.startswith(PACKAGE) and one_sentence
 
 
 def kernels(used: bool) -> AbstractContextManager[None]:
-    """Switch the kernels in C off, or leave them as they are."""
+    """Disable the C kernels unless ``used``."""
     return nullcontext() if used else definitions_only()
 
 
 def check_case(case: Case) -> Findings:
-    """Make the operator of a case, and check all that it promises."""
+    """Build the operator of a case, and check all its promises."""
     findings = Findings()
     guide = case.guide.clone().requires_grad_(case.backward)
     generator = torch.Generator().manual_seed(case.seed)
@@ -144,7 +144,7 @@ def check_case(case: Case) -> Findings:
 def check_gradient(
     findings: Findings, operator: NonlocalOperator, guide: Tensor, image: Tensor, generator: torch.Generator
 ) -> None:
-    """That the gradient of a filtered image and of the eigenvalues is finite."""
+    """Check that the gradients of a filtered image and of the eigenvalues are finite."""
     filtered = polynomial_filter(operator, image, torch.randn(4, generator=generator).to(image))
     values = operator.spectrum().eigenvalues
     outputs = [
@@ -156,20 +156,20 @@ def check_gradient(
 
 
 def check_operator(findings: Findings, operator: NonlocalOperator, image: Tensor, tolerance: float | None) -> bool:
-    """Check an operator and what it does to an image (B, C, H, W); True if its numbers are finite."""
+    """Check an operator and its effect on an image (B, C, H, W); return whether its tensors are finite."""
     for name in ("factor", "diagonal", "scaling", "remainder", "residual"):
         if not findings.finite(getattr(operator, name), name):
             return False
     exact, dtype = Exact.of(operator), operator.factor.dtype
     errors = exact.row_sum_errors()
     _check_residual(findings, RESIDUAL, errors, operator.residual.double(), dtype)
-    # Who set a tolerance below the precision gets no better than the precision.
+    # A tolerance below the working precision cannot be attained.
     if not any("row sum" in text for text in findings.warned):
         detail = f"reported {operator.residual.max():.1e}"
         findings.note(ROW_SUMS, errors.max(), max(tolerance or 0.0, UNNOTICED[dtype]), detail)
     least, most = exact.eigenvalue_range()
     findings.note(EIGENVALUES, -least.min(), 1e-4, "smallest")
-    # Row sums of 1 + tolerance, where that was asked for, have such an eigenvalue.
+    # Row sums of 1 + tolerance, if so requested, imply an eigenvalue of that size.
     findings.note(EIGENVALUES, most.max(), 1 + max(tolerance or 0.0, 1e-4), "largest")
     _check_spectrum(findings, operator, exact, most)
     _check_certificate(findings, operator, errors, least, most)
@@ -198,17 +198,17 @@ def _check_residual(findings: Findings, promise: str, errors: Tensor, reported: 
 
 
 def _check_spectrum(findings: Findings, operator: NonlocalOperator, exact: Exact, most: Tensor) -> None:
-    """Eigenvalues and eigenvectors, and the figures of :class:`Diagnostics`."""
+    """Check eigenvalues and eigenvectors, and the figures of :class:`Diagnostics`."""
     spectrum = operator.spectrum()
     if not spectrum.eigenvalues.numel() or not findings.finite(spectrum.eigenvalues, "eigenvalues"):
-        return  # an image whose pixels all stand alone has none
+        return  # there are none if no pixel is similar to any other
     findings.note(REPORTED, -spectrum.eigenvalues.min(), 0.0, "smallest")
     findings.note(REPORTED, spectrum.eigenvalues.max(), 1.0, "largest")
     vectors = spectrum.eigenvectors.double().flatten(2)  # (B, R, N)
     if not findings.finite(vectors, "eigenvectors"):
         return
     gram = vectors @ vectors.mT
-    occupied = torch.diag_embed((gram.diagonal(dim1=1, dim2=2) != 0).double())  # padding is zero
+    occupied = torch.diag_embed((gram.diagonal(dim1=1, dim2=2) != 0).double())  # padded eigenvectors are zero
     apart = (gram - occupied).abs().amax((1, 2))
     findings.note(ORTHONORMAL, apart.max(), 1e-3)
 
@@ -231,14 +231,14 @@ def _check_spectrum(findings: Findings, operator: NonlocalOperator, exact: Exact
 
 
 def _known(errors: Tensor) -> float:
-    """How exactly eigenvalues are to be reported: 1 counts as the largest where row sums are off by less than that."""
+    """Accuracy required of reported eigenvalues: the largest may be reported as 1 if row sums are off by less."""
     return max(1e-3, float(errors.max()))
 
 
 def _check_certificate(
     findings: Findings, operator: NonlocalOperator, errors: Tensor, least: Tensor, most: Tensor
 ) -> None:
-    """What :meth:`NonlocalOperator.certify` says: bounds that hold, and the upper one not far from the truth."""
+    """Check :meth:`NonlocalOperator.certify`: its bounds hold, and the upper one is close to the true value."""
     told = operator.certify()
     findings.note(DIAGNOSTICS, max(told.symmetry), ROUNDING[operator.factor.dtype], "certified symmetry")
     sums = torch.tensor(told.row_sums, dtype=torch.float64)

@@ -1,6 +1,6 @@
-"""Every public function with random arguments, half of the time with one that is wrong.
+"""Every public function with random arguments, one of them invalid in half of the calls.
 
-Legal arguments have to give finite values and no error; wrong ones finite values or an error in one sentence.
+Legal arguments must give finite values and no error; invalid ones, finite values or an error in one sentence.
 """
 
 import math
@@ -22,7 +22,7 @@ Kind = Callable[[Scene], Any]
 
 
 def _number(least: float, most: float) -> Kind:
-    """A number, or a tensor of one for each image."""
+    """A number, or a tensor with one number per image."""
 
     def kind(scene: Scene) -> float | Tensor:
         if scene.rng.random() < 0.7:
@@ -110,12 +110,12 @@ def _affinity(**options: Any) -> Tensor:
 
 
 def _denoiser(image: Tensor, noise: float | Tensor = 0.1) -> Tensor:
-    """One that knows nothing."""
+    """Denoise with an untrained network."""
     return nlf.NonlocalDenoiser()(image, noise)
 
 
 def _portable(image: Tensor, alpha: list[float]) -> Tensor:
-    """A layer in its portable form, which is itself but while it is exported."""
+    """A layer in its portable form, which differs from the layer only during export."""
     return nlf.Portable(nlf.NonlocalFilter(alpha, num_landmarks=10))(image)
 
 
@@ -149,7 +149,7 @@ def _first(scene: Scene) -> Tensor:
 
 @dataclass(frozen=True)
 class Function:
-    """A public function, its arguments that are always given, and those that may be left out."""
+    """A public function, its required arguments, and its optional ones."""
 
     call: Callable[..., Any]
     required: dict[str, Kind]
@@ -296,27 +296,27 @@ FUNCTIONS = {
 
 @dataclass(frozen=True)
 class Call:
-    """A function, its arguments, and which of them is wrong."""
+    """A function, its arguments, and the name of the invalid one."""
 
     name: str
     arguments: dict[str, Any]
     wrong: str | None
 
     def __str__(self) -> str:
-        """In one line."""
+        """Describe the call in one line."""
         shown = ", ".join(f"{name}={_shown(value)}" for name, value in self.arguments.items())
         return f"{self.name}({shown}){'' if self.wrong is None else ' with a wrong ' + self.wrong}"
 
 
 def random_call(rng: random.Random) -> Call:
-    """A public function and arguments of it, half of the time with one that is wrong."""
+    """Draw a public function and its arguments, one of them invalid in half of the calls."""
     name = rng.choice(tuple(FUNCTIONS))
     function, scene = FUNCTIONS[name], Scene(rng)
     arguments = {key: kind(scene) for key, kind in function.required.items()}
     arguments |= {key: kind(scene) for key, kind in function.optional.items() if rng.random() < 0.4}
-    if "num_landmarks" in function.optional:  # no more than pixels, as its default may be
+    if "num_landmarks" in function.optional:  # the default may exceed the number of pixels
         arguments.setdefault("num_landmarks", 16)
-    candidates = [key for key in arguments if "." not in name or key != "operator"]  # whose method it is
+    candidates = [key for key in arguments if "." not in name or key != "operator"]  # a method needs its operator
     wrong = rng.choice(candidates) if candidates and rng.random() < 0.5 else None
     if wrong is not None:
         arguments[wrong] = _wrong_response(scene) if wrong == "response" else _wrong(rng, wrong, arguments[wrong])
@@ -324,7 +324,7 @@ def random_call(rng: random.Random) -> Call:
 
 
 def check_call(call: Call) -> Findings:
-    """Make the call, and check what comes of it."""
+    """Make the call, and check its result."""
     findings, made = Findings(), None
     with judged(findings, legal=call.wrong is None):
         made = FUNCTIONS[call.name].call(**call.arguments)
@@ -334,7 +334,7 @@ def check_call(call: Call) -> Findings:
 
 
 def _wrong(rng: random.Random, name: str, value: Any) -> Any:
-    """Something else in place of an argument; it may happen to be legal."""
+    """Draw a replacement for an argument; it may happen to be legal."""
     if isinstance(value, Tensor) and value.ndim > 0 and rng.random() < 0.8:
         return rng.choice(TENSORS)(value)
     if isinstance(value, list) and value and rng.random() < 0.6:
@@ -382,7 +382,7 @@ TENSORS: tuple[Callable[[Tensor], Any], ...] = (
 
 
 def _tensors(value: Any) -> Iterable[Tensor]:
-    """What a result holds that can be finite or not."""
+    """Yield the tensors of a result that must be finite."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, list | tuple):

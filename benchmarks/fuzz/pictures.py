@@ -1,4 +1,4 @@
-"""Pictures that ship with scikit-image, in grey, over sizes, bandwidths, samplings and numbers of landmarks."""
+"""Grey pictures that ship with scikit-image, over sizes, bandwidths, samplings and numbers of landmarks."""
 
 import random
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from benchmarks.fuzz.checks import Findings, check_operator, judged
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.operator.landmarks import Sampling
 
-# All that load without a download.
+# All pictures that load without a download.
 PICTURES = (
     "astronaut", "brick", "camera", "cell", "chelsea", "clock", "coffee", "coins", "colorwheel", "grass", "gravel",
     "horse", "hubble_deep_field", "immunohistochemistry", "logo", "microaneurysms", "moon", "page", "retina", "rocket",
@@ -39,7 +39,7 @@ class Picture:
     num_landmarks: int
 
     def __str__(self) -> str:
-        """In one line."""
+        """Describe the picture and its options in one line."""
         return (
             f"{self.name} {self.side}x{self.side}: photometric_bandwidth={self.bandwidth} / 255, "
             f"landmarks={self.landmarks!r}, num_landmarks={self.num_landmarks}"
@@ -48,7 +48,7 @@ class Picture:
 
 @cache
 def pictures(seed: int) -> list[Picture]:
-    """All of them, in random order, so that the first few are a sample."""
+    """All combinations in random order, so that the first few are a sample."""
     everything = [Picture(*values) for values in product(PICTURES, SIDES, BANDWIDTHS, SAMPLINGS, LANDMARKS)]
     random.Random(seed).shuffle(everything)
     return everything
@@ -56,7 +56,7 @@ def pictures(seed: int) -> list[Picture]:
 
 @cache
 def grey(name: str, side: int) -> torch.Tensor:
-    """A picture (1, 1, side, side), reduced, whatever its proportions."""
+    """A picture (1, 1, side, side), resized regardless of its aspect ratio."""
     picture = getattr(skimage.data, name)()
     picture = img_as_float64(picture[0] if isinstance(picture, tuple) else picture)
     picture = rgb2gray(picture[..., :3]) if picture.ndim == 3 else picture
@@ -65,7 +65,7 @@ def grey(name: str, side: int) -> torch.Tensor:
 
 
 def check_picture(picture: Picture) -> Findings:
-    """Make the operator of a picture, and check all that it promises."""
+    """Build the operator of a picture, and check all its promises."""
     findings = Findings()
     image = grey(picture.name, picture.side)
     operator = None

@@ -1,4 +1,4 @@
-"""Cases by their numbers, in worker processes."""
+"""Running cases by number, in worker processes."""
 
 import math
 import multiprocessing
@@ -18,7 +18,7 @@ from benchmarks.fuzz.pictures import check_picture, pictures
 
 @dataclass(frozen=True)
 class Result:
-    """One case: its number, what it was, its figures (the worst of each promise) and its warnings."""
+    """One case: its number, its description, its figures (the worst of each promise) and its warnings."""
 
     number: int
     what: str
@@ -30,19 +30,19 @@ Check = Callable[[int], tuple[str, Findings]]
 
 
 def operator_case(seed: int, number: int) -> tuple[str, Findings]:
-    """Random case ``number``."""
+    """Check random operator ``number``."""
     case = random_case(random.Random(f"{seed}:{number}"))
     return str(case), check_case(case)
 
 
 def picture_case(seed: int, number: int) -> tuple[str, Findings]:
-    """Case ``number`` of the pictures."""
+    """Check picture ``number``."""
     picture = pictures(seed)[number]
     return str(picture), check_picture(picture)
 
 
 def function_case(seed: int, number: int) -> tuple[str, Findings]:
-    """Random call ``number``."""
+    """Check random call ``number``."""
     call = random_call(random.Random(f"{seed}:call:{number}"))
     return str(call), check_call(call)
 
@@ -58,12 +58,12 @@ def run(check: Check, number: int) -> Result:
 
 
 def rank(figure: Figure) -> tuple[bool, float]:
-    """By which the worst of some figures is found."""
+    """Sort key of figures, largest for the worst."""
     return figure.broken, figure.value - figure.limit if figure.value == figure.value else math.inf
 
 
 def results(check: Check, numbers: Iterable[int], workers: int) -> Iterator[Result]:
-    """Of all cases, in their order."""
+    """Yield the results of all cases, in order."""
     if workers == 1:
         yield from map(partial(run, check), numbers)
         return

@@ -1,4 +1,4 @@
-"""Random arguments that fit each other."""
+"""Random arguments of matching shapes."""
 
 import random
 from functools import cached_property
@@ -13,7 +13,7 @@ SIDES = (4, 24)
 
 
 class Scene:
-    """An image, its operator and all other arguments that fit them."""
+    """An image, its operator, and other arguments of matching shapes."""
 
     def __init__(self, rng: random.Random) -> None:
         self.rng = rng
@@ -25,20 +25,20 @@ class Scene:
         self.generator = torch.Generator().manual_seed(rng.randint(0, 1 << 20))
 
     def noise(self, *shape: int) -> Tensor:
-        """In [0, 1], sometimes of few levels."""
+        """Draw values in [0, 1], sometimes with few levels."""
         levels = self.rng.choice((2, 4, 255, 1 << 20))
         values = torch.rand(shape, generator=self.generator, dtype=torch.float64)
         return ((values * levels).round() / levels).to(self.dtype)
 
     def image(self, channels: int) -> Tensor:
-        """(B, C, H, W), flat in one half at times."""
+        """Draw an image (B, C, H, W), sometimes flat in one half."""
         image = self.noise(self.batch, channels, *self.size)
         if self.rng.random() < 0.3:
             image[..., self.size[1] // 2 :] = self.rng.random()
         return image
 
     def mask(self, channels: int) -> Tensor:
-        """(B, C, H, W) in [0, 1], of which every channel holds a rectangle."""
+        """Draw a mask (B, C, H, W) in [0, 1] with a rectangle in every channel."""
         mask = torch.zeros(self.batch, channels, *self.size, dtype=self.dtype)
         for plane in mask.flatten(0, 1):
             top, left = (self.rng.randint(0, side - 2) for side in self.size)
@@ -47,16 +47,16 @@ class Scene:
 
     @cached_property
     def guide(self) -> Tensor:
-        """What the operator is made from."""
+        """Guide of the operator."""
         return self.image(self.rng.choice((1, 3, 2)))
 
     @cached_property
     def operator(self) -> nlf.NonlocalOperator:
-        """Of a bandwidth that suits noise."""
+        """Operator with a bandwidth suitable for noise."""
         bandwidth = log_uniform(self.rng, 0.03, 1.0)
         return nlf.nonlocal_operator(self.guide, photometric_bandwidth=bandwidth, num_landmarks=self.rng.randint(1, 16))
 
     @cached_property
     def spectrum(self) -> nlf.Spectrum:
-        """Of the operator."""
+        """Spectrum of the operator."""
         return self.operator.spectrum()

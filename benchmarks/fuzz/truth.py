@@ -1,4 +1,4 @@
-"""Properties of an operator in float64, from its tensors."""
+"""Properties of an operator, computed in float64 from its tensors."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from nlfilter_torch import NonlocalOperator
 
 DENSE = 320  # pixels up to which all eigenvalues are computed
-STEPS = 25  # of the iteration for the largest eigenvalue, which needs 3 to 6
+STEPS = 25  # limit of the iteration for the largest eigenvalue, which takes 3 to 6
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Exact:
 
     @staticmethod
     def of(operator: NonlocalOperator) -> "Exact":
-        """W of an operator, for every image of its batch."""
+        """Read W from an operator, for every image of its batch."""
         factor, scaling, remainder = (
             t.detach().double() for t in (operator.factor, operator.scaling, operator.remainder)
         )
@@ -44,7 +44,7 @@ class Exact:
         return (self.product(torch.ones_like(self.diagonal).unsqueeze(1)) - 1).abs().amax((1, 2))
 
     def eigenvalue_range(self) -> tuple[Tensor, Tensor]:
-        """Smallest and largest eigenvalue, (B,) each; of large images a lower bound of the smallest."""
+        """Smallest and largest eigenvalue, (B,) each; for large images, a lower bound of the smallest."""
         if self.diagonal.shape[1] <= DENSE:
             values = torch.linalg.eigvalsh(self.dense())
             return values[:, 0], values[:, -1]
@@ -55,12 +55,12 @@ class Exact:
 def _largest(factor: Tensor, diagonal: Tensor) -> Tensor:
     """The largest eigenvalue of ``F^T F + diag(D)``, for F (M, N) and D (N,).
 
-    With l above D, an eigenvector x to the eigenvalue l has ``x = (l - D)^-1 F^T v`` where ``S(l) v = v`` and
-    ``S(l) = F (l - D)^-1 F^T`` is M x M. For the first eigenvector v of any S(l), of eigenvalue m, the Rayleigh
-    quotient of that x is ``l + (m - 1) m / |x|^2``; it is the next l. No quotient exceeds the largest eigenvalue.
+    For l above D, an eigenvector x of eigenvalue l is ``x = (l - D)^-1 F^T v``, where ``S(l) v = v`` and
+    ``S(l) = F (l - D)^-1 F^T`` is M x M. For the leading eigenvector v of any S(l), with eigenvalue m, the Rayleigh
+    quotient of this x is ``l + (m - 1) m / |x|^2``, the next l. No Rayleigh quotient exceeds the largest eigenvalue.
     """
     floor = diagonal.max()
-    best = (factor.square().sum(0) + diagonal).max()  # no diagonal entry exceeds it either
+    best = (factor.square().sum(0) + diagonal).max()  # nor does a diagonal entry of W
     value = torch.maximum(best, torch.ones_like(best)) * (1 + 1e-6)
     for _ in range(STEPS):
         inverse = (value - diagonal).reciprocal()

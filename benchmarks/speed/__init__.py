@@ -1,5 +1,5 @@
-"""How fast the filter is, against the least that its matrix products cost and against other filters.
+"""Speed of the filter, compared with the minimum cost of its matrix products and with other filters.
 
-``python -m benchmarks.speed --out FILE`` measures everything into a JSON file in under ten minutes; ``--quick`` shows
-in seconds that it runs. ``python -m benchmarks.report FILE`` makes the tables and plots from it.
+``python -m benchmarks.speed --out FILE`` measures everything in under ten minutes and writes a JSON file; ``--quick``
+checks in seconds that it runs. ``python -m benchmarks.report FILE`` makes tables and plots from the file.
 """

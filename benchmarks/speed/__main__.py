@@ -1,4 +1,4 @@
-"""Measure, print every figure as it comes, and write them to a JSON file."""
+"""Run the speed measurements, print each as it completes, and write all to a JSON file."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ MINUTES = 9.3  # no case starts later than this
 
 
 def run(plan: Plan, names: Sequence[str], minutes: float) -> dict[str, Any]:
-    """Run the suites and gather their records."""
+    """Run the suites and collect their records."""
     start = time.perf_counter()
     results: list[Record] = []
     cut: list[str] = []
@@ -35,7 +35,7 @@ def run(plan: Plan, names: Sequence[str], minutes: float) -> dict[str, Any]:
         taken[name] = time.perf_counter() - begun
         if not is_time_left(start, minutes):
             cut.append(name)
-            print(f"{name}: {minutes:g} minutes were over during or before it", flush=True)
+            print(f"{name}: stopped or skipped after {minutes:g} minutes", flush=True)
     return {
         "quick": plan == QUICK,
         "machine": machine,
@@ -48,12 +48,12 @@ def run(plan: Plan, names: Sequence[str], minutes: float) -> dict[str, Any]:
 
 
 def is_time_left(start: float, minutes: float) -> bool:
-    """Whether so many minutes since ``start`` are not over yet."""
+    """Whether at most ``minutes`` have passed since ``start``."""
     return time.perf_counter() - start <= 60 * minutes
 
 
 def show(result: Record) -> None:
-    """Print one record, with every time as a multiple of the floor where that was measured."""
+    """Print one record, with every time as a multiple of the floor if the floor was measured."""
     print(f"\n{result['suite']}: {result['label']}")
     floor = result.get("floor")
     for name, timing in result["timings"].items():
@@ -82,13 +82,15 @@ def show(result: Record) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that everything runs, not how fast")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that everything runs")
     parser.add_argument("--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"some of {', '.join(SUITES)}")
     parser.add_argument("--out", type=Path, default=Path("out/speed.json"), help="JSON file (default: %(default)s)")
-    parser.add_argument("--device", default="cpu", help="of torch (default: %(default)s)")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="start no case later (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="torch device (default: %(default)s)")
+    parser.add_argument(
+        "--minutes", type=float, default=MINUTES, help="start no case later than this (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     plan = QUICK if options.quick else Plan(device=options.device)
     results = run(plan, options.only or list(SUITES), options.minutes)

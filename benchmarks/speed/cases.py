@@ -1,4 +1,4 @@
-"""What is measured: images, options of the operator, and the work done with them."""
+"""Images of the measurements, and options of the operator."""
 
 import functools
 from dataclasses import asdict, dataclass
@@ -19,7 +19,7 @@ TOLERANCE = 1e-4  # of the row sums
 
 @dataclass(frozen=True)
 class Case:
-    """One operator's size and options; the defaults are the case that the others vary."""
+    """Size and options of one operator; the defaults are the case that all others vary."""
 
     height: int = 1024
     width: int = 1024
@@ -33,26 +33,26 @@ class Case:
 
     @property
     def pixels(self) -> int:
-        """Of one image."""
+        """Number of pixels of one image."""
         return self.height * self.width
 
     @property
     def working_dtype(self) -> torch.dtype:
-        """What the operator computes in: float64 for float64, else float32."""
+        """Precision of the operator: float64 for float64, else float32."""
         return torch.float64 if self.dtype == "float64" else torch.float32
 
     @property
     def factor_bytes(self) -> int:
-        """Size of the operator's factor."""
+        """Size of the operator's factor, in bytes."""
         return self.batch * self.pixels * self.landmarks * self.working_dtype.itemsize
 
     @property
     def used_threads(self) -> int:
-        """Threads of torch: all, unless set."""
+        """Number of torch threads: all, unless set."""
         return self.threads or torch.get_num_threads()
 
     def label(self) -> str:
-        """A short name that tells cases apart."""
+        """A short description that distinguishes cases."""
         count = f"{self.batch} x " if self.batch > 1 else ""
         return (
             f"{count}{self.height}x{self.width}, m = {self.landmarks}, {self.patch_size}x{self.patch_size}, "
@@ -60,7 +60,7 @@ class Case:
         )
 
     def image(self) -> Tensor:
-        """(B, 1, H, W): the picture, or, in a batch, tiles of a picture with all their pixels."""
+        """Image (B, 1, H, W): the resized picture or, for a batch, its tiles."""
         rows = int(self.batch**0.5)
         while self.batch % rows:
             rows -= 1
@@ -75,11 +75,11 @@ class Case:
         return {"num_landmarks": self.landmarks, "patch_size": self.patch_size, "tolerance": TOLERANCE}
 
     def operator(self, image: Tensor) -> NonlocalOperator:
-        """The operator of an image, with these options."""
+        """Build the operator of an image with these options."""
         return nonlocal_operator(image, **self.options())
 
     def to_json(self) -> dict[str, Any]:
-        """As a plain dictionary, with the threads that are used."""
+        """As a plain dictionary, with the number of threads used."""
         return asdict(self) | {"threads": self.used_threads}
 
 
@@ -94,5 +94,5 @@ def colour(name: str, height: int, width: int) -> np.ndarray:
 
 
 def grey(name: str, height: int, width: int) -> np.ndarray:
-    """The same in grey, (H, W)."""
+    """The photograph of :func:`colour` in grey, (H, W)."""
     return np.ascontiguousarray(rgb2gray(colour(name, height, width)), dtype=np.float32)

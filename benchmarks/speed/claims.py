@@ -1,4 +1,4 @@
-"""What the project promises of its speed, each with its limit and what a run measured."""
+"""Claims about speed, each with its limit and the measured value."""
 
 import math
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ MAIN = Plan()
 
 @dataclass(frozen=True)
 class Claim:
-    """One promise.
+    """One claim.
 
     Attributes:
         text: what is compared.
-        at_most: whether the limit is an upper one.
+        at_most: whether the limit is an upper bound.
         limit: the limit.
-        measured: None where this run did not measure it.
-        unit: of both; empty for ratios.
-        quartiles: of what was measured, where two calls alternated.
+        measured: the measured value; None if this run did not measure it.
+        unit: of limit and measured value; empty for ratios.
+        quartiles: of the measured value, if two calls alternated.
     """
 
     text: str
@@ -33,14 +33,14 @@ class Claim:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the promise was kept; None where nothing was measured."""
+        """Whether the claim holds; None if it was not measured."""
         if self.measured is None:
             return None
         return self.measured <= self.limit if self.at_most else self.measured >= self.limit
 
 
 def claims(results: Results) -> list[Claim]:
-    """All promises, judged by the medians of one run; a quick run keeps and breaks none.
+    """All claims, judged by the medians of one run; a quick run judges none.
 
     Claims that compare two sizes or variants are judged by the median ratio of calls that alternated.
     """
@@ -59,7 +59,7 @@ def claims(results: Results) -> list[Claim]:
     imported = _first(measured, "imports")
 
     def compared(text: str, limit: float, label: str) -> Claim:
-        """At most so many times as long, in the worst of the comparisons with this label."""
+        """Claim that the largest ratio of the comparisons with this label is at most the limit."""
         ratios = [record["ratio"] for record in records_of(measured, SUITE) if record["label"] == label]
         if not ratios:
             return Claim(text, True, limit, None)
@@ -104,7 +104,7 @@ def _first(results: Results, suite: str) -> Record | None:
 
 
 def _median(record: Record | None, name: str) -> Any:
-    """Seconds of a call; None where the record lacks it."""
+    """Median seconds of a call; None if the record lacks it."""
     return record["timings"].get(name, {}).get("median") if record else None
 
 
@@ -113,7 +113,7 @@ def _ratio(above: float | None, below: float | None) -> float | None:
 
 
 def _exponent(ratio: Claim) -> Claim:
-    """Slope between the two numbers of landmarks, on logarithmic axes, from the ratio of the times."""
+    """Exponent of m in the time, from the ratio of the times at two numbers of landmarks."""
     first, last = MAIN.growth
 
     def slope(value: float) -> float:

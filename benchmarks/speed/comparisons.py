@@ -1,4 +1,4 @@
-"""Two sizes or variants at a time that alternate, A B A B, for the claims about how many times as long one takes."""
+"""Alternating measurements, A B A B, of two sizes or variants, for the claims about ratios of times."""
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -14,7 +14,7 @@ from benchmarks.speed.timing import Call, compare, discard, on_threads
 from nlfilter_torch import NonlocalOperator, PolynomialSliders, detail_layers, spectral_filter
 
 SUITE = "comparisons"
-# Labels of the records, by which the claims find them.
+# Labels by which the claims find the records.
 DOUBLED = "twice the pixels"
 GROWTH = "growth in landmarks"
 MANY = "many landmarks"
@@ -26,7 +26,7 @@ RESPONSE = "another response against a read"
 
 
 def comparisons(plan: Plan) -> Iterator[Record]:
-    """All of them, each a record with two timings and their ratio."""
+    """Yield all comparisons, each a record with two timings and their ratio."""
     for smaller, larger in pairwise(plan.doublings):
         cases = [plan.case(height=height, width=width) for height, width in (smaller, larger)]
         yield _operators(plan, DOUBLED, *cases)
@@ -41,7 +41,7 @@ def comparisons(plan: Plan) -> Iterator[Record]:
 
 
 def held_calls(operator: NonlocalOperator, image: Tensor) -> dict[str, Call]:
-    """A slider move and another response, with what each of them keeps."""
+    """A slider move with cached layers, and another response with cached coefficients."""
     spectrum, layers = operator.spectrum(), detail_layers(operator, image)
     sliders = PolynomialSliders(ALPHA).to(image.device)
     held = spectrum.coefficients(image)
@@ -52,7 +52,7 @@ def held_calls(operator: NonlocalOperator, image: Tensor) -> dict[str, Call]:
 
 
 def power(eigenvalues: Tensor) -> Tensor:
-    """A response that is no polynomial."""
+    """A response that is not a polynomial."""
     return eigenvalues**0.1
 
 
@@ -68,13 +68,13 @@ def _compared(plan: Plan, label: str, case: Case, calls: Mapping[str, Call]) -> 
 
 
 def _operators(plan: Plan, label: str, first: Case, second: Case) -> Record:
-    """The operator of two cases."""
+    """Compare the operators of two cases."""
     calls = {case.label(): discard(case.operator, case.image()) for case in (first, second)}
     return _compared(plan, label, second, calls)
 
 
 def _crops(plan: Plan) -> Iterator[Record]:
-    """A training step and an operator of one image, and of a batch of crops that has as many pixels."""
+    """Compare a training step and an operator of one image with those of a batch of crops with as many pixels."""
     count, side, marks = plan.crops
     across = round(count**0.5)
     whole = plan.case(height=across * side, width=across * side, landmarks=marks)
@@ -84,7 +84,7 @@ def _crops(plan: Plan) -> Iterator[Record]:
 
 
 def _threads(plan: Plan) -> Iterator[Record]:
-    """The main operator on the fewest threads and on the most, where the two differ."""
+    """Compare the main operator on the fewest threads and on the most, if the two differ."""
     counts = plan.thread_counts()
     if len(counts) > 1:
         most, fewest = plan.case(threads=counts[-1]), plan.case(threads=counts[0])
@@ -94,7 +94,7 @@ def _threads(plan: Plan) -> Iterator[Record]:
 
 
 def _reads(plan: Plan) -> Iterator[Record]:
-    """What works from kept results, beside one read of the factor."""
+    """Compare calls that use cached results with one read of the factor."""
     case = plan.case()
     image = case.image()
     with torch.no_grad():

@@ -1,17 +1,17 @@
-"""The least that an operator's matrix products cost with torch on this machine, measured beside it.
+"""Minimum cost of an operator's matrix products with torch, measured on the same machine alongside the operator.
 
-Three products cannot be avoided on the way from features (D, N) to a spectrum: landmarks (M, D) with features, the
-inverse Cholesky factor (M, M) with the affinities, and the Gram matrix of the factor (M, N): N x D x M and
-twice N x M x M. Balancing adds reads of the factor, taken as ten. Each of the four is timed in several ways and the
-fastest counts, so that the floor is not slow because of a poor choice:
+Computing a spectrum from features (D, N) takes at least three products: landmarks (M, D) with features, the inverse
+Cholesky factor (M, M) with the affinities, and the Gram matrix of the factor (M, N): N x D x M and twice N x M x M.
+Balancing adds reads of the factor, counted as ten. Each of the four parts is timed in several ways, of which the
+fastest counts:
 
 - a product as one call on the whole, into memory that was used before, and in blocks of 4080 and 16368 pixels whose
-  results never leave the cache;
+  results stay in the cache;
 - a read as ``factor.sum()``, as ``factor @ vector`` and as ``vector @ factor``.
 
-The kernels in C (:mod:`nlfilter_torch.core.kernels`) know that the whitening is a triangle and form half of its
-product, so that the operator may be quicker than this. The exponential, the features, the landmarks, the writing of
-the factor and the memory for it are not in the floor.
+The C kernels (:mod:`nlfilter_torch.core.kernels`) compute only half of the product with the inverse Cholesky factor,
+which is triangular, so the operator may be faster than the floor. The floor excludes the exponential, the features, the
+landmarks, and allocating and writing the factor.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ PARTS = ("affinity", "whitening", "gram", "read")
 
 
 def floor_calls(case: Case) -> dict[str, Call]:
-    """The quickest way of every part, found by trying each once, warm; named ``part: way``."""
+    """The fastest way of every part, found by one warm trial of each; named ``part: way``."""
     ways = _ways(case)
     every = {f"{part}: {way}": call for part, choices in ways.items() for way, call in choices.items()}
     tried = {name: try_once(call, threads=case.used_threads) for name, call in every.items()}
@@ -41,7 +41,7 @@ def floor_calls(case: Case) -> dict[str, Call]:
 
 
 def floor_summary(timings: Mapping[str, Timing]) -> dict[str, Any]:
-    """Seconds of the floor, of its products and of one read, from timings of :func:`floor_calls` among others."""
+    """Seconds of the floor, of its products and of one read, from timings that include :func:`floor_calls`."""
     parts = {part: name for name in timings for part in PARTS if name.startswith(f"{part}: ")}
     median = {part: timings[name].median for part, name in parts.items()}
     products = median["affinity"] + median["whitening"] + median["gram"]
@@ -54,12 +54,12 @@ def floor_summary(timings: Mapping[str, Timing]) -> dict[str, Any]:
 
 
 def _ways(case: Case) -> dict[str, dict[str, Call]]:
-    """All ways to do every part, on random numbers; they share their memory."""
+    """All ways to compute every part, on the same random tensors."""
     marks, pixels, batch = case.landmarks, case.pixels, case.batch
     numbers = torch.Generator(case.device).manual_seed(0)
 
     def empty(*shape: int) -> Tensor:
-        if case.device == "cpu":  # numpy asks the system for huge pages, in which a read is quicker
+        if case.device == "cpu":  # numpy requests huge pages, which make reads faster
             return torch.from_numpy(np.empty((batch, *shape), str(case.working_dtype).removeprefix("torch.")))
         return torch.empty(batch, *shape, dtype=case.working_dtype, device=case.device)
 
@@ -80,7 +80,7 @@ def _ways(case: Case) -> dict[str, dict[str, Call]]:
         },
     }
     for block in BLOCKS:
-        length = block // batch  # together, the images of a batch have blocks as long as a single one
+        length = block // batch  # so that the total over the batch is ``block``
         if length < pixels:
             first, second = random(marks, length), random(marks, length)
             blocks = [slice(start, start + length) for start in range(0, pixels - length + 1, length)]

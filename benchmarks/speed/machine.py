@@ -1,4 +1,4 @@
-"""The machine and the versions of a measurement."""
+"""Hardware and software versions of a measurement."""
 
 import importlib.metadata
 import os
@@ -16,7 +16,7 @@ LIBRARIES = ("torch", "kornia", "numpy", "scikit-image", "scipy", "opencv-contri
 
 
 def describe() -> dict[str, Any]:
-    """Machine, versions, threads, and how busy the machine was with other things."""
+    """Describe the machine, versions, threads and load."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -35,7 +35,7 @@ def describe() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """The processor's own name, where the system tells it."""
+    """Name of the processor, if the system reports it."""
     table = Path("/proc/cpuinfo")
     if table.exists():
         for line in table.read_text().splitlines():
@@ -52,7 +52,7 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit that was measured, with a + where files differ from it; None outside a repository."""
+    """The measured commit, with a + if files differ from it; None outside a repository."""
     try:
         text = subprocess.run(
             ["git", "describe", "--always", "--dirty=+"],

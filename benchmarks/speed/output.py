@@ -1,4 +1,4 @@
-"""Writing files that appear complete or not at all."""
+"""Atomic file writes."""
 
 import os
 import tempfile
@@ -6,13 +6,13 @@ from pathlib import Path
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write beside the place, then move there; folders are made."""
+    """Write a temporary file in the same folder, which is created if missing, then rename the file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, beside = tempfile.mkstemp(dir=path.parent, suffix=path.suffix)
     try:
         with os.fdopen(descriptor, "wb") as stream:
             stream.write(content)
-        os.chmod(beside, 0o644)  # made for its owner alone
+        os.chmod(beside, 0o644)  # mkstemp grants access to the owner only
         os.replace(beside, path)
     except BaseException:
         os.unlink(beside)

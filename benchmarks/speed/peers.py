@@ -1,7 +1,7 @@
-"""Other filters on the same image, as their libraries offer them.
+"""Filters of other libraries, on the same image.
 
 They are different operators for the same tasks: smoothing an image while keeping its edges, or enhancing its detail.
-Each is called with its fastest memory layout and number type, and with the parameters of its documentation's examples
+Each is called with its fastest memory layout and data type, and with the parameters of its documentation's examples
 if those suit photographs.
 """
 
@@ -22,13 +22,13 @@ PACKAGE = "nlfilter-torch"
 
 @dataclass(frozen=True)
 class Peer:
-    """A filter to compare with.
+    """A filter for comparison.
 
     Attributes:
-        name: for tables.
+        name: in tables.
         does: what it computes, in a few words.
-        extra: of this package, that installs it; None where the package itself needs it.
-        prepare: makes a call without arguments that filters the image of a case.
+        extra: of this package that installs the filter; None if the package itself requires it.
+        prepare: returns a call without arguments that filters the image of a case.
     """
 
     name: str
@@ -50,7 +50,7 @@ def skimage_nlm(patch: int, distance: int) -> Callable[[Case], Call]:
 
 
 def opencv_nlm(case: Case) -> Call:
-    """Non-local means of OpenCV on 8 bits, patches 7x7 in windows of 21x21, its defaults."""
+    """Non-local means of OpenCV on 8 bits, with its default 7x7 patches and 21x21 windows."""
     import cv2
 
     cv2.setNumThreads(case.used_threads)
@@ -75,7 +75,7 @@ def kornia_bilateral(case: Case) -> Call:
 
 
 def kornia_guided(case: Case) -> Call:
-    """Guided filter of kornia, 11x11, the image its own guide."""
+    """Guided filter of kornia, 11x11, guided by the image itself."""
     from kornia.filters import guided_blur
 
     image = case.image()
@@ -83,10 +83,10 @@ def kornia_guided(case: Case) -> Call:
 
 
 def dense_attention(case: Case) -> Call:
-    """The dense filter of eq. (2), all pixels with all pixels, as attention.
+    """The dense filter of eq. (2), between all pairs of pixels, as attention.
 
-    With queries ``[2 x, 1]`` and keys ``[x, -|x|^2]`` the softmax is ``K / K 1``: -|x_i|^2, which is the same for a
-    whole row, drops out. Values are padded to the width of the keys, which torch's fused kernel asks for; it never
+    With queries ``[2 x, 1]`` and keys ``[x, -|x|^2]`` the softmax is ``K / K 1``: -|x_i|^2, which is constant along
+    a row, cancels. Values are padded to the width of the keys, as torch's fused kernel requires; that kernel never
     forms the N x N matrix.
     """
     from torch.nn.attention import SDPBackend, sdpa_kernel
@@ -119,12 +119,12 @@ QUICK_PEERS = (OPENCV_NLM, OPENCV_DETAIL, NLM_5_6, BILATERAL, GUIDED)
 
 
 def prepare_all(peers: tuple[Peer, ...], case: Case) -> tuple[dict[str, Call], dict[str, str]]:
-    """Calls by name of the peers that are installed, and by name what to do about those that are not."""
+    """Calls of the peers that are installed, and installation hints for the others, both by name."""
     calls, missing = {}, {}
     for peer in peers:
         try:
             calls[peer.name] = peer.prepare(case)
         except ImportError as error:
             remedy = f"pip install '{PACKAGE}[{peer.extra}]'" if peer.extra else f"pip install {PACKAGE}"
-            missing[peer.name] = f"{peer.name} is left out, {error.name or error} is not installed: {remedy}"
+            missing[peer.name] = f"{peer.name} is skipped: {error.name or error} is not installed; {remedy}"
     return calls, missing

@@ -1,4 +1,4 @@
-"""How large and how often things are measured, and what a measurement leaves behind."""
+"""Sizes and repetitions of the measurements, and the records they produce."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,41 +11,41 @@ from benchmarks.speed.floor import floor_calls, floor_summary
 from benchmarks.speed.probe import rounding_error
 from benchmarks.speed.timing import Call, Timing, take_turns
 
-# What one case showed, as JSON can hold it: suite, label, case, timings by name, and where they apply the floor, the
-# rounding error, the peak memory and notes about peers that were left out. A comparison has two timings and, as
-# "ratio", median and quartiles of the second over the first.
+# Results of one case in JSON types: suite, label, case, timings by name and, where they apply, the floor, the rounding
+# error, the peak memory and notes about peers that are not installed. A comparison has two timings and, as "ratio",
+# median and quartiles of the second over the first.
 Record = dict[str, Any]
-# A whole run: its machine, whether it was quick, and under "results" its records.
+# A whole run: its machine, whether it was quick, and its records under "results".
 Results = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How large and how often.
+    """Sizes and repetitions of the measurements.
 
     Attributes:
         side: of the main image.
         landmarks: of the main operator.
-        sizes: height and width of the series over pixels.
-        doublings: height and width of images, each twice the pixels of the one before, that are compared in pairs.
+        sizes: heights and widths of the series over pixels.
+        doublings: heights and widths of images compared in pairs, each with twice the pixels of the one before.
         counts: m of the series over landmarks.
-        counts_side: side of the image of that series, and of those over patches and number types.
-        growth: the two m that are compared on the main image.
-        many: the two m that are compared beyond the usual numbers.
+        counts_side: side of the image of that series, and of those over patches and data types.
+        growth: the two m compared on the main image.
+        many: the two m compared beyond the usual range.
         many_side: side of the image of that comparison.
-        patches: sizes.
-        crops: number, side and m of the batches.
-        dense_side: of the image that the dense filter can do.
-        pictures: that the main operator is built from, too.
-        seconds: that a group of calls takes turns, after the least number of rounds.
-        claimed_seconds: the same for the main group, which claims rest on.
-        least: rounds.
-        pair_seconds: that two compared calls alternate, after the least number of pairs.
-        pairs: least number of them.
-        pause: idle seconds before a call whose memory is to be fresh.
-        processes: that measure what an import takes.
-        probes: cases whose memory is measured.
-        threads: counts; none is one, and all.
+        patches: patch sizes.
+        crops: number and side of the crops in a batch, and m.
+        dense_side: side of the image for the dense filter.
+        pictures: photographs that the main operator is timed on.
+        seconds: for which a group of calls takes turns, if longer than ``least`` rounds.
+        claimed_seconds: ``seconds`` of the main group, on which claims rest.
+        least: minimum number of rounds.
+        pair_seconds: for which two compared calls alternate, if longer than ``pairs`` pairs.
+        pairs: minimum number of pairs.
+        pause: idle seconds before each call in the suite ``pauses``.
+        processes: number of processes that measure the time of an import.
+        probes: number of cases whose memory is measured.
+        threads: numbers of threads; if empty, one and all.
         device: of torch.
     """
 
@@ -79,7 +79,7 @@ class Plan:
         return replace(main, **changes)
 
     def thread_counts(self) -> tuple[int, ...]:
-        """The counts to measure, ascending."""
+        """The numbers of threads to measure, ascending."""
         return self.threads or tuple(sorted({1, torch.get_num_threads()}))
 
 
@@ -110,7 +110,7 @@ QUICK = Plan(
 
 
 def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) -> Record:
-    """What one case showed."""
+    """Make the record of one case."""
     floor = {"floor": floor_summary(timings)} if any(": " in name for name in timings) else {}
     return {
         "suite": suite,
@@ -125,7 +125,7 @@ def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) 
 def measured(
     suite: str, case: Case, calls: Mapping[str, Call], *, seconds: float, least: int, error: bool = False, **facts: Any
 ) -> Record:
-    """Let ``calls`` take turns with the floor of the case."""
+    """Time ``calls`` in turns with the floor of the case."""
     timings = take_turns({**calls, **floor_calls(case)}, threads=case.used_threads, seconds=seconds, least=least)
     if error:
         facts["error"] = rounding_error(case, case.image())

@@ -11,14 +11,14 @@ HELD = ("slider, layers held", "response, coefficients held", "response, spectru
 
 
 def seconds(value: float) -> str:
-    """Seconds or milliseconds with three significant digits."""
+    """Format a time in seconds or milliseconds, with three significant digits."""
     scaled, unit = (value, "s") if value >= 1 else (1e3 * value, "ms")
     digits = 0 if scaled >= 100 else 1 if scaled >= 10 else 2
     return f"{scaled:.{digits}f} {unit}"
 
 
 def plot_growth(results: Results) -> Figure:
-    """Time over pixels and over landmarks, with the floor; those of the two that were measured."""
+    """Plot time over pixels and over landmarks, whichever were measured, with the floor."""
     panels = [
         (suite, label, size, records)
         for suite, label, size in (
@@ -45,9 +45,7 @@ def plot_growth(results: Results) -> Figure:
         first = records[0]["case"]
         rest = f"m = {first['landmarks']}" if suite == "sizes" else f"{first['height']}x{first['width']}"
         axis.set(xscale="log", yscale="log", xlabel=label, ylabel="seconds, median")
-        if (
-            suite == "landmarks"
-        ):  # less than a decade or two: the labels of a logarithmic axis would run into each other
+        if suite == "landmarks":  # the default labels of a logarithmic axis would overlap
             axis.set_xticks(across, labels=[str(count) for count in across])
             axis.set_xticks([], minor=True)
         axis.set_title(f"Time over {label} ({rest}, {first['threads']} threads)")
@@ -57,7 +55,7 @@ def plot_growth(results: Results) -> Figure:
 
 
 def plot_peers(results: Results) -> Figure:
-    """Operator, sliders and peers on one image as bars."""
+    """Plot the times of operator, sliders and peers on one image as bars."""
     main = records_of(results, "main")[0]
     bars = {name: t["median"] for name, t in main["timings"].items() if ": " not in name}
     for record in records_of(results, "slow"):
@@ -79,7 +77,7 @@ def plot_peers(results: Results) -> Figure:
 
 
 def png(figure: Figure) -> bytes:
-    """A figure as the bytes of a PNG file."""
+    """Render a figure as the bytes of a PNG file."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()

@@ -1,6 +1,6 @@
-"""Peak memory and rounding error of one case, each measured apart from the timings.
+"""Peak memory and rounding error of one case, each measured separately from the timings.
 
-``python -m benchmarks.speed.probe WORK JSON`` is the fresh process: it does its work once and prints a line of JSON.
+``python -m benchmarks.speed.probe WORK JSON``, run as a fresh process, does its work once and prints a line of JSON.
 """
 
 import json
@@ -21,7 +21,7 @@ ALPHA = (3.0, 3.0, 4.0, 1.05)
 
 
 def peak_memory(case: Case, work: str) -> dict[str, float]:
-    """MiB that ``"operator"`` or a ``"training step"`` adds at its peak to a process that holds the image."""
+    """Peak memory in MiB that ``"operator"`` or ``"training step"`` adds to a process that holds the image."""
     command = [sys.executable, "-m", "benchmarks.speed.probe", work, json.dumps(case.to_json())]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -30,13 +30,13 @@ def peak_memory(case: Case, work: str) -> dict[str, float]:
 
 
 def training_step(case: Case, image: Tensor) -> None:
-    """Filter and differentiate in the image and in alpha."""
+    """Filter an image and differentiate with respect to the image and alpha."""
     layer = NonlocalFilter(ALPHA, **case.options())
     layer(image.requires_grad_()).square().mean().backward()
 
 
 def build(case: Case, image: Tensor) -> None:
-    """Make the operator, nothing else."""
+    """Build the operator, nothing else."""
     with torch.no_grad():
         case.operator(image)
 
@@ -45,10 +45,10 @@ WORKS = {"operator": build, "training step": training_step}
 
 
 def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
-    """Difference of ``W y`` to the same filter in float64, with the same landmarks, in grey levels of 255.
+    """Difference between ``W y`` and the same filter in float64, with the same landmarks, in grey levels of 255.
 
-    Landmarks are chosen by a discrete search that rounding may turn another way, so those of the case itself, as
-    float64 numbers, serve both; what is left is rounding and the tolerance of the balancing.
+    Landmark selection is discrete, so rounding may change it. Both filters therefore use the landmarks of the case
+    itself; the remaining difference is rounding and the tolerance of the balancing.
     """
     with torch.no_grad():
         operator = case.operator(image)
@@ -70,7 +70,7 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
 
 
 def held(case: Case) -> tuple[float, float]:
-    """MiB in use now and at most so far: of the process on the CPU, of torch's allocator on an accelerator."""
+    """Current and peak memory in MiB: of the process on the CPU, of torch's allocator on an accelerator."""
     if case.device == "cpu":
         return resident("VmRSS"), resident("VmHWM")
     return torch.cuda.memory_allocated() / MIB, torch.cuda.max_memory_allocated() / MIB
@@ -82,7 +82,7 @@ def main() -> None:
     case = Case(**given)
     torch.set_num_threads(case.used_threads)
     import kornia.color
-    import kornia.filters  # noqa: F401  imported on first use by the package: it is no part of the work
+    import kornia.filters  # noqa: F401  imported by the package on first use, which is not to be measured
 
     image = case.image()
     forget_peak()

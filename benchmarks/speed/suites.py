@@ -1,4 +1,4 @@
-"""The measurements, one function each: a plan in, records out."""
+"""The suites of measurements: functions from a plan to records."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.core.kernels import definitions_only
 
-COMPARED = 1 << 27  # bytes of the largest factor that is made in float64, too; the main case always is
+COMPARED = 1 << 27  # bytes of the largest factor that is compared with float64; the main case always is
 
 
 def filter_calls(case: Case, *, backward: bool) -> dict[str, Call]:
@@ -37,7 +37,7 @@ def filter_calls(case: Case, *, backward: bool) -> dict[str, Call]:
 
 
 def backward_call(case: Case) -> Call:
-    """The gradient of a filtered image in the image, as its own guide, and in alpha; the forward pass is done."""
+    """Gradient of a filtered image with respect to alpha and the image, also its guide; excludes the forward pass."""
     image = case.image().requires_grad_()
     layer = NonlocalFilter(ALPHA, **case.options()).to(case.device)
     filtered = layer(image)
@@ -46,7 +46,7 @@ def backward_call(case: Case) -> Call:
 
 
 def without_kernels(call: Call) -> Call:
-    """The same by torch alone, as it is where no C compiler was at hand."""
+    """Run a call with torch alone, as without a C compiler."""
 
     def slower() -> None:
         with definitions_only():
@@ -56,7 +56,7 @@ def without_kernels(call: Call) -> Call:
 
 
 def main_case(plan: Plan) -> Iterator[Record]:
-    """The main operator, the sliders over it and the peers, all taking turns on one image."""
+    """The main operator, its sliders and the peers, taking turns on one image."""
     case = plan.case()
     image = case.image()
     operator = case.operator(image)
@@ -95,7 +95,7 @@ def pauses(plan: Plan) -> Iterator[Record]:
 
 
 def slow_peers(plan: Plan) -> Iterator[Record]:
-    """A peer that takes many times as long, beside the operator."""
+    """A peer that takes many times as long, alongside the operator."""
     case = plan.case()
     others, missing = peers.prepare_all((peers.NLM_7_11,), case)
     calls = {"operator": discard(case.operator, case.image())} | others
@@ -104,7 +104,7 @@ def slow_peers(plan: Plan) -> Iterator[Record]:
 
 
 def dense(plan: Plan) -> Iterator[Record]:
-    """The dense filter, N x N affinities, beside operator and product, on an image that it can do."""
+    """The dense filter (N x N affinities), alongside operator and product, on a small image."""
     case = plan.case(height=plan.dense_side, width=plan.dense_side)
     image = case.image()
     operator = case.operator(image)
@@ -115,7 +115,7 @@ def dense(plan: Plan) -> Iterator[Record]:
 
 
 def autograd(plan: Plan) -> Iterator[Record]:
-    """A training step, beside the same filter as plain tensor operations that autograd differentiates one by one."""
+    """A training step, alongside the same filter written as plain tensor operations under autograd."""
     from tests.plain_autograd import plain_filter
 
     case = plan.case(height=plan.counts_side, width=plan.counts_side)
@@ -153,35 +153,35 @@ def _measured(suite: str, plan: Plan, case: Case, calls: dict[str, Call]) -> Rec
 
 
 def sizes(plan: Plan) -> Iterator[Record]:
-    """Time, backward and error over the number of pixels."""
+    """Times and error over the number of pixels."""
     for height, width in plan.sizes:
         case = plan.case(height=height, width=width)
         yield _measured("sizes", plan, case, filter_calls(case, backward=case.pixels <= 1 << 20))
 
 
 def landmarks(plan: Plan) -> Iterator[Record]:
-    """The same over the number of landmarks."""
+    """Times and error over the number of landmarks."""
     for count in plan.counts:
         case = plan.case(height=plan.counts_side, width=plan.counts_side, landmarks=count)
         yield _measured("landmarks", plan, case, filter_calls(case, backward=True))
 
 
 def patches(plan: Plan) -> Iterator[Record]:
-    """The same over the size of the patches."""
+    """Times and error over the size of the patches."""
     for size in plan.patches:
         case = plan.case(height=plan.counts_side, width=plan.counts_side, patch_size=size)
         yield _measured("patches", plan, case, filter_calls(case, backward=True))
 
 
 def dtypes(plan: Plan) -> Iterator[Record]:
-    """The same over number types; half precision is computed in float32."""
+    """Times and error over data types; half precision is computed in float32."""
     for dtype in ("float32", "float64", "bfloat16"):
         case = plan.case(height=plan.counts_side, width=plan.counts_side, dtype=dtype)
         yield _measured("dtypes", plan, case, filter_calls(case, backward=True))
 
 
 def threads(plan: Plan) -> Iterator[Record]:
-    """The main operator, filtering with it and the backward pass on one thread, and on all; tiles: streaming_busy."""
+    """The main operator, its filtering and backward pass on one thread and on all; for tiles, see streaming_busy."""
     for count in plan.thread_counts():
         case = plan.case(threads=count)
         calls = filter_calls(case, backward=True)
@@ -200,7 +200,7 @@ def pictures(plan: Plan) -> Iterator[Record]:
 
 
 def memory(plan: Plan) -> Iterator[Record]:
-    """Peak memory of fresh processes."""
+    """Peak memory in fresh processes."""
     half = plan.counts_side
     cases = [
         ("operator", plan.case()),
@@ -214,8 +214,8 @@ def memory(plan: Plan) -> Iterator[Record]:
 
 
 def imports(plan: Plan) -> Iterator[Record]:
-    """What ``import nlfilter_torch`` takes after ``import torch``, in fresh processes."""
-    runs = [_import_seconds() for _ in range(plan.processes + 1)][1:]  # the first reads the disk
+    """Time of ``import nlfilter_torch`` after ``import torch``, in fresh processes."""
+    runs = [_import_seconds() for _ in range(plan.processes + 1)][1:]  # the first reads from disk
     timings = {}
     for name, times in zip(("torch", "nlfilter_torch"), zip(*runs, strict=True), strict=True):
         low, middle, high = quartiles(times)

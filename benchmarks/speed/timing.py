@@ -1,4 +1,4 @@
-"""Medians and quartiles of calls that take turns, so that slow minutes of the machine affect all of them equally."""
+"""Medians and quartiles of calls that take turns, so that slow periods of the machine affect all of them equally."""
 
 import math
 import time
@@ -11,10 +11,10 @@ from torch.utils.benchmark import Measurement, TaskSpec, set_torch_threads, time
 
 Call = Callable[[], Any]
 
-UNCOUNTED = 5.0  # seconds; a call that takes more comes to its own memory and caches on its way
-SHORTEST = 0.01  # seconds; a call that takes less is repeated within one sample, or the clock would count, too
-MOST = 15  # rounds
-LONG = 0.5  # seconds; a call that takes more is warm after one
+UNCOUNTED = 5.0  # seconds; no uncounted call precedes a call that takes longer
+SHORTEST = 0.01  # seconds; a shorter call is repeated within one sample, because of the cost of the clock
+MOST = 15  # maximum number of rounds
+LONG = 0.5  # seconds; a longer call is warmed up by one run
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Timing:
 
     Attributes:
         median: of the samples.
-        iqr: between the quartiles of the samples.
-        samples: how many there are.
-        calls: in each sample, which is their mean.
+        iqr: interquartile range of the samples.
+        samples: number of samples.
+        calls: number of calls per sample; a sample is their mean.
     """
 
     median: float
@@ -40,13 +40,13 @@ class Timing:
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times as long one call takes as another, from samples taken right after each other.
+    """Time of one call relative to another, from consecutive samples.
 
     Attributes:
-        lower: quartile of the ratios.
-        median: of the ratios.
-        upper: quartile of the ratios.
-        pairs: how many ratios there are.
+        lower: lower quartile of the ratios.
+        median: median of the ratios.
+        upper: upper quartile of the ratios.
+        pairs: number of ratios.
     """
 
     lower: float
@@ -62,14 +62,14 @@ class Ratio:
 def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least: int = 3) -> dict[str, Timing]:
     """Time several calls round after round, one sample of each per round.
 
-    Each sample comes after a call that is not counted, so that memory and caches are the call's own, as in a loop over
-    pictures, unless it takes seconds. What it costs to come after something else is measured by :func:`after_pauses`.
+    Each sample of a call follows an uncounted run of the same call, unless it takes seconds, so that memory and caches
+    are as in a loop over pictures. :func:`after_pauses` measures the cost of a call after idle time.
 
     Args:
         calls: what to time, by name.
         threads: of torch.
-        seconds: start no further round after so many, once there have been ``least``.
-        least: rounds.
+        seconds: after which no further round starts, once there have been ``least``.
+        least: minimum number of rounds.
 
     Returns:
         A timing by name. The first call of each, which pays for imports and memory, is not counted.
@@ -81,14 +81,14 @@ def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least
 def compare(calls: Mapping[str, Call], *, threads: int, seconds: float, least: int) -> tuple[dict[str, Timing], Ratio]:
     """Time two calls in turns, A B A B, and divide each sample of B by the sample of A just before it.
 
-    Other work on the machine slows both samples of a pair or, if it starts or ends between them, spoils one ratio of
-    many, which moves the median little.
+    Other work on the machine slows both samples of a pair or, if it starts or ends between them, distorts one ratio of
+    many, which changes the median little.
 
     Args:
         calls: A and B, by name, in this order.
         threads: of torch.
-        seconds: start no further pair after so many, once there have been ``least``.
-        least: pairs.
+        seconds: after which no further pair starts, once there have been ``least``.
+        least: minimum number of pairs.
 
     Returns:
         A timing of each by name, and the ratio B / A.
@@ -111,7 +111,7 @@ def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
 def _rounds(
     calls: Mapping[str, Call], threads: int, seconds: float, least: int
 ) -> tuple[dict[str, list[float]], dict[str, int]]:
-    """Samples by name, one of each per round, and how many calls each sample of a name consists of."""
+    """Samples by name, one of each per round, and the number of calls per sample by name."""
     samples: dict[str, list[float]] = {name: [] for name in calls}
     with set_torch_threads(threads):
         repeats = {name: _calls_per_sample(call) for name, call in calls.items()}
@@ -127,9 +127,9 @@ def _rounds(
 
 
 def after_pauses(name: str, call: Call, *, threads: int, pause: float, count: int) -> Timing:
-    """Time ``count`` calls of which each follows ``pause`` idle seconds.
+    """Time ``count`` calls, each after ``pause`` idle seconds.
 
-    By then a virtual machine has given freed memory back to its host, and must ask for it again, page by page.
+    By then a virtual machine has returned freed memory to its host, and must request it again page by page.
     """
     with set_torch_threads(threads):
         call()
@@ -141,7 +141,7 @@ def after_pauses(name: str, call: Call, *, threads: int, pause: float, count: in
 
 
 def try_once(call: Call, *, threads: int) -> float:
-    """Seconds of a call, roughly: the second one, or the mean of a few short ones."""
+    """Rough time of a call in seconds: the second one, or the mean of a few short ones."""
     with set_torch_threads(threads):
         call()
         seconds = _sample(call, 1)
@@ -150,7 +150,7 @@ def try_once(call: Call, *, threads: int) -> float:
 
 
 def _calls_per_sample(call: Call) -> int:
-    """Enough calls to take :data:`SHORTEST`; warms up on the way, twice unless once took long."""
+    """Number of calls that take :data:`SHORTEST`; also warms up, by two calls or a single long one."""
     seconds = _sample(call, 1)
     if seconds < LONG:
         seconds = _sample(call, 1)
@@ -171,7 +171,7 @@ def _summary(name: str, times: list[float], count: int, threads: int) -> Timing:
 
 
 def discard(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Call:
-    """A call without arguments, outside of autograd, whose result is dropped."""
+    """Bind arguments to a call that runs without autograd and drops its result."""
 
     def run() -> None:
         with torch.no_grad():
@@ -181,7 +181,7 @@ def discard(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Call:
 
 
 def on_threads(call: Call, count: int) -> Call:
-    """The same call on so many threads of torch, whatever it runs on otherwise."""
+    """Run a call on ``count`` threads of torch, whatever the current number."""
 
     def run() -> None:
         with set_torch_threads(count):

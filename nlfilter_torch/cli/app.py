@@ -6,25 +6,25 @@ from typing import Annotated
 import typer
 
 Image = Annotated[
-    Path | None, typer.Argument(metavar="[IMAGE]", help="A photograph to begin with: PNG, JPEG, TIFF, WebP or AVIF.")
+    Path | None, typer.Argument(metavar="[IMAGE]", help="A photograph to open: PNG, JPEG, TIFF, WebP or AVIF.")
 ]
 Out = Annotated[
     Path | None,
     typer.Option(
         "--out",
         metavar="FOLDER",
-        help="Where the editor saves, and nowhere else. Left out: where IMAGE is, or the folder you are in.",
+        help="The only folder in which the editor saves. Default: the folder of IMAGE, or the current folder.",
     ),
 ]
 Host = Annotated[
     str,
     typer.Option(
         metavar="ADDRESS",
-        help="Address to listen on. 127.0.0.1 is this machine only; with any other, whoever reaches it can open the "
-        "editor and save into the folder.",
+        help="Address to listen on. 127.0.0.1 accepts this machine only; with any other, everyone who can reach it can "
+        "use the editor and save to the folder.",
     ),
 ]
-Port = Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Port to listen on; 0 takes a free one.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Port to listen on; 0 selects a free one.")]
 Open = Annotated[
     bool, typer.Option("--open/--no-open", help="Open the page in the browser, or only print its address.")
 ]
@@ -42,7 +42,7 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
     folder = out if out is not None else image.parent if image is not None else Path.cwd()
     check_folder(folder)
     if not folder.is_dir():
-        raise ValueError(f"--out {folder} does not exist; make the folder first")
+        raise ValueError(f"--out {folder} does not exist; create the folder first")
     try:
         from nlfilter_torch.app.server import serve
     except ModuleNotFoundError as error:

@@ -13,8 +13,8 @@ Edit = Annotated[
     typer.Option(
         "--preset",
         metavar="FILE|NAME",
-        help="What the editor saved (`nlfilter-torch app`), what `nlfilter-torch fit` found, or the name of a preset "
-        "(`nlfilter-torch presets`).",
+        help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, or the name of a "
+        "preset (see `nlfilter-torch presets`).",
     ),
 ]
 

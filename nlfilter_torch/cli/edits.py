@@ -41,8 +41,8 @@ def preset_option(help: str, *, plain: bool = True) -> Any:
             context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
         elif plain and name is not None and look_step(find_recipe(name)) is None:
             raise ValueError(
-                f"--preset must be a file with one step, of detail and without strokes, got {name}; "
-                "use nlfilter-torch apply, which takes any"
+                f"--preset must hold a look or a single detail step without strokes, got {name}; "
+                "use nlfilter-torch apply, which accepts any edit"
             )
         return name
 
@@ -52,8 +52,8 @@ def preset_option(help: str, *, plain: bool = True) -> Any:
 PresetName = Annotated[
     str | None,
     preset_option(
-        f"One of {', '.join(PRESETS)} (`nlfilter-torch presets` describes them), or a file that "
-        "`nlfilter-torch fit` made, in place of the defaults here; options that are given count for more."
+        f"One of {', '.join(PRESETS)} (see `nlfilter-torch presets`), or a file written by `nlfilter-torch fit`. It "
+        "replaces the defaults of the other options; options on the command line override it."
     ),
 ]
 #: Options for scribbles, regions and masks, by the name of the edit.
@@ -195,7 +195,9 @@ def edit_photograph(
     preset = given.get("preset")
     if preset is not None and (look := look_step(find_recipe(preset))) is not None:
         if step.values or given.get("region") or given.get("mask"):
-            raise ValueError(f"--preset must be without options of detail where it is a look, got {preset}; drop them")
+            raise ValueError(
+                f"--preset must not be combined with other options of detail if it is a look, got {preset}; drop them"
+            )
         edit, step, name = EDITS["look"], look, "look"
 
     import torch
@@ -217,7 +219,7 @@ def edit_photograph(
         """Print the colours that scribbles cover, and write the picture of ``--show``."""
         check_channels(name, read(slice(0, 1)).shape[1])
         if given.get("show") is not None and not any(True for _ in showing.overlays(drawn)):
-            raise ValueError("--show needs scribbles to show; give --region X,Y,W,H, or leave it out")
+            raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
         showing.tell_colours(showing.overlays(drawn), read)
         if given.get("show") is not None:
             showing.show(given["show"], name, step.arguments, size, read, drawn)

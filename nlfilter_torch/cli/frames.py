@@ -23,14 +23,14 @@ BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, 
 Frames = Annotated[
     Path,
     typer.Argument(
-        metavar="FRAMES", help="A film (.mp4 or .mov), or a folder of photographs, taken in the order of their names."
+        metavar="FRAMES", help="A film (.mp4 or .mov), or a folder of photographs, read in the order of their names."
     ),
 ]
 Edited = Annotated[
     Path,
     typer.Argument(
         metavar="OUT",
-        help="The edited film (.mp4 or .mov), or the folder for the edited photographs; it is made if it is not there.",
+        help="The edited film (.mp4 or .mov), or the folder for the edited photographs; created if it does not exist.",
     ),
 ]
 References = Annotated[
@@ -38,7 +38,7 @@ References = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="Number of frames, spread over the film, that the filter learns from. More for scenes that change.",
+        help="Number of frames, spread over the film, to which the filter is fitted. Use more if the scene changes.",
     ),
 ]
 EditName = Annotated[
@@ -46,14 +46,14 @@ EditName = Annotated[
     typer.Option(
         "--edit",
         metavar="|".join(edit.name for edit in EDITS_WITHOUT_STROKES),
-        help="What to do: the edit of the command of that name.",
+        help="The edit to apply, with the name of its command.",
     ),
 ]
 Preset = Annotated[
     str | None,
     preset_option(
-        f"One of {', '.join(PRESETS)}, or a file of any edits without scribbles, such as `nlfilter-torch fit` and the "
-        "editor make. Options that are given count for more than a preset of detail; other edits take none.",
+        f"One of {', '.join(PRESETS)}, or a file of any edits without scribbles, as written by `nlfilter-torch fit` or "
+        "the editor. Options on the command line override a detail preset; other presets accept none.",
         plain=False,
     ),
 ]
@@ -113,21 +113,21 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: 
     if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
         if typed:
             raise ValueError(
-                f"--{typed[0].replace('_', '-')} must be left out where --preset holds another edit than detail, got "
-                f"it with {preset}; write it into the file"
+                f"--{typed[0].replace('_', '-')} must not be given with a --preset of edits other than detail, got "
+                f"{preset}; set it in that file instead"
             )
         return recipe
     if name not in {edit.name for edit in EDITS_WITHOUT_STROKES}:
         names = ", ".join(edit.name for edit in EDITS_WITHOUT_STROKES)
-        raise ValueError(f"--edit must be one of {names}, got {name!r}; others need scribbles, or are unknown")
+        raise ValueError(f"--edit must be one of {names}, got {name!r}; choose one of these")
     if preset is not None and name != "detail":
-        raise ValueError(f"--edit must be left out where there is a preset, got {name} with {preset}; drop one of them")
+        raise ValueError(f"--edit must not be given together with --preset, got {name} and {preset}; drop one of them")
     declared = {parameter.name for parameter in EDITS[name]}
     other = next((option for option in typed if option not in declared and option != "edit"), None)
     if other is not None:
         edits = " or ".join(edit.name for edit in EDITS_WITHOUT_STROKES if other in {p.name for p in edit})
         raise ValueError(
-            f"--{other.replace('_', '-')} must come with --edit {edits}, got it with {name}; leave it out, or name that"
+            f"--{other.replace('_', '-')} must be used with --edit {edits}, got --edit {name}; drop it or change --edit"
         )
     mine = given if name == "detail" else {option: given[option] for option in typed if option != "edit"}
     return Recipe((step_of(EDITS[name], mine),))
@@ -140,7 +140,7 @@ def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[
 
     check_film_output(target)
     with open_film(source) as film, steps(film.count + 1) as begin:
-        begin("Learning from some frames")
+        begin("Fitting to sample frames")
         edit = fit(film.sample(references))
         return write_film(film, target, edit, lambda number: begin(f"Frame {number + 1} of {film.count}"))
 
@@ -154,10 +154,10 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     from nlfilter_torch.io.photographs import check_folder, check_output, read_photograph, write_photograph
 
     if source.is_file():
-        raise ValueError(f"{source} must be a film that ends in .mp4 or .mov, or a folder; convert it")
+        raise ValueError(f"{source} must be a film (.mp4 or .mov) or a folder; convert it")
     paths = pictures(source, "frames")
     if target.exists() and target.resolve() == source.resolve():
-        raise ValueError(f"{target} must be another folder than that of the frames; name a new one")
+        raise ValueError(f"{target} must not be the folder of the frames; choose another folder")
     check_folder(target)
     first: tuple[int, ...] = ()
 
@@ -171,12 +171,12 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
                 f"{height}x{width} and {colours} channel(s)" for height, width, colours in (first, rows.shape)
             )
             raise ValueError(
-                f"{path} must have the size and the colours of the other frames, {wanted}, got {got}; convert it"
+                f"{path} must have the size and channels of the first frame, {wanted}, got {got}; convert it"
             )
         return photograph, rows
 
     with steps(len(paths) + 1) as begin:
-        begin("Learning from some frames")
+        begin("Fitting to sample frames")
         spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
         edit = fit([read(paths[i])[1] for i in spread])
         for number, path in enumerate(paths):

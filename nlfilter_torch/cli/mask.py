@@ -13,7 +13,7 @@ from nlfilter_torch.edits.parameters import MASK
 if TYPE_CHECKING:
     from nlfilter_torch.tiled.pictures import Rows
 
-GIVE = "give --region X,Y,W,H or --mask FILE: some of what is to be selected, such as --region 190,60,60,60"
+GIVE = "give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60"
 
 
 def mask(
@@ -90,7 +90,9 @@ def mask(
             return
     with open_picture(Path(source), allowed) as picture, stages() as report:
         if floats:
-            raise ValueError(f"{target} takes the whole mask in memory; write a TIFF file, or allow more memory")
+            raise ValueError(
+                f"{target} cannot be written in tiles, since it is a PFM file; write a TIFF file, or raise --memory"
+            )
         plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
         check_place(place, kind, plain, allowed)
         with ExitStack() as files:

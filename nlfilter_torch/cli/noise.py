@@ -31,7 +31,7 @@ class NoiseReport:
     def __init__(self, noise: Noise, *, given: bool) -> None:
         self._level, self._given = float(noise.level), given
         ends = [float((noise.floor + light * noise.gain).sqrt()) for light in (0.0, 1.0)]
-        self._ends = f" ({LEVELS * ends[0]:.2f} in the dark, {LEVELS * ends[1]:.2f} in white)" if noise.gain > 0 else ""
+        self._ends = f" ({LEVELS * ends[0]:.2f} in black, {LEVELS * ends[1]:.2f} in white)" if noise.gain > 0 else ""
         self._squares, self._count = 0.0, 0
 
     def add(self, before: NDArray[np.generic], after: NDArray[np.generic]) -> None:
@@ -52,15 +52,13 @@ class NoiseReport:
     def tell(self) -> None:
         """Print the report."""
         level, change = LEVELS * self._level, LEVELS * (self._squares / max(self._count, 1)) ** 0.5
-        found = f"denoise: noise of {level:.2f} grey levels {'given' if self._given else 'found'}{self._ends}"
+        found = f"denoise: {'given' if self._given else 'estimated'} noise of {level:.2f} grey levels{self._ends}"
         if self._level < NEGLIGIBLE_NOISE:
-            typer.echo(
-                f"{found}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}: nothing to do, all pixels are as they were"
-            )
+            typer.echo(f"{found}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed")
             return
-        weak = "" if change >= VISIBLE_LEVELS else ", which is hardly visible"
-        remedy = "" if self._given or not weak else "; --strength 2 takes more away"
-        typer.echo(f"{found}; pixels changed by {change:.2f} grey levels (root mean square){weak}{remedy}")
+        weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
+        remedy = "" if self._given or not weak else "; --strength 2 removes more"
+        typer.echo(f"{found}; pixels changed by {change:.2f} grey levels (RMS){weak}{remedy}")
 
 
 def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tensor], path: Path) -> None:

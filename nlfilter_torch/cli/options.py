@@ -31,7 +31,7 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"{option} must be numbers with commas between, such as 3,3,4,1.05, got {text!r}") from None
+        raise ValueError(f"{option} must be numbers separated by commas, such as 3,3,4,1.05, got {text!r}") from None
     if not all(map(math.isfinite, numbers)):
         raise ValueError(f"{option} must be finite numbers, such as 3,3,4,1.05, got {text!r}")
     if len(numbers) < 2:
@@ -77,33 +77,33 @@ Seed = Annotated[
         min=0,
         max=2**63 - 1,
         metavar="N",
-        help="Seed of the random numbers: the same number gives the same picture again, another one a variation.",
+        help="Random seed: the same seed gives the same picture again, another seed a variation of it.",
     ),
 ]
 Target = Annotated[
     str,
     typer.Argument(
         metavar="OUT",
-        help="The edited photograph; the extension of its name (.png, .jpg, .tif, .webp, .avif) selects the type.",
+        help="The edited photograph; its extension (.png, .jpg, .tif, .webp, .avif) selects the file type.",
     ),
 ]
 OutputDepth = Annotated[
     FileDepth | None,
-    typer.Option(help="Bits per channel of the output, or floats (TIFF only). Left out: as in the input."),
+    typer.Option(help="Bits per channel of the output, or floats (TIFF only). Default: as in the input."),
 ]
 Memory = Annotated[
     float | None,
     typer.Option(
         metavar="GB",
-        help="Gigabytes of memory that may be used, besides the 0.3 of the program itself. A photograph that needs "
-        "more is processed in tiles, which leaves no seams. Left out: a fifth of the machine's memory.",
+        help="Memory limit in gigabytes, in addition to 0.3 for the program itself. A photograph that needs more is "
+        "processed in tiles, without seams. Default: a fifth of the machine's memory.",
     ),
 ]
 Full = Annotated[
     bool,
     typer.Option(
         "--full",
-        help="In tiles: learn from every pixel to the last digit. Takes two or three times as long.",
+        help="In tiles: compute statistics from every pixel instead of a sample. Takes two or three times as long.",
     ),
 ]
 
@@ -120,40 +120,38 @@ def _rectangles(name: str, metavar: str, help: str) -> Any:
 
 StrokesFile = _file(
     "--strokes",
-    "Scribbles over the photograph: a picture of its size, in PNG, TIFF or WebP, transparent where nothing is drawn.",
+    "Scribbles on the photograph: a PNG, TIFF or WebP picture of its size, transparent where nothing is drawn.",
 )
 ColourRegions = _rectangles(
     "--region",
     "X,Y,W,H:COLOUR",
     "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width and "
     "height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small square "
-    "around that point. May be given several times; later ones cover earlier ones.",
+    "around that point. May be repeated; later rectangles cover earlier ones.",
 )
-Keeps = _rectangles(
-    "--keep", "X,Y,W,H", "A rectangle; whatever looks like it stays as it is. May be given several times."
-)
+Keeps = _rectangles("--keep", "X,Y,W,H", "A rectangle; everything that resembles it stays unchanged. May be repeated.")
 Regions = _rectangles(
     "--region",
     "X,Y,W,H",
     "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; X,Y "
-    "alone is a small square around that point. May be given several times.",
+    "alone is a small square around that point. May be repeated.",
 )
 Backgrounds = _rectangles(
     "--background",
     "X,Y,W,H",
-    "A rectangle of what is around, where the mask takes in too much. May be given several times.",
+    "A rectangle of the background, where the mask covers too much. May be repeated.",
 )
 SliderRegions = _rectangles(
     "--region",
     "X,Y,W,H[:SLIDERS]",
-    "Edit only what looks like a rectangle: column and row of its upper left corner, its width and height, and its own "
-    "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be given several times.",
+    "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its own "
+    "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be repeated.",
 )
-MaskFile = _file("--mask", "A picture of the size of the photograph, white where it is selected and black elsewhere.")
+MaskFile = _file("--mask", "A picture of the same size as the photograph, white where selected and black elsewhere.")
 NoiseMap = _file(
-    "--map", "Write the noise as a picture, too: its standard deviation at every pixel; white is 64 grey levels."
+    "--map", "Also write a picture of the standard deviation of the noise at every pixel; white is 64 grey levels."
 )
 Show = _file(
     "--show",
-    "A picture to write before the edit: the photograph, reduced, with scribbles and what they select over it.",
+    "Picture to write before the edit: the photograph, reduced, with the scribbles and the selected area marked on it.",
 )

@@ -8,7 +8,7 @@ from nlfilter_torch.edits.presets import PRESETS, PURPOSES, find_preset
 
 Name = Annotated[
     str | None,
-    typer.Argument(metavar="NAME", help="Print this preset as a file, to be changed and passed to `detail --preset`."),
+    typer.Argument(metavar="NAME", help="Print this preset as JSON, to be edited and passed to `detail --preset`."),
 ]
 
 

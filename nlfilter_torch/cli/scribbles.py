@@ -55,8 +55,8 @@ class Rectangle:
             x, y, width, height = (math.floor(number) for number in found)
         except ValueError:
             raise ValueError(
-                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; shares such as 25% "
-                "and a point X,Y will do, too"
+                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; percentages "
+                "such as 25% and a point X,Y are accepted too"
             ) from None
         if width < 1 or height < 1:
             raise ValueError(f"{option} must be at least 1 pixel wide and high, got {width}x{height} in {text!r}")
@@ -130,7 +130,7 @@ class Overlay(ABC):
 class Regions(Overlay):
     """Masks of regions; the picture is the first of them."""
 
-    marked, empty = 0, "black everywhere; paint white what is to be selected"
+    marked, empty = 0, "black everywhere; paint the selected area white"
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
@@ -141,7 +141,7 @@ class Regions(Overlay):
 class Strokes(Overlay):
     """Coloured scribbles: RGB and their mask, in four channels."""
 
-    marked, empty = 3, "transparent everywhere; paint at least one stroke"
+    marked, empty = 3, "transparent everywhere; draw at least one scribble"
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         tile = picture.tile(rows.start, rows.stop, 0)
@@ -160,7 +160,7 @@ def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tup
         focus = selection(size, mask, regions, "--region", read)
         if focus is None:
             raise ValueError(
-                "give --region X,Y,W,H or --mask FILE: what is to stay sharp, such as --region 190,60,60,60"
+                "give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60"
             )
         return (focus,), {}
     if step.edit != "detail" or (mask is None and not regions):
@@ -203,7 +203,7 @@ def selection(size: Size, path: Path | None, texts: list[str] | None, option: st
     for text in texts or []:
         rectangle = Rectangle.parse(text, option, size)
         if rectangle.note is not None:
-            raise ValueError(f"{option} must be X,Y,W,H alone here, got {text!r}; leave out what follows the colon")
+            raise ValueError(f"{option} must be X,Y,W,H only, got {text!r}; drop the colon and what follows it")
         rectangles.append((rectangle, slice(None), [1.0]))
     return None if path is None and not rectangles else Regions((*size, 1), _picture(size, path, read), rectangles)
 
@@ -222,7 +222,7 @@ def _slider_regions(
         if len(own) != len(alpha):
             raise ValueError(
                 f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
-                "repeat or drop some"
+                "add or drop some"
             )
         rectangles.append((rectangle, slice(len(sliders), len(sliders) + 1), [1.0]))
         sliders.append(own)
@@ -237,11 +237,11 @@ def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = F
     found = stored.shape[:2]
     if found != size:
         raise ValueError(
-            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize one"
+            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize it"
         )
     if transparent and not stored.alpha:
         raise ValueError(
-            f"{path} has no transparency, so that every pixel of it would be a stroke; "
-            "paint on a transparent layer and save that"
+            f"{path} has no transparency, so every pixel would count as a scribble; "
+            "draw on a transparent layer and save only that layer"
         )
     return Picture(stored.rows, str(path))

@@ -41,12 +41,12 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
             middle = pixels.median(2).values
             red, green, blue = (middle[0].expand(3) * 255).round().int().tolist()
             place = f"{option} {rectangle}"
-            typer.echo(f"{place}: {pixels.shape[2]} pixels, most of them about #{red:02x}{green:02x}{blue:02x}")
+            typer.echo(f"{place}: {pixels.shape[2]} pixels, median colour #{red:02x}{green:02x}{blue:02x}")
             share = unlike(pixels, middle)
             if share > NOTE_SHARE:
                 typer.echo(
-                    f"nlfilter-torch: note: {place} covers very different pixels: {100 * share:.0f} % of them differ "
-                    "much from the others; make it smaller or move it, and look at it with --show FILE",
+                    f"nlfilter-torch: note: {place} covers very different colours: {100 * share:.0f} % of its pixels "
+                    "differ strongly from the median; make it smaller or move it, and check it with --show FILE",
                     err=True,
                 )
 

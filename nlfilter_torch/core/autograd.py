@@ -1,4 +1,4 @@
-"""Helpers of the hand-written derivatives: low-rank gradients, and an error for second derivatives."""
+"""Helpers for hand-written derivatives: low-rank gradients, and an error for second derivatives."""
 
 import functools
 from collections.abc import Callable
@@ -16,9 +16,9 @@ Gradients = tuple[Tensor | None, ...]
 class OuterProduct(Tensor):
     """A low-rank gradient ``left @ right`` of the factor, evaluated only when needed.
 
-    The gradients of products with W and of the balancing are low-rank matrices (B, M, N). When autograd adds them,
-    their parts are concatenated, and the backward pass of the factor evaluates the sum block by block. This saves three
-    copies of the factor. Any other operation sees an ordinary tensor.
+    The gradients of products with W and of balancing are low-rank matrices (B, M, N). When autograd adds them, their
+    factors are concatenated, and the backward pass of the Nystrom factor evaluates the sum block by block. This saves
+    three copies of the factor. Any other operation sees an ordinary tensor.
 
     Attributes:
         left: (B, M, r).
@@ -30,7 +30,7 @@ class OuterProduct(Tensor):
 
     @staticmethod
     def __new__(cls, left: Tensor, right: Tensor) -> "OuterProduct":
-        """A tensor with the shape of the product that owns no memory."""
+        """Create a tensor that has the shape of the product but owns no memory."""
         shape = (left.shape[0], left.shape[1], right.shape[2])
         product: OuterProduct = Tensor._make_wrapper_subclass(cls, shape, dtype=left.dtype, device=left.device)
         product.left, product.right = left, right
@@ -52,22 +52,22 @@ class OuterProduct(Tensor):
 
 
 def outer_product(left: Tensor, right: Tensor) -> Tensor:
-    """``left @ right``, kept as its parts if these are smaller than the product."""
+    """``left @ right``, stored as its two factors if they are smaller than the product."""
     if left.shape[2] >= left.shape[1] or torch.compiler.is_compiling():
         return torch.bmm(left, right)
     return OuterProduct(left, right)
 
 
 def factors_of(gradient: Tensor) -> tuple[Tensor, ...]:
-    """The parts (B, M, r) and (B, r, N) of a low-rank gradient, or an ordinary gradient alone."""
+    """Factors (B, M, r) and (B, r, N) of a low-rank gradient, or the gradient itself as a tuple of one."""
     return (gradient.left, gradient.right) if isinstance(gradient, OuterProduct) else (gradient,)
 
 
 def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
     """Make a ``backward`` of an autograd Function raise on second derivatives, and run it in full precision.
 
-    A backward pass started under autocast would otherwise round its products. torch's decorator of this name raises
-    only if the incoming gradient requires a gradient. Otherwise it treats the result as a constant, and second
+    A backward pass started under autocast would otherwise round its products. torch's decorator of the same name raises
+    only if the incoming gradient requires a gradient; otherwise it treats the result as a constant, and second
     derivatives would be silently wrong.
     """
     exact = full_precision(backward)
@@ -79,7 +79,7 @@ def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gra
         if not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return found
         formed = [g.formed() if isinstance(g, OuterProduct) else g for g in found if g is not None]
-        # Connected to all that the gradients depend on: autograd visits only nodes on the way to the requested tensors.
+        # Connected to everything the gradients depend on: autograd visits only nodes on a path to a requested tensor.
         causes = [t for t in (*ctx.saved_tensors, *gradients) if t is not None and t.requires_grad]
         refused = iter(_Refusal.apply(len(formed), *formed, *causes))  # type: ignore[no-untyped-call]
         return tuple(None if g is None else next(refused) for g in found)
@@ -96,5 +96,5 @@ class _Refusal(torch.autograd.Function):
     def backward(ctx: Any, *_: Any) -> Gradients:
         raise RuntimeError(
             "the filter must not be differentiated twice with respect to its guide, bandwidths or patch weights; "
-            "detach them, which leaves second derivatives in the image and in alpha"
+            "detach them to take second derivatives with respect to the image and alpha only"
         )

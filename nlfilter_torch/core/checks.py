@@ -1,6 +1,6 @@
-"""Validation of public arguments: one sentence with the argument, the requirement, the value and the remedy.
+"""Validation of public arguments. Each error is one sentence: the argument, the requirement, the value, the remedy.
 
-Only public functions call these; internal functions trust their arguments.
+Only public functions validate; internal functions trust their arguments.
 """
 
 import math
@@ -22,16 +22,16 @@ Response = Callable[[Tensor], Tensor]
 LARGEST_PATCH = 101  # features take patch_size^2 times the memory of the guide
 LARGEST_ORDER = 1000  # each order takes a copy of the image
 LARGEST_EIGENVALUE = 1e6
-LEAST_WEIGHT = 1e-6  # of a point; its inverse is the largest, beyond which sums in float32 lose the others
+LEAST_WEIGHT = 1e-6  # of a point; the largest is its inverse, above which float32 sums lose the other points
 FAR_OUTSIDE = 16.0  # above the values of HDR pictures with white at 1, below those of 8-bit pictures
 
-#: Of the finite numbers that an argument may be: what they are, whether a number is one, and what to do otherwise.
+#: Allowed ranges of finite numbers: description, test and remedy.
 DOMAINS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "positive": ("positive and finite", lambda v: v > 0, "pass a positive number"),
     "not negative": ("at least 0 and finite", lambda v: v >= 0, "pass 0 or more"),
     "share": ("in [0, 1]", lambda v: (v >= 0) & (v <= 1), "clamp it"),
     "below 1": ("in [0, 1)", lambda v: (v >= 0) & (v < 1), "clamp it"),
-    "finite": ("finite", lambda v: v == v, "1.0 changes nothing"),
+    "finite": ("finite", lambda v: v == v, "pass a finite number"),
 }
 
 
@@ -40,14 +40,14 @@ def check_tensor(value: object, name: str, remedy: str = "convert it with torch.
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}; {remedy}")
     if value.layout != torch.strided:
-        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call its to_dense()")
+        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call .to_dense()")
 
 
 def check_dtype(tensor: Tensor, name: str, remedy: str, *, values: str = "") -> None:
-    """Raise unless ``tensor`` is a tensor of a floating-point dtype; ``values`` describes them in the error."""
+    """Raise unless ``tensor`` is a tensor of a floating-point dtype; ``values`` is inserted in the message."""
     check_tensor(tensor, name)
     if tensor.dtype not in FLOATING:
-        raise TypeError(f"{name} must be of a floating-point dtype{values}, got {tensor.dtype}; {remedy}")
+        raise TypeError(f"{name} must have a floating-point dtype{values}, got {tensor.dtype}; {remedy}")
 
 
 def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
@@ -61,7 +61,7 @@ def check_image(
 ) -> None:
     """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with pixels; B may be 0 if ``empty``."""
     check_tensor(image, name, "convert it with torch.as_tensor")
-    check_dtype(image, name, "divide integer pixels by their largest value", values=" with values in [0, 1]")
+    check_dtype(image, name, "convert integer pixels and divide by white, such as 255", values=" with values in [0, 1]")
     if image.ndim != 4:
         raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
     if 0 in image.shape[empty:]:
@@ -76,7 +76,7 @@ def check_image(
 
 
 def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise if ``tensor`` holds NaN or infinity; skipped where :func:`~nlfilter_torch.core.values.is_hidden` holds."""
+    """Raise if ``tensor`` holds NaN or infinity; skipped if :func:`~nlfilter_torch.core.values.is_hidden`."""
     if is_hidden(tensor):
         return
     values = tensor.detach()
@@ -88,7 +88,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
 
 
 def check_unit_range(tensor: Tensor, name: str) -> None:
-    """Raise unless all values are in [0, 1]; skipped where :func:`check_finite` is."""
+    """Raise unless all values are in [0, 1]; skipped if :func:`~nlfilter_torch.core.values.is_hidden`."""
     if is_hidden(tensor):
         return
     low, high = tensor.detach().aminmax()
@@ -97,23 +97,23 @@ def check_unit_range(tensor: Tensor, name: str) -> None:
 
 
 def check_photograph(image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None) -> None:
-    """:func:`check_image`, with a warning where values are far outside [0, 1], see :func:`warn_of_scale`."""
+    """:func:`check_image`, and warn if values are far outside [0, 1]; see :func:`warn_of_scale`."""
     check_image(image, name, channels=channels, batch=batch)
     warn_of_scale(image, name)
 
 
 def warn_of_scale(image: Tensor, name: str) -> None:
-    """Warn of an image of 1 or 3 channels with values above 16: probably 8-bit pixels converted to floats.
+    """Warn if an image of 1 or 3 channels has values above 16: probably 8-bit pixels converted to floats.
 
-    Skipped where :func:`check_finite` is. Images with other numbers of channels are feature maps, which may have any
-    values; HDR pictures stay below 16.
+    Skipped if :func:`~nlfilter_torch.core.values.is_hidden`. Images with other numbers of channels are feature maps,
+    which may have any values; HDR pictures stay below 16.
     """
     if is_hidden(image) or image.shape[1] not in (1, 3) or len(image) == 0:
         return
     largest = float(image.detach().max())
     if largest > FAR_OUTSIDE:
         warn(
-            f"{name} must be in [0, 1] or near it, got values up to {largest:g}; divide by the value of white, say 255"
+            f"{name} must be in or near [0, 1], got values up to {largest:g}; divide by the value of white, such as 255"
         )
 
 
@@ -127,7 +127,7 @@ def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str
 
 
 def check_patch_size(patch_size: int) -> None:
-    """Raise unless ``patch_size`` is an odd positive integer, and not above :data:`LARGEST_PATCH`."""
+    """Raise unless ``patch_size`` is an odd positive integer of at most :data:`LARGEST_PATCH`."""
     if isinstance(patch_size, bool) or not isinstance(patch_size, int):
         raise TypeError(f"patch_size must be an int, got {type(patch_size).__name__}; pass 1, 3, 5, ...")
     if patch_size < 1 or patch_size % 2 == 0:
@@ -135,7 +135,7 @@ def check_patch_size(patch_size: int) -> None:
         raise ValueError(f"patch_size must be odd and at least 1, got {described(patch_size)}; {remedy}")
     if patch_size > LARGEST_PATCH:
         raise ValueError(
-            f"patch_size must be at most {LARGEST_PATCH}, got {described(patch_size)}; reduce the image instead"
+            f"patch_size must be at most {LARGEST_PATCH}, got {described(patch_size)}; downscale the image instead"
         )
 
 
@@ -146,14 +146,14 @@ def check_choice(value: str, name: str, choices: Sequence[str], remedy: str = "c
 
 
 def described(value: object) -> str:
-    """A value of any type, as one line of an error message."""
+    """Describe a value of any type in one line, for error messages."""
     if isinstance(value, int) and value.bit_length() > 64:
         return f"an integer of {value.bit_length()} bits"
     return repr(value) if value is None or isinstance(value, str | int | float) else type(value).__name__
 
 
 def check_number(value: object, name: str, remedy: str = "pass a float") -> None:
-    """Raise unless ``value`` is a number, rather than a tensor of them."""
+    """Raise unless ``value`` is a number (tensors are not accepted)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{name} must be a number, got {type(value).__name__}; {remedy}")
 
@@ -169,16 +169,16 @@ def check_weight(value: float | Tensor, name: str, batch: int | None = None) -> 
 
 
 def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:
-    """Raise unless ``value`` is a number in one of :data:`DOMAINS`, or a tensor of them of shape () or (batch,).
+    """Raise unless ``value`` is a number, or a tensor of shape () or (batch,), in the given one of :data:`DOMAINS`.
 
-    The values of a tensor are checked where :func:`check_finite` checks them.
+    The values of a tensor are not checked if :func:`~nlfilter_torch.core.values.is_hidden`.
     """
     wanted, inside, usual = DOMAINS[domain]
     remedy = remedy or usual
     if not isinstance(value, Tensor):
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number")
-        # Integers of Python may exceed both floats and the 64 bits of torch.
+        # Python integers may exceed the range of floats and the 64 bits of torch.
         finite = abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)
         if not (inside(value) and finite):
             raise ValueError(f"{name} must be {wanted}, got {described(value)}; {remedy}")
@@ -197,7 +197,7 @@ def check_values(value: object, name: str, domain: str, batch: int | None = None
 
 
 def check_pair(value: object, name: str) -> None:
-    """Raise unless ``value`` is a pair of integers that are not negative."""
+    """Raise unless ``value`` is a pair of non-negative integers."""
     if not isinstance(value, tuple | list) or not all(isinstance(v, int) and not isinstance(v, bool) for v in value):
         raise TypeError(f"{name} must be a pair of ints, got {described(value)}; pass (0, 0) for none")
     if len(value) != 2 or not all(0 <= v < 1 << 63 for v in value):
@@ -206,7 +206,7 @@ def check_pair(value: object, name: str) -> None:
 
 
 def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
-    """Raise if a blur radius of ``value`` pixels exceeds half the short side: time and memory grow with it."""
+    """Raise if a blur radius of ``value`` pixels exceeds half the short side, as time and memory grow with it."""
     most = max(min(size) / 2, 2.0)  # defaults must be valid for tiny images too
     if not value <= most:
         limit = f"half the short side of the image, {most:g} pixels"
@@ -214,15 +214,15 @@ def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
 
 
 def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str) -> None:
-    """Raise if squares of features overflow: magnitudes up to ``largest`` (B,) divided by the bandwidth.
+    """Raise if squares of features overflow; features have magnitudes up to ``largest`` (B,) over the bandwidth.
 
-    Skipped where :func:`check_finite` is.
+    Skipped if :func:`~nlfilter_torch.core.values.is_hidden`.
     """
     given = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
     if is_hidden(largest) or is_hidden(given):
         return
     limits = torch.finfo(largest.dtype)
-    # Squared differences of features are summed; the margin is for the gradients.
+    # Squared differences of features are summed; the margin allows for gradients.
     smallest = (largest.double() / (limits.max**0.5 / 64)).clamp(min=4 * limits.tiny)
     given = given.double().reshape(-1).expand_as(smallest)
     if bool((given < smallest).any()):
@@ -245,12 +245,12 @@ def check_count(value: int, name: str, *, least: int = 1, most: int | None = Non
 
 
 def check_order(order: int) -> None:
-    """Raise unless ``order`` is a number of products with W from 1 to :data:`LARGEST_ORDER`."""
+    """Raise unless ``order``, a number of products with W, is an integer from 1 to :data:`LARGEST_ORDER`."""
     check_count(order, "order", most=LARGEST_ORDER)
 
 
 def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) -> None:
-    """Raise unless ``tensor`` is a tensor of that shape."""
+    """Raise unless ``tensor`` is a tensor of the given shape."""
     check_tensor(tensor, name, remedy)
     if tensor.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}; {remedy}")
@@ -258,24 +258,24 @@ def check_shape(tensor: Tensor, shape: tuple[int, ...], name: str, remedy: str) 
 
 def check_coefficients(coefficients: Tensor, factor: Tensor) -> None:
     """Raise unless coefficients (b, C, M) in float64 fit a factor (B, M, N)."""
-    check_tensor(coefficients, "coefficients", "take spectrum.coefficients of an image")
+    check_tensor(coefficients, "coefficients", "use spectrum.coefficients(image)")
     batch, count, _ = factor.shape
     shape = tuple(coefficients.shape)
     if coefficients.ndim != 3 or shape[2] != count or 0 in shape or (shape[0] != batch and 1 not in (batch, shape[0])):
         raise ValueError(
-            f"coefficients must have shape ({batch}, C, {count}), got {shape}; take spectrum.coefficients of an image"
+            f"coefficients must have shape ({batch}, C, {count}), got {shape}; use spectrum.coefficients(image)"
         )
     if coefficients.dtype != torch.float64:
-        raise TypeError(f"coefficients must be of dtype torch.float64, got {coefficients.dtype}; convert them")
+        raise TypeError(f"coefficients must have dtype torch.float64, got {coefficients.dtype}; convert them")
     check_finite(coefficients, "coefficients")
 
 
 def checked_response(response: Response, support: Tensor) -> Response:
-    """A function from eigenvalues (B, M) to gains, with a check of its results where ``support`` (B, M) is True."""
+    """Wrap a function from eigenvalues (B, M) to gains so that its results are checked where ``support`` is True."""
     if not callable(response):
         raise TypeError(
             f"response must be a function of the eigenvalues, got {type(response).__name__}; "
-            "pass one such as torch.sqrt"
+            "pass a function such as torch.sqrt"
         )
     remedy = "return one gain for every eigenvalue"
 
@@ -290,7 +290,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
             fits = False
         if not fits:
             raise ValueError(
-                f"response must return a tensor of the shape {tuple(eigenvalues.shape)} of its argument, "
+                f"response must return a tensor with the shape of its argument, {tuple(eigenvalues.shape)}, "
                 f"got {tuple(gains.shape)}; {remedy}"
             )
         if eigenvalues.shape == support.shape:
@@ -301,7 +301,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
 
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
-    """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, where allowed, (B, k+1, H, W)."""
+    """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, if allowed, (B, k+1, H, W)."""
     check_dtype(alpha, "alpha", "write 1.0 instead of 1")
     if alpha.ndim not in dimensions:
         shapes = {1: "(k+1,)", 2: "(B, k+1)", 4: "(B, k+1, H, W)"}
@@ -316,7 +316,7 @@ def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None
 
 
 def check_eigenvalues(values: Tensor) -> None:
-    """Raise unless eigenvalues are floating-point and so close to [0, 1] that their powers stay finite."""
+    """Raise unless eigenvalues are floating-point and small enough in magnitude for their powers to stay finite."""
     check_dtype(values, "eigenvalues", "convert them")
     check_finite(values, "eigenvalues")
     if is_hidden(values) or values.numel() == 0:
@@ -324,70 +324,70 @@ def check_eigenvalues(values: Tensor) -> None:
     largest = float(values.detach().abs().max())
     if largest > LARGEST_EIGENVALUE:
         raise ValueError(
-            f"eigenvalues must be in [0, 1] or near it, got values up to {largest:g}; divide them by the largest"
+            f"eigenvalues must be in or near [0, 1], got values up to {largest:g}; divide by the largest one"
         )
 
 
 def check_features(features: Tensor, name: str, size: int | None = None, *, empty: bool = False) -> None:
-    """Raise unless ``features`` is a finite (B, D, N) tensor, of ``size`` D if given; B may be 0 if ``empty``."""
+    """Raise unless ``features`` is a finite (B, D, N) tensor, with D = ``size`` if given; B may be 0 if ``empty``."""
     check_dtype(features, name, "convert them")
     if features.ndim != 3 or 0 in features.shape[empty:]:
         raise ValueError(
             f"{name} must have shape (B, D, N) with at least one point, got {tuple(features.shape)}; "
-            "put points last and add the missing dimensions"
+            "move points to the last dimension and add missing ones"
         )
     if size is not None and features.shape[1] != size:
         raise ValueError(
-            f"{name} must have the {size} features of each point that the operator was made from, got "
-            f"{features.shape[1]}; work them out in the same way"
+            f"{name} must have {size} features per point, as those from which the operator was built, got "
+            f"{features.shape[1]}; compute them in the same way"
         )
     check_finite(features, name)
 
 
 def check_size(size: object, points: int) -> tuple[int, int]:
-    """The size (H, W) of ``points`` pixels, from (H, W) or (N,); raise unless these are integers of that product."""
+    """Return ``size``, (H, W) or (N,), as (H, W); raise unless it holds integers whose product is ``points``."""
     if not isinstance(size, tuple | list) or len(size) not in (1, 2) or any(type(length) is not int for length in size):
         raise TypeError(
             f"size must be integers (H, W) or (N,), got {size if isinstance(size, tuple) else described(size)}; "
-            f"pass ({points},), say"
+            f"pass ({points},), for example"
         )
     size = (1, *size)[-2:]
     if size[0] < 1 or size[1] < 1 or size[0] * size[1] != points:
         raise ValueError(
-            f"size must have as many pixels as there are features, {points}, got {size[0]}x{size[1]}; "
-            f"pass ({points},) for points in no order"
+            f"size must have one pixel for each of the {points} points, got {size[0]}x{size[1]}; "
+            f"pass ({points},) for unordered points"
         )
     return (size[0], size[1])
 
 
 def check_weights(weights: Tensor, features: Tensor) -> Tensor:
-    """Weights (B, N) in the dtype of features (B, D, N), from (N,) or (B, N); raise unless all are in range."""
+    """Return weights, (N,) or (B, N), as (B, N) in the dtype of features (B, D, N); raise unless all are in range."""
     check_tensor(weights, "weights")
     check_dtype(weights, "weights", "convert it with weights.float()")
     batch, _, points = features.shape
     if tuple(weights.shape) not in ((points,), (1, points), (batch, points)):
         raise ValueError(
-            f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; give one each"
+            f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; pass one each"
         )
     weights = weights.detach().to(features).expand(batch, points).contiguous()
     if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
         allowed, found = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
-        raise ValueError(f"weights must be from {allowed}, got {found}; leave out points that stand for no pixel")
+        raise ValueError(f"weights must be from {allowed}, got {found}; drop points of negligible weight")
     return weights
 
 
 def warn(message: str) -> None:
-    """Warn at the line that called this package, through any number of wrappers and modules."""
+    """Warn with the location of the line that called this package, through any number of wrappers and modules."""
     warnings.warn(message, stacklevel=1 + len(_modules_inside()))
 
 
 def called_by_edit() -> bool:
-    """Whether the caller is an edit of photographs, which has checked the image already."""
+    """Whether the caller is an edit, which has checked the image already."""
     edits = ("nlfilter_torch.edits", "nlfilter_torch.filtering.fitted")
     return any(module.startswith(edits) for module in _modules_inside())
 
 
 def _modules_inside() -> list[str]:
-    """The module of every frame from the caller's to the one that called this package, which is left out."""
+    """Modules of all frames from the caller's up to, but not including, the one that called this package."""
     modules = (str(frame.f_globals.get("__name__", "")) for frame, _ in walk_stack(sys._getframe(1)))
     return list(takewhile(lambda module: module.split(".")[0] in ("nlfilter_torch", "torch"), modules))

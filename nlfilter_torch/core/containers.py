@@ -1,4 +1,4 @@
-"""Dataclasses of tensors, such as operators and spectra: moved to devices and dtypes, and loaded from files."""
+"""Dataclasses of tensors, such as operators and spectra: moving to devices and dtypes, and loading from files."""
 
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
@@ -9,7 +9,7 @@ from torch import Tensor
 Target = torch.device | str | int | torch.dtype | Tensor
 Container = TypeVar("Container")
 
-# Sums over all pixels, in float64 whatever the precision of the pixels.
+# Fields that are sums over all pixels, kept in float64 whatever the precision of the pixels.
 EXACT = frozenset({"moment", "moments", "captured", "before", "ritz", "root"})
 
 
@@ -19,7 +19,7 @@ def loadable(*classes: type) -> None:
 
 
 def moved(container: Container, target: Target, dtype: torch.dtype | None = None) -> Container:
-    """A dataclass with all its tensors on another device, or in another precision.
+    """Copy a dataclass with all its tensors moved to another device or converted to another precision.
 
     Raises:
         TypeError: if the dtype is neither float32 nor float64.
@@ -32,7 +32,9 @@ def moved(container: Container, target: Target, dtype: torch.dtype | None = None
     else:
         device = torch.device(target)
     if dtype not in (None, torch.float32, torch.float64):
-        raise TypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}; filters convert images themselves")
+        raise TypeError(
+            f"dtype must be torch.float32 or torch.float64, got {dtype}; filters convert images of other dtypes"
+        )
 
     def move(value: Any, exact: bool) -> Any:
         if isinstance(value, Tensor):

@@ -1,4 +1,4 @@
-"""The compiled kernels and their instruction set, without importing torch, which takes seconds."""
+"""Loading the compiled kernels and finding their instruction set, without importing torch, which takes seconds."""
 
 import ctypes
 import platform
@@ -8,11 +8,11 @@ NAMES = ("none", "NEON") if platform.machine() in ("aarch64", "arm64") else ("no
 
 
 def load_library() -> ctypes.CDLL | None:
-    """The compiled library of :mod:`nlfilter_torch.core.kernels`, if it is installed."""
+    """Load the compiled library of :mod:`nlfilter_torch.core.kernels`, if it is installed."""
     path = Path(__file__).with_name("kernels") / "kernels.so"
     return ctypes.CDLL(str(path)) if path.exists() else None
 
 
 def level(library: ctypes.CDLL | None) -> int:
-    """The best instruction set of this processor and the library, as an index of :data:`NAMES`."""
+    """Best instruction set that both this processor and the library support, as an index of :data:`NAMES`."""
     return 0 if library is None else int(library.nlfilter_level())

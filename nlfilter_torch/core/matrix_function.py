@@ -1,9 +1,9 @@
 """Functions of small symmetric matrices, with a gradient that is finite for repeated eigenvalues.
 
-``torch.linalg.eigh`` differentiates its eigenvectors, which divides by ``lambda_i - lambda_j`` and gives NaN where two
-are equal, as on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of
+The gradient of eigenvectors from ``torch.linalg.eigh`` divides by ``lambda_i - lambda_j`` and is NaN for equal
+eigenvalues, as on any image of two flat colours. A function ``f(A) = Q f(Lambda) Q^T`` does not depend on the choice of
 Q, and its derivative is finite: ``Q (D * (Q^T dA Q)) Q^T`` with the divided differences ``D_ij = (f_i - f_j) /
-(lambda_i - lambda_j)``, or f' where eigenvalues are equal (Daleckii and Krein, 1965).
+(lambda_i - lambda_j)``, or f' if the eigenvalues are equal (Daleckii and Krein, 1965).
 """
 
 from collections.abc import Callable
@@ -16,9 +16,9 @@ from torch import Tensor
 from nlfilter_torch.core.autograd import once_differentiable
 from nlfilter_torch.core.precision import uncompiled
 
-# Eigenvalues with a relative distance below MEETING use f' at their midpoint: the errors of f''' and of
-# cancellation are then both near 1e-10. Below FLOOR the distance is absolute, since zero eigenvalues are zero only to
-# rounding.
+# For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
+# and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,
+# since zero eigenvalues are zero only up to rounding.
 MEETING = 1e-5
 FLOOR = 1e-5
 
@@ -45,7 +45,7 @@ class SymmetricMatrix:
 
     @uncompiled
     def apply(self, function: Callable[[Tensor], Tensor], support: Tensor) -> Tensor:
-        """f(A) restricted to the eigenvalues in ``support``.
+        """Compute f(A) restricted to the eigenvalues in ``support``.
 
         Args:
             function: elementwise and differentiable, (B, M) to (B, M); may have parameters that need a gradient.
@@ -54,7 +54,7 @@ class SymmetricMatrix:
         Returns:
             (B, M, M), differentiable once in the matrix and in the parameters of ``function``.
         """
-        # Outside the support f is evaluated at a point where responses and their derivatives are finite.
+        # Outside the support f is evaluated at 1, where responses and their derivatives are finite.
         points = torch.where(support, self.eigenvalues, torch.ones_like(self.eigenvalues))
         values = torch.where(support, function(points), torch.zeros_like(points))
         if not self.matrix.requires_grad:
@@ -77,7 +77,7 @@ class SymmetricMatrix:
 
     @staticmethod
     def _slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-        """F' at ``points`` (B, M, M), one column at a time because f may differ between the images of a batch."""
+        """Derivative of f at ``points`` (B, M, M); f may differ between the images of a batch."""
         with torch.enable_grad():
             points = points.detach().requires_grad_()
             flat = points.flatten(1)

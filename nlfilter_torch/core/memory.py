@@ -1,12 +1,12 @@
-"""Memory that an edit needs."""
+"""Estimates of the memory that an edit needs."""
 
 
 def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
-    """Memory in bytes that one pixel needs, a little more than was measured on two megapixels.
+    """Bytes of memory per pixel, slightly more than measured on two megapixels.
 
     Args:
-        landmarks: m; the factor has as many floats for each pixel.
-        patch_size: p; patches exist twice while they are weighted.
-        factors: number of arrays of the factor's size at once: 1 to filter, 5 for the diagnostics.
+        landmarks: M, the number of floats of the factor per pixel.
+        patch_size: p; two copies of the patches exist while they are weighted.
+        factors: number of arrays of the factor's size at once: 1 for filtering, 5 for diagnostics.
     """
     return 4 * (factors * landmarks + 2 * patch_size**2 + 40)

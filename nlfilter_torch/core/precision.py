@@ -1,8 +1,8 @@
-"""How functions are run: in float32 or float64 whatever the precision outside, and uncompiled where that is needed.
+"""Decorators that run functions in float32 or float64 whatever the precision outside, and uncompiled if necessary.
 
 Cholesky and eigen-decompositions reject half precision, and TF32 is too coarse for distances between patches. Every
-public function therefore leaves autocast, computes in :func:`working_dtype` and casts its result back. Data-dependent
-control flow and loops over blocks of pixels are kept out of ``torch.compile``.
+public function therefore leaves autocast, computes in :func:`working_dtype` and casts its result back. Functions with
+data-dependent control flow or loops over blocks of pixels are excluded from ``torch.compile``.
 """
 
 import functools
@@ -19,12 +19,12 @@ R = TypeVar("R")
 
 
 def working_dtype(tensor: Tensor) -> torch.dtype:
-    """float64 for float64 input, float32 for everything narrower."""
+    """Return float64 for float64 tensors, float32 for all others."""
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
 
 
 def as_given(result: Tensor, image: Tensor) -> Tensor:
-    """A result (B, C, H, W) in the dtype of the image that it was computed from, and channels-last where that is."""
+    """Convert a result (B, C, H, W) to the dtype of ``image``, and to channels-last if ``image`` is."""
     result = result.to(image.dtype)
     if image.is_contiguous() or is_functorch_wrapped_tensor(image) or is_functorch_wrapped_tensor(result):
         return result
@@ -47,7 +47,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        devices = [a.device.type for a in args if isinstance(a, Tensor)]  # Dynamo of PyTorch 2.8 knows no `next`
+        devices = [a.device.type for a in args if isinstance(a, Tensor)]  # Dynamo of PyTorch 2.8 lacks `next`
         device = devices[0] if devices and devices[0] != "meta" else "cuda"
         with torch.autocast("cpu", enabled=False), torch.autocast(device, enabled=False):
             if torch.cuda.is_available() and not torch.compiler.is_compiling():
@@ -74,7 +74,7 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def uncompiled_with(*options: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Run a function as :func:`uncompiled` does if one of these keyword arguments is given and not None."""
+    """Run a function uncompiled, as by :func:`uncompiled`, if one of these keyword arguments is not None."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         whole = uncompiled(function)

@@ -1,16 +1,16 @@
-"""How far a long work is, as text, with the time that is left."""
+"""Progress of a long computation as text, with an estimate of the time left."""
 
 import time
 from collections.abc import Callable
 
-KNOWN = 0.05  # share of the work after which the rest can be estimated
+KNOWN = 0.05  # fraction of a stage after which the remaining time can be estimated
 
 
 class Progress:
-    """The stage of a work and how much of it is done; called by the work, read by whoever shows it.
+    """Current stage of a computation and the fraction completed; called to report, converted to text for display.
 
     Args:
-        clock: seconds.
+        clock: returns the time in seconds.
 
     Example:
         >>> now = [0.0]
@@ -27,26 +27,26 @@ class Progress:
         self._stage, self._share, self._begun, self._first = "", 0.0, clock(), 0.0
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Note that so much of a stage is done."""
+        """Report that ``done`` of ``total`` units of a stage are complete."""
         share = done / max(total, 1)
         if stage != self._stage or share < self._share:
             self._stage, self._begun, self._first = stage, self._clock(), share
         self._share = share
 
     def begin(self, stage: str) -> None:
-        """Begin a stage of which nobody reports how far it is."""
+        """Begin a stage without progress reports."""
         self._stage, self._begun, self._first, self._share = stage, self._clock(), 0.0, 0.0
 
     @property
     def seconds_left(self) -> float | None:
-        """Until the stage ends, or None if that is not known."""
+        """Estimated seconds until the stage ends, or None if unknown."""
         done = self._share - self._first
         if done < KNOWN:
             return None
         return (self._clock() - self._begun) * (1 - self._share) / done
 
     def __str__(self) -> str:
-        """The stage and what is left of it, or how long it has taken."""
+        """The stage with the fraction done and the time left, or with the elapsed time if that is unknown."""
         left = self.seconds_left
         if left is not None:
             return f"{self._stage}, {100 * self._share:.0f} %, about {_time(left)} left"
@@ -54,7 +54,7 @@ class Progress:
 
 
 def _time(seconds: float) -> str:
-    """Seconds or minutes.
+    """Format a time in seconds or minutes.
 
     >>> _time(0.4), _time(89.7), _time(130)
     ('1 s', '90 s', '2 min')

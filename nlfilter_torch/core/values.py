@@ -1,8 +1,8 @@
-"""Whether values of tensors can be read, and which transforms of torch a computation can run under.
+"""Tests whether values of tensors can be read, and under which torch transforms a computation can run.
 
-Reading a value (``float(tensor)``, ``if tensor``) makes a processor wait for an accelerator, and is impossible where
-tensors have shapes alone: on the device "meta", as fake tensors, under ``torch.compile`` and ``torch.export``. Checks
-of values are skipped there, and iterations run a fixed number of steps.
+Reading a value (``float(tensor)``, ``if tensor``) makes the CPU wait for an accelerator, and is impossible for tensors
+without data: on the device "meta", as fake tensors, under ``torch.compile`` and ``torch.export``. In these cases checks
+of values are skipped, and iterations run a fixed number of steps.
 """
 
 import torch
@@ -15,7 +15,7 @@ _FAKE = torch._C._TorchDispatchModeKey.FAKE
 
 
 def is_hidden(tensor: Tensor) -> bool:
-    """Whether values cannot be read, or not without waiting: on accelerators, fake, compiling, in ``torch.func``."""
+    """Whether reading values would wait (accelerators) or is impossible (fake, compiling, in ``torch.func``)."""
     return (
         tensor.device.type != "cpu"
         or torch.compiler.is_compiling()
@@ -25,24 +25,24 @@ def is_hidden(tensor: Tensor) -> bool:
 
 
 def is_fake(tensor: Tensor) -> bool:
-    """Whether a tensor has a shape alone, or tensors made now will."""
+    """Whether a tensor is fake (has a shape but no data), or fake tensor mode is active."""
     return isinstance(tensor, FakeTensor) or torch._C._get_dispatch_mode(_FAKE) is not None
 
 
 def refuse_transforms(name: str, *values: object) -> None:
-    """Raise if an operator would be built from ``values`` under a transform that cannot follow it.
+    """Raise if ``values`` are under a transform that does not support building an operator.
 
     Args:
-        name: of the first of the values.
-        *values: what derivatives may be wanted of, tensors or not.
+        name: name of the first value.
+        *values: differentiable arguments, tensors or not.
     """
     if torch.compiler.is_compiling():
         return
-    # Reading these three takes less than a microsecond.
+    # These three checks take less than a microsecond.
     if torch._C._is_tracing():
         raise TypeError(
-            f"{name} must not be traced by torch.jit.trace where an operator is built, got a traced tensor; "
-            "use torch.export.export, or trace what a finished operator is applied to"
+            f"{name} must not be traced by torch.jit.trace while an operator is built, got a traced tensor; "
+            "use torch.export.export, or trace only the application of an operator built before"
         )
     if forward_ad._current_level < 0 and peek_interpreter_stack() is None:
         return
@@ -51,11 +51,11 @@ def refuse_transforms(name: str, *values: object) -> None:
             continue
         if is_functorch_wrapped_tensor(value):
             raise TypeError(
-                f"{name} must not be transformed by torch.func (vmap, grad, jvp) where an operator is built, got a "
+                f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
                 "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
             )
         if forward_ad.unpack_dual(value).tangent is not None:
             raise TypeError(
-                f"{name} must have no forward-mode derivative where an operator is built, got a tensor with a tangent; "
-                "take derivatives backward, with torch.autograd.grad"
+                f"{name} must have no forward-mode derivative while an operator is built, got a tensor with a tangent; "
+                "use reverse mode, with torch.autograd.grad"
             )

@@ -99,7 +99,7 @@ def fit_abstract(
     check_reach(width, "edge_width", source.size)
     ABSTRACT["tones"].check_argument(tones)
     if (edges > 0 or tones is not None) and source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select some")
+        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3")
     options |= {
         "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
         "spatial_bandwidth": nearby(options["spatial_bandwidth"], ABSTRACT["spatial_bandwidth"].share, source.size),

@@ -44,11 +44,11 @@ def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor
         return before, resized, f"{edited} is resized from {other[1]}x{other[0]} to {size[1]}x{size[0]}"
     if likeness < MIN_CORRELATION:
         raise ValueError(
-            f"{edited} must have the size of {name}, {size[1]}x{size[0]}, or be that picture resized or a part of it, "
-            f"got {other[1]}x{other[0]}; crop both alike"
+            f"{edited} must have the size of {name}, {size[1]}x{size[0]}, or be a resized copy or a crop of it, "
+            f"got {other[1]}x{other[0]}; crop both to the same area"
         )
     part = before[..., place[0] : place[0] + other[0], place[1] : place[1] + other[1]]
-    return part, after, f"{edited} is the part of {name} from row {place[0]}, column {place[1]}"
+    return part, after, f"{edited} is a crop of {name} from row {place[0]}, column {place[1]}"
 
 
 def _grey(image: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 def check_channels(edit: str, channels: int) -> None:
     """Raise if a grey photograph is to be recoloured."""
     if edit == "recolor" and channels < 3:
-        raise ValueError("recolor needs a colour photograph, got a grey one; use colorize, which colours grey ones")
+        raise ValueError("recolor needs a colour photograph, got a grey one; use colorize for grey photographs")
 
 
 def scribbles_of(

@@ -148,8 +148,8 @@ def fit_colorize(
     COLORIZE["method"].check_argument(method)
     if method == "kmeans" and not source.whole:
         raise ValueError(
-            "method must be regression where a picture is worked out by rows, got kmeans, which takes all pixels at "
-            "once; choose regression, or allow more memory"
+            "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in memory; "
+            "choose regression, or allow more memory"
         )
     COLORIZE["strength"].check_argument(strength, source.batch)
     check_positive(time, "time", source.batch)

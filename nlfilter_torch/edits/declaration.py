@@ -131,7 +131,7 @@ class Parameter:
             "count": f"a whole number {span}",
             "odd": f"an odd number {span}",
             "choice": f"{', '.join(named[:-1])} or {''.join(named[-1:])}",
-            "sliders": f"a list of {self.length or f'2 to {MAX_SLIDERS}'} numbers, none beyond {GAINS[1]:.0f}",
+            "sliders": f"a list of {self.length or f'2 to {MAX_SLIDERS}'} numbers {span}",
         }[self.kind]
         alternatives = [f'"{word}"' for word in self.words] + ["null"] * self.optional
         return ", or ".join([text, *alternatives])
@@ -258,7 +258,7 @@ def parse_json(text: str, name: str, remedy: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
-        raise ValueError(f"{name} is no preset: {reason}; {remedy}") from error
+        raise ValueError(f"{name} is not a preset: {reason}; {remedy}") from error
 
 
 def shown(value: Any) -> str:

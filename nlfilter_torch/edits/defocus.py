@@ -92,7 +92,7 @@ def fit_defocus(
 ) -> Fitted:
     """:func:`defocus` for any source."""
     if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
     DEFOCUS["aperture"].check_argument(aperture)
     DEFOCUS["radius"].check_argument(radius)
     blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))

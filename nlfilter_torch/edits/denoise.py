@@ -103,7 +103,7 @@ def fit_denoise(
     check_count(options["num_landmarks"], "num_landmarks")
     unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
     if unknown:
-        raise TypeError(f"denoise takes no argument {unknown[0]}; see its documentation for those it takes")
+        raise TypeError(f"denoise has no argument {unknown[0]}; see its documentation for the valid ones")
     is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
     if not isinstance(noise_level, Noise) and not is_map:
         DENOISE["noise_level"].check_argument(noise_level, source.batch)
@@ -112,7 +112,9 @@ def fit_denoise(
     if method == "network":
         return _by_network(source, noise_level, strength)
     if is_map:
-        raise ValueError("noise_level must be a number or (B,) for the rule, got a map; use the network")
+        raise ValueError(
+            "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
+        )
     level = noise_level.level if isinstance(noise_level, Noise) else torch.as_tensor(noise_level, dtype=source.dtype)
     return _by_rule(source, level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1), **options)
 
@@ -131,13 +133,15 @@ def _network(image: Tensor) -> NonlocalDenoiser:
 def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
     """Fit denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
     if isinstance(noise, Tensor) and noise.ndim == 4 and not source.whole:
-        raise ValueError("noise_level must be a number for a picture in tiles, got a map; denoise it in memory")
+        raise ValueError(
+            "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
+        )
 
     def finish(image: Tensor, _: Tensor) -> Tensor:
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
         level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
-        return image - _network(image).removed(image, level, turns=1)
+        return image - _network(image).estimate_in_tiles(image, level, turns=1)
 
     return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
 

@@ -143,7 +143,7 @@ def fit_detail(
         check_weight(residual, "residual", source.batch)
     if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
-        raise ValueError(f"{name} must come with regions, got it alone; paint what is to be edited, too")
+        raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
     sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit

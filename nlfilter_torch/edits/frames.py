@@ -60,21 +60,23 @@ def filter_frames(
     check_alpha(alpha, dimensions=(1,))
     DETAIL["channels"].check_argument(channels)
     if not isinstance(references, Sequence):
-        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; put it in one")
+        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; wrap it in a list")
     if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
-        raise TypeError(f"frames must be images, got {type(frames).__name__}; pass a list or a generator")
+        raise TypeError(
+            f"frames must be an iterable of images, got {type(frames).__name__}; pass a list or a generator"
+        )
     if residual is not None:
         check_weight(residual, "residual")
     if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
     if len(references) > 1 and options.get("spatial_bandwidth") is not None:
         raise ValueError(
-            f"references must be a single frame where spatial_bandwidth is set, got {len(references)}; "
-            "their coordinates would mean several places at once"
+            f"references must hold a single frame if spatial_bandwidth is given, got {len(references)}; "
+            "pass one frame, or no spatial_bandwidth"
         )
     for frame in references:
         check_photograph(frame, "references", batch=1)
-        check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first of them")
+        check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first one")
     DETAIL["limits"].check_argument(limits)
     DETAIL["threshold"].check_argument(threshold)
     DETAIL["viewing_size"].check_argument(viewing_size)

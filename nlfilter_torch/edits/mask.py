@@ -185,7 +185,7 @@ def select_regions(
     Further arguments are those of :func:`region_mask`.
     """
     if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select some")
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
     inside = source.regions(scribbles, names[0])
     others = [] if background is None else source.regions(background, names[1])
     if len(others) not in (0, 1, len(inside)):
@@ -197,7 +197,7 @@ def select_regions(
     if others and bool((found.background_weights.detach() <= 0).any()):
         raise ValueError(
             f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
-            "paint beside them, or leave it out"
+            "paint outside them, or omit it"
         )
     return found
 

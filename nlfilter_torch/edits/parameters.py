@@ -25,52 +25,52 @@ CRISP = (2.2, 2.2, 2.2, 1.0)
 
 DETAIL = Edit(
     "detail",
-    """Make the details of a photograph stronger or weaker, each size of them by a slider of its own.
+    """Strengthen or weaken the details of a photograph, with one slider for each size of detail.
 
-    Colours stay as they are where nothing clips, and so do the file's depth, transparency, colour profile and notes of
-    the camera (EXIF). Photographs that fit no memory are worked out in tiles; best as TIFF files or arrays of zarr,
-    read in parts.
+    Colours stay unchanged where nothing clips, and so do the file's depth, transparency, colour profile and camera
+    metadata (EXIF). Photographs that do not fit in memory are processed in tiles, preferably from TIFF files or zarr
+    arrays, which are read in parts.
 
     Sharpen strongly: `nlfilter-torch detail in.jpg out.jpg --alpha 3,3,3,1`
 
-    A look with a name: `nlfilter-torch detail in.jpg out.jpg --preset crisp`
+    Apply a preset (see `nlfilter-torch presets`): `nlfilter-torch detail in.jpg out.jpg --preset crisp`
 
-    Smooth skin or noise away: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
+    Smooth skin or noise: `nlfilter-torch detail in.jpg out.jpg --alpha 0.2,0.5,1,1 --bandwidth 10`
 
-    Sharpen all that looks like a spot: `nlfilter-torch detail in.jpg out.jpg --region 60,300,20,20`
+    Sharpen everything that resembles a rectangle: `nlfilter-torch detail in.jpg out.jpg --region 60,300,20,20`
 
-    By the name of a look: `nlfilter-torch detail in.jpg out.jpg --preset "soft skin"` (see `nlfilter-torch presets`)
+    Apply a preset with a space in its name: `nlfilter-torch detail in.jpg out.jpg --preset "soft skin"`
 
-    Edit like another photograph: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
+    Apply a fitted edit: `nlfilter-torch detail in.jpg out.jpg --preset look.json` (see `nlfilter-torch fit`)
     """,
     (
         sliders(
             "alpha",
             CRISP,
-            "One slider for each layer, from the finest detail to the smooth shading, with commas between. 1 leaves a "
-            "layer as it is, 3 makes it three times as strong, 0 takes it away.",
+            "One slider for each layer, from the finest detail to the smooth shading, separated by commas. 1 leaves a "
+            "layer unchanged, 3 makes it three times as strong, 0 removes it.",
             idle=1.0,
             metavar="A,B,...,Z",
         ),
         sliders(
             "inside",
             None,
-            "The sliders inside what looks like the strokes; as many. Left out: 1 for each.",
+            "The sliders inside the region selected by the strokes, as many as in alpha. Default: 1 for each.",
             optional=True,
             is_option=False,  # given by --region
         ),
         gain(
             "residual",
             None,
-            "Strength of the grain that no typical patch explains. 1 leaves it as it is, which keeps noise down. "
-            "Left out: as the first slider of --alpha.",
+            "Strength of the grain that the typical patches do not capture. 1 leaves it unchanged, which keeps noise "
+            "down. Default: the first slider of --alpha.",
             optional=True,
             idle=None,
         ),
         choice(
             "channels",
             ("luminance", "all"),
-            "Edit brightness and keep the colours, or edit red, green and blue alike, colours too.",
+            "`luminance`: edit brightness and keep the colours. `all`: edit red, green and blue, colours too.",
         ),
         replace(REACH, former_names=(("time", reach_of_time), ("spread", reach_of_time)), slider=REACH_SLIDER),
         replace(TOLERANCE, argument="mask_bandwidth"),
@@ -78,25 +78,25 @@ DETAIL = Edit(
             "threshold",
             "number",
             5.0,
-            "Detail of less contrast than this is strengthened less, since it may be noise: a standard deviation in "
-            "grey levels of 255. 0: all alike.",
+            "Detail with less contrast than this is strengthened less, since it may be noise: a standard deviation in "
+            "grey levels of 255. 0 strengthens all detail equally.",
             0,
             255,
             "levels",
             domain="not negative",
-            zero_meaning="0 strengthens all detail alike",
+            zero_meaning="pass 0 to strengthen all detail equally",
         ),
         LIMITS,
         VIEWING_SIZE,
         *WITHOUT_SHADING,
     ),
-    hint="Paint on what is to have sliders of its own; all that looks like it follows.",
+    hint="Paint on an area to give it its own sliders; everything that resembles it is selected too.",
     brushes=(("in", "Edit this"), ("out", "Not this")),
 )
 
 SHARPEN = Edit(
     "sharpen",
-    """Sharpen a photograph and leave its noise alone: one slider instead of those of `nlfilter-torch detail`.
+    """Sharpen a photograph but not its noise, with one slider instead of those of `nlfilter-torch detail`.
 
     Example: `nlfilter-torch sharpen in.jpg out.jpg --amount 5`
     """,
@@ -104,7 +104,7 @@ SHARPEN = Edit(
         gain(
             "amount",
             4.0,
-            "Strength: 1 leaves the photograph as it is, 4 is visible, 8 is strong.",
+            "Strength: 1 leaves the photograph unchanged, 4 is visible, 8 is strong.",
             idle=1.0,
             slider=Slider("Amount", 0, 10, 0.5, live=False),
         ),
@@ -112,13 +112,13 @@ SHARPEN = Edit(
             "guide_blur",
             "number",
             1.2,
-            "How much noise and the finest grain are overlooked: 0 not at all.",
+            "Blur that hides noise and the finest grain from the filter, so that they are not sharpened. 0: no blur.",
             0,
             1e4,
             "px",
             domain="not negative",
-            zero_meaning="0 leaves the guide as it is",
-            slider=Slider("Grain overlooked", 0, 4, 0.1, live=False),
+            zero_meaning="pass 0 to leave the guide unblurred",
+            slider=Slider("Ignored grain", 0, 4, 0.1, live=False),
         ),
         LIMITS,
         VIEWING_SIZE,
@@ -129,7 +129,7 @@ SHARPEN = Edit(
 
 TONE = Edit(
     "tone",
-    """Raise or lower contrast without a change of colour or of mean brightness, but where the picture clips.
+    """Raise or lower contrast without changing colours or mean brightness, except where the picture clips.
 
     Example: `nlfilter-torch tone in.jpg out.jpg --contrast 1.2 --clarity 2`
     """,
@@ -137,14 +137,14 @@ TONE = Edit(
         gain(
             "contrast",
             1.2,
-            "Contrast of the smooth shading: 1 leaves it, 1.4 is strong, 0.7 flattens.",
+            "Contrast of the smooth shading: 1 leaves it unchanged, 1.4 is strong, 0.7 flattens it.",
             idle=1.0,
             slider=Slider("Contrast", 0.5, 1.5, 0.05, live=False),
         ),
         gain(
             "clarity",
             1.0,
-            "Contrast of the largest details on it: 1 leaves it, 4 is strong.",
+            "Contrast of the largest details: 1 leaves it unchanged, 4 is strong.",
             idle=1.0,
             slider=Slider("Clarity", 0, 5, 0.1, live=False),
         ),
@@ -152,14 +152,14 @@ TONE = Edit(
         VIEWING_SIZE,
         *WITHOUT_SHADING,
     ),
-    hint="Contrast of large shapes, and of the detail on them.",
+    hint="Contrast of large shapes, and of the largest details on them.",
 )
 
 DENOISE = Edit(
     "denoise",
     """Remove noise from a photograph.
 
-    The noise is measured in the photograph, and whether it grows with the light.
+    The noise level, and how it depends on brightness, are estimated from the photograph.
 
     Example: `nlfilter-torch denoise in.jpg out.jpg`
 
@@ -170,7 +170,7 @@ DENOISE = Edit(
             "strength",
             "number",
             1.0,
-            "How much is taken away: 1 removes the noise that was found or given, less leaves some, more smooths.",
+            "How much noise is removed: 1 removes the estimated or given noise, less leaves some, more smooths detail.",
             0,
             4,
             domain="not negative",
@@ -182,7 +182,7 @@ DENOISE = Edit(
             "noise_level",
             "number",
             None,
-            "The noise: its standard deviation in grey levels of 255. Left out: measured.",
+            "Standard deviation of the noise in grey levels of 255. Default: estimated from the photograph.",
             0,
             255,
             "levels",
@@ -193,30 +193,30 @@ DENOISE = Edit(
         choice(
             "method",
             ("network", "rule"),
-            "`network`: trained on photographs. `rule`: by sliders of the filter, which the options below are for.",
+            "`network`: trained on photographs. `rule`: sliders of the filter, to which the options below apply.",
         ),
         *filter_parameters(share=0.2, landmarks=200),
     ),
-    hint="Less noise: it is measured, and taken away as strongly as you choose.",
+    hint="Estimates the noise and removes as much of it as you choose.",
 )
 
 RECOLOR = Edit(
     "recolor",
-    """Give a thing another colour: paint a little of it on it, and the rest of it takes it, and its likes nearby.
+    """Recolour an object: paint some colour on it, and the rest of it and similar objects nearby take that colour.
 
-    Brightness stays as it is to the last bit, and so does whatever is beyond the borders of the thing. Photographs that
-    fit no memory are worked out in tiles; best as TIFF files or arrays of zarr, read in parts.
+    Brightness stays exactly the same, and so does everything outside the object. Photographs that do not fit in memory
+    are processed in tiles, preferably from TIFF files or zarr arrays, which are read in parts.
 
-    A red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
+    Turn a red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
 
-    Spare the wood: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
+    Keep the wood unchanged: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
     """,
     (
         Parameter(
             "reach",
             "number",
             0.6,
-            "How far the colour spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+            "How far the colour spreads to less similar areas. 0 stays close, 0.95 goes far.",
             0,
             0.999,
             domain="below 1",
@@ -226,17 +226,18 @@ RECOLOR = Edit(
         replace(TOLERANCE, former_names=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
         *filter_parameters(share=1.2, patch_size=1)[1:],
     ),
-    hint="Choose a colour and paint a little of it on a thing; its likes take it.",
+    hint="Choose a colour and paint some of it on an object; similar areas take it too.",
     brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
     requires_strokes=True,
 )
 
 COLORIZE = Edit(
     "colorize",
-    """Colour a grey photograph: paint some strokes, and the colours spread over what looks alike nearby.
+    """Colourise a grey photograph: paint some strokes, and their colours spread over similar areas nearby.
 
-    Brightness stays as it is. A photograph in colour is taken for a grey one: its own colours are replaced. Photographs
-    that fit no memory are worked out in tiles, by regression; best as TIFF files or arrays of zarr, read in parts.
+    Brightness stays unchanged. A colour photograph is treated as a grey one: its own colours are replaced. Photographs
+    that do not fit in memory are processed in tiles, by regression only, preferably from TIFF files or zarr arrays,
+    which are read in parts.
 
     Example: `nlfilter-torch colorize grey.jpg out.jpg --strokes paint.png`
 
@@ -247,7 +248,7 @@ COLORIZE = Edit(
             "strength",
             "number",
             1.0,
-            "How much colour goes to what resembles no stroke: 1 colours everything, 0 leaves it grey.",
+            "How much colour is given to areas that resemble no stroke: 1 colours everything, 0 leaves them grey.",
             0,
             1,
             domain="share",
@@ -257,11 +258,11 @@ COLORIZE = Edit(
         choice(
             "method",
             ("regression", "kmeans"),
-            "Soft colours that mix between strokes, or one flat colour for each of as many pieces (k-means).",
+            "`regression`: soft colours that mix between strokes. `kmeans`: segments of one flat colour each.",
         ),
         *filter_parameters(bandwidth=40.0, share=0.5625)[:4],
     ),
-    hint="For grey photographs: paint some colours, and they spread over what looks alike nearby.",
+    hint="For grey photographs: paint some colours, and they spread over similar areas nearby.",
     brushes=(("colour", "Paint"),),
     requires_strokes=True,
     coloured=True,
@@ -269,9 +270,9 @@ COLORIZE = Edit(
 
 DEFOCUS = Edit(
     "defocus",
-    """Blur a photograph as a wide aperture would, but for the thing that you mark.
+    """Blur a photograph as a wide aperture would, except for the object that you mark.
 
-    Mark a spot of it, or of each of its parts; the rest of it is found.
+    Mark some of it, or of each of its parts; the rest of it is found automatically.
 
     Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
     """,
@@ -290,27 +291,27 @@ DEFOCUS = Edit(
         choice(
             "aperture",
             ("disc", "gaussian"),
-            "Turn dots into discs, as a lens does, or into soft spots.",
+            "`disc`: points of light become discs, as in a lens. `gaussian`: they become soft spots.",
         ),
         replace(TOLERANCE, former_names=(("bandwidth", 100 / 255),)),
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
-    hint="Paint some of what is to stay sharp; the rest of it is found, and what is around is blurred.",
+    hint="Paint on some of the object to keep sharp; the rest of it is found, and the background is blurred.",
     brushes=(("in", "Keep sharp"),),
     requires_strokes=True,
 )
 
 MASK = Edit(
     "mask",
-    """Select a thing: a soft mask of it from a scribble on it, or from a rough mask.
+    """Select an object: compute a soft mask of it from a scribble on it, or from a rough mask.
 
-    Mark some of it and, where the mask takes in too much, some of what is around. Masks are grey pictures of the
+    Mark some of it and, where the mask covers too much, some of the background. Masks are grey pictures of the
     photograph's size, white inside: 8 bits in PNG files, 16 in TIFF files, floats in PFM files, which darktable and ART
     read as raster masks.
 
     Example: `nlfilter-torch mask in.jpg mask.png --region 190,60,60,60 --background 10,10,40,40`
 
-    A rough mask to a soft one: `nlfilter-torch mask in.jpg mask.tif --mask rough.png`
+    Refine a rough mask: `nlfilter-torch mask in.jpg mask.tif --mask rough.png`
     """,
     (
         REACH,
@@ -332,11 +333,11 @@ ABSTRACT = Edit(
             "power",
             "number",
             0.1,
-            "How much detail goes: 0 none, 0.1 all but outlines, 1 much more.",
+            "How much detail is removed. 0: none, 0.1: all but outlines, 1: much more.",
             0,
             10,
             domain="not negative",
-            zero_meaning="0 leaves the image as it is",
+            zero_meaning="pass 0 to leave the image unchanged",
             idle=0.0,
             metavar="K",
             slider=Slider("Flatten", 0, 1, 0.01),
@@ -357,7 +358,7 @@ ABSTRACT = Edit(
             "edge_width",
             "number",
             0.2,
-            "Width of these lines, in hundredths of the short side.",
+            "Width of the lines along edges, in hundredths of the short side.",
             0.01,
             2,
             "%",
@@ -370,7 +371,7 @@ ABSTRACT = Edit(
             "tones",
             "count",
             None,
-            "Reduce brightness to so many tones. Left out: no such steps.",
+            "Number of tones to which brightness is reduced. Default: no reduction.",
             2,
             1 << 16,  # levels of 16 bits
             domain="count",
@@ -381,7 +382,7 @@ ABSTRACT = Edit(
         ),
         *filter_parameters(bandwidth="auto", share=0.15, patch_size=3, landmarks=200, auto=True),
     ),
-    hint="A painting of the photograph: flat areas with clear outlines.",
+    hint="Turns the photograph into a painting: flat areas with clear outlines.",
 )
 
 #: All edits, in the order in which the editor applies them.

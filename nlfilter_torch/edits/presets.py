@@ -118,13 +118,15 @@ class Preset:
         return _preset(Recipe.from_json(text, name, REMEDY), name)
 
 
-REMEDY = "make one with nlfilter-torch fit"
+REMEDY = "create one with nlfilter-torch fit"
 
 
 def _preset(recipe: Recipe, name: str) -> Preset:
     """Convert a recipe of a single detail step without strokes."""
     if [step.edit for step in recipe.steps] != ["detail"] or recipe.steps[0].strokes:
-        raise ValueError(f"{name} is no preset: it holds other steps than detail, or strokes; use nlfilter-torch apply")
+        raise ValueError(
+            f"{name} is not a preset: it must hold a single detail step without strokes; use nlfilter-torch apply"
+        )
     return Preset(**{field: recipe.steps[0][field] for field in Preset.__dataclass_fields__})
 
 
@@ -143,14 +145,14 @@ PRESETS: dict[str, Preset] = {
 
 #: Short description of each of :data:`PRESETS`.
 PURPOSES: dict[str, str] = {
-    "crisp": "all details, large and small, strongly",
-    "clear": "a little more of everything",
-    "texture": "the finest only: fur, hair, cloth, stone; grain too",
-    "dramatic": "deep light and shade; small halos at hard edges",
-    "glow": "fine detail soft, larger shapes stronger",
-    "soft skin": "pores and grain away, eyes and outlines kept",
-    "calm": "less contrast within things, as in haze",
-    "smooth": "texture away, edges kept; the start of a drawing",
+    "crisp": "stronger detail of all sizes",
+    "clear": "slightly stronger detail of all sizes",
+    "texture": "stronger finest detail only: fur, hair, cloth, stone, but also grain",
+    "dramatic": "strong light and shade; small halos at hard edges",
+    "glow": "softer fine detail, stronger large shapes",
+    "soft skin": "removes pores and grain, keeps eyes and outlines",
+    "calm": "less contrast within objects, as in haze",
+    "smooth": "removes texture, keeps edges; a start for a drawing",
 }
 
 
@@ -179,7 +181,7 @@ def find_recipe(name: str) -> Recipe:
     path = Path(name)
     if not path.is_file():
         raise ValueError(
-            f"{name} does not exist or is no file, nor is it one of the presets {', '.join(PRESETS)}; "
-            "make a file with nlfilter-torch fit"
+            f"{name} is neither a file nor one of the presets {', '.join(PRESETS)}; "
+            "create a file with nlfilter-torch fit"
         )
     return Recipe.from_json(path.read_text(encoding="utf-8", errors="replace"), name)

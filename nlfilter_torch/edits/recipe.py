@@ -136,7 +136,7 @@ class Recipe:
         if isinstance(entries, dict) and "steps" in entries:
             return Recipe(tuple(_read_steps(entries, name)))
         if not isinstance(entries, dict) or not set(entries) <= set(FORMER_ORDER):
-            raise ValueError(f"{name} is no preset: it must hold a list of steps; {remedy}")
+            raise ValueError(f"{name} is not a preset: it must hold a list of steps; {remedy}")
         former = [edit for edit in FORMER_ORDER if edit in entries]
         return Recipe(
             tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", former_format=True) for edit in former)
@@ -154,11 +154,11 @@ def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
     """Parse the steps of a file."""
     unknown = entries.keys() - {"version", "steps"}
     if unknown:
-        raise ValueError(f"{name} must hold no other entries than version, steps, got {min(unknown)}; remove it")
+        raise ValueError(f"{name} must have no entries other than version and steps, got {min(unknown)}; remove it")
     if entries.get("version") != VERSION:
         raise ValueError(
             f"version in {name} must be {VERSION}, got {shown(entries.get('version'))}; "
-            "newer files need a newer nlfilter-torch"
+            "update nlfilter-torch to read newer files"
         )
     if not isinstance(entries["steps"], list):
         raise ValueError(f"steps in {name} must be a list, got {shown(entries['steps'])}; correct it")
@@ -166,7 +166,7 @@ def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
     for number, step in enumerate(entries["steps"], 1):
         if not isinstance(step, dict) or step.get("edit") not in ORDER:
             raise ValueError(
-                f"step {number} in {name} must hold an entry edit, one of {', '.join(ORDER)}, got {shown(step)}; "
+                f"step {number} in {name} must have an entry edit, one of {', '.join(ORDER)}, got {shown(step)}; "
                 "correct it"
             )
         rest = {entry: value for entry, value in step.items() if entry != "edit"}

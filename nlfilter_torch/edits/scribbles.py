@@ -45,7 +45,9 @@ class Stroke:
             ValueError: if ``value`` is no stroke; ``place`` says in the message where it was found.
         """
         if not isinstance(value, dict) or set(value) != {"points", "radius", "paint"}:
-            raise ValueError(f"{place} must hold strokes with points, radius and paint, got {shown(value)}; correct it")
+            raise ValueError(
+                f"strokes of {place} must have the entries points, radius and paint, got {shown(value)}; correct it"
+            )
         points, radius, paint = value["points"], value["radius"], value["paint"]
         if not (isinstance(points, list) and points and all(map(_is_point, points))):
             raise ValueError(

@@ -14,7 +14,7 @@ from nlfilter_torch.edits.declaration import (
 )
 from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
 
-ALIKE = "How different two spots may be and still count as alike"
+ALIKE = "How much two places may differ and still count as similar"
 #: Arguments of the filter of an edit.
 FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 
@@ -44,28 +44,28 @@ def filter_parameters(
     far: bool = False,
 ) -> tuple[Parameter, ...]:
     """Declare the filter parameters of an edit, with its defaults; ``far`` allows ``"none"`` as spatial bandwidth."""
-    levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) touch fine texture only, large ones (40) treat "
+    levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) affect fine texture only, large ones (40) treat "
     photometric = Parameter(
         "bandwidth",
         "number",
         bandwidth,
-        levels + ("much as detail. `auto` looks at the picture." if auto else "much as one."),
+        levels + ("much as detail. `auto` estimates it from the picture." if auto else "wide areas as one."),
         *BANDWIDTHS,
         "levels",
         words=("auto",) if auto else (),
         optional=bandwidth is None,
         argument="photometric_bandwidth",
     )
-    reach = "as far as the picture goes" if share == 0 else f"{share:.2g} of the short side"
+    reach = "no limit" if share == 0 else f"{share:.2g} of the short side"
     if far:
-        reach += ". `none`: distance does not count, and large areas of light and dark are details, too"
+        reach += ". `none`: distance is ignored, and large areas of light and dark count as detail too"
     return (
         photometric,
         Parameter(
             "spatial_bandwidth",
             "number",
             None,
-            f"How far apart two spots may be and still count as alike. Left out: {reach}.",
+            f"How far apart two places may be and still count as similar. Default: {reach}.",
             *DISTANCES,
             "px",
             words=("none",) if far else (),
@@ -76,7 +76,7 @@ def filter_parameters(
             "patch_size",
             "odd",
             patch_size,
-            "Width of the patch around each spot that is compared; an odd number. 1 compares single pixels.",
+            "Width of the compared patch around each pixel, an odd number. 1 compares single pixels.",
             1,
             MAX_PATCH,
             "px",
@@ -85,7 +85,8 @@ def filter_parameters(
             "landmarks",
             "count",
             landmarks,
-            "Number of typical patches that stand for the whole picture. More are truer, slower and take more memory.",
+            "Number of typical patches that represent the whole picture. More are more accurate, but slower, and need "
+            "more memory.",
             1,
             MAX_LANDMARKS,
             argument="num_landmarks",
@@ -95,7 +96,7 @@ def filter_parameters(
             "sampling",
             "choice",
             "kmeans",
-            "How the typical patches are found: by grouping similar ones, on a regular grid, or at random.",
+            "How the typical patches are chosen: by grouping similar ones, on a regular grid, or at random.",
             choices=("kmeans", "uniform", "random"),
             argument="landmarks",
         ),
@@ -108,19 +109,19 @@ WITHOUT_SHADING = filter_parameters(bandwidth=LEVELS, share=NEAR, landmarks=LAND
 LIMITS = choice(
     "limits",
     ("soft", "none"),
-    "How far pixels may get brighter or darker: `soft` keeps what highlights and shadows show, `none` lets them clip.",
+    "Limits of brightening and darkening: `soft` keeps detail in highlights and shadows, `none` lets them clip.",
 )
 #: For all edits of brightness.
 VIEWING_SIZE = Parameter(
     "viewing_size",
     "number",
     1.5,
-    "Size at which the picture is looked at, in millions of pixels, so that the sliders do the same to it at any "
-    "resolution. In larger photographs patches and lengths are counted in pixels of that size. 0: of the file.",
+    "Size at which the picture is viewed, in megapixels, so that the sliders have the same effect at any resolution. "
+    "In larger photographs, patches and lengths are measured in pixels at that size. 0: the size of the file.",
     0,
     1e6,
     domain="not negative",
-    zero_meaning="0 is the size of the image",
+    zero_meaning="pass 0 for the size of the image",
     metavar="MEGAPIXELS",
 )
 #: For all edits that select objects.
@@ -128,7 +129,7 @@ TOLERANCE = Parameter(
     "tolerance",
     "number",
     8.0,
-    "How different two colours may be and still count as alike, in units of CIE Lab.",
+    "How much two colours may differ and still count as similar, in units of CIE Lab.",
     1,
     100,
     "lab",
@@ -139,7 +140,7 @@ REACH = Parameter(
     "reach",
     "number",
     0.6,
-    "How far a region spreads from what is alike to what is less so. 0 stays close, 0.95 goes far.",
+    "How far a region spreads to less similar areas. 0 stays close, 0.95 goes far.",
     0,
     0.999,
     domain="below 1",

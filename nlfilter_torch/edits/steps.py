@@ -44,7 +44,9 @@ class Step:
         declared = EDITS[edit]
         unknown = values.keys() - {parameter.name for parameter in declared}
         if unknown:
-            raise TypeError(f"{edit} has no parameter {min(unknown)}; it has {', '.join(p.name for p in declared)}")
+            raise TypeError(
+                f"{edit} has no parameter {min(unknown)}; its parameters are {', '.join(p.name for p in declared)}"
+            )
         given = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
         for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(given))):
             object.__setattr__(self, name, value)
@@ -144,7 +146,7 @@ class Step:
             ValueError: if an entry is unknown or invalid.
         """
         if not isinstance(entries, dict):
-            raise ValueError(f"{place} must hold entries in braces, got {shown(entries)}; correct it")
+            raise ValueError(f"{place} must be a JSON object, got {shown(entries)}; correct it")
         declared, values = EDITS[edit], dict(FORMER_DEFAULTS.get(edit, {})) if former_format else {}
         strokes: tuple[Stroke, ...] = ()
         for entry, value in entries.items():
@@ -154,7 +156,7 @@ class Step:
             found = _find(declared, entry)
             if found is None:
                 names = [*(p.name for p in declared), *(["strokes"] if declared.brushes else [])]
-                raise ValueError(f"{place} must hold no other entries than {', '.join(names)}, got {entry}; remove it")
+                raise ValueError(f"{place} must have no entries other than {', '.join(names)}, got {entry}; remove it")
             parameter, factor = found
             converted = value
             if is_within(value, -1e300, 1e300) and factor != 1:

@@ -1,1 +1,1 @@
-"""From an operator and an image to the output: filters, masks, scribbles, least-squares fits, fitted filters."""
+"""Applying an operator to images: filters, masks, scribbles, least-squares fits, fitted filters."""

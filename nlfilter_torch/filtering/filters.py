@@ -28,9 +28,9 @@ from nlfilter_torch.operator.spectrum import Response, Spectrum
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:
     """Split an image into detail layers, fine to coarse, and the smooth layer that remains.
 
-    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. With the
-    layers, other sliders need no further products with the operator: ``(alpha[:, None, None, None] * layers).sum(1)``,
-    which is what :class:`PolynomialSliders` does.
+    Paper: eq. (11), Fig. 4: ``(I - W) y, W (I - W) y, ..., W^(k-1) (I - W) y, W^k y``. Given the layers, any sliders
+    can be applied without further products with the operator: ``(alpha[:, None, None, None] * layers).sum(1)``, as
+    :meth:`PolynomialSliders.combine` does.
 
     Args:
         operator: W.
@@ -38,7 +38,7 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
         order: k, at least 1.
 
     Returns:
-        (B, k+1, C, H, W) in the image's dtype; they sum to the image, to rounding. Differentiable in image and
+        (B, k+1, C, H, W) in the image's dtype; the layers sum to the image, up to rounding. Differentiable in image and
         operator.
 
     Raises:
@@ -56,19 +56,19 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
 
 
 def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
-    """The layers in the operator's dtype: differences of ``y, W y, ..., W^k y``."""
+    """Compute the layers in the operator's dtype, as differences of ``y, W y, ..., W^k y``."""
     powers = operator.powers(image, order)  # (B, k, C, H, W)
     first = image.to(powers).unsqueeze(1).expand(powers.shape[0], -1, -1, -1, -1)
     return layers_between(torch.cat([first, powers], dim=1))
 
 
 def layers_between(smoothed: Tensor) -> Tensor:
-    """Differences of neighbours in ``y, W y, ..., W^k y`` (B, k+1, ...), followed by the last of them."""
+    """Differences of consecutive images in ``y, W y, ..., W^k y`` (B, k+1, ...), followed by the last image."""
     return torch.cat([smoothed[:, :-1] - smoothed[:, 1:], smoothed[:, -1:]], dim=1)
 
 
 def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
-    """``sum_i alpha_i y_i`` over the layers (B, k+1, C, H, W). Paper: eq. (12).
+    """Weighted sum of layers, ``sum_i alpha_i y_i``. Paper: eq. (12).
 
     Args:
         layers: (B, k+1, C, H, W).
@@ -77,10 +77,11 @@ def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
     check_alpha(alpha)
     entries = alpha.shape[-1] if alpha.ndim <= 2 else alpha.shape[1]
     if entries != layers.shape[1]:
-        raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; change one of them")
+        raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; add or drop some")
     if alpha.ndim > 1 and alpha.shape[0] != layers.shape[0] and 1 not in (alpha.shape[0], layers.shape[0]):
         raise ValueError(
-            f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; repeat it"
+            f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; "
+            "pass one row per image"
         )
     if alpha.ndim == 4:
         check_same_size(alpha, (layers.shape[-2], layers.shape[-1]), "alpha", "image")
@@ -96,25 +97,26 @@ def polynomial_filter(
 ) -> Tensor:
     """Filter an image with the sliders ``alpha``: detail, contrast and tone in one linear filter.
 
-    Paper: eq. (12), (13), by k products with W and no eigenvectors.
+    Paper: eq. (12), (13), by k products with W and without eigenvectors.
 
     Args:
         operator: W.
         image: y, (B, C, H, W).
-        alpha: weights of the layers, fine to coarse, the last of the smooth layer: (k+1,), (B, k+1) per image, or
-            (B, k+1, H, W) per pixel. Ones leave the image as it is.
-        residual: weight of what neither the eigenvectors capture nor W keeps, ``(1 - r) (y - V V^T y)`` with r the
-            operator's :attr:`~NonlocalOperator.diagonal_share` (zero without completion). None is exactly eq. (12),
-            which gives it f(r) of eq. (14), alpha_1 without completion; 0.0 drops it, which is the paper's eq. (13) and
-            Appendix B; 1.0 leaves it untouched, which sharpens less noise. A number, or a tensor of shape () or (B,).
+        alpha: weights of the layers, from fine to coarse, the last for the smooth layer: (k+1,), (B, k+1) per image, or
+            (B, k+1, H, W) per pixel. Ones leave the image unchanged.
+        residual: weight of the residual ``(1 - r) (y - V V^T y)``, which the eigenvectors do not capture and W does not
+            keep; r is the operator's :attr:`~NonlocalOperator.diagonal_share` (zero without completion). None is
+            exactly eq. (12), where the weight is f(r) of eq. (14), or alpha_1 without completion; 0.0 drops the
+            residual, as in the paper's eq. (13) and Appendix B; 1.0 leaves it unchanged, which sharpens less noise. A
+            number, or a tensor of shape () or (B,).
 
     Returns:
-        (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in all of
-        these and in the operator.
+        (B, C, H, W) in the image's dtype. Linear in ``alpha``, ``residual`` and ``image``; differentiable in the three
+        and in the operator.
 
     Raises:
-        TypeError, ValueError: if ``image`` does not fit the operator, ``alpha`` has fewer than two entries or another
-            shape, or ``residual`` is not finite or has another shape.
+        TypeError, ValueError: if ``image`` does not fit the operator, ``alpha`` has fewer than two entries or the wrong
+            shape, or ``residual`` is not finite or has the wrong shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -141,14 +143,14 @@ def polynomial_filter(
 
 
 def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, remainder: Tensor) -> Tensor:
-    """The change of a filtered image that gives the residual, the part that no eigenvector captures, its own weight.
+    """Compute the change of a filtered image that gives the residual y - V V^T y the given weight.
 
-    F maps the residual to zero, so W multiplies it by r, and the sliders have given it the weight f(r). The share r of
-    it keeps that weight: W preserves a pixel unlike all others, although no eigenvector captures it.
+    F maps the residual to zero, so W multiplies it by r, and the sliders give it the weight f(r). The share r of the
+    residual keeps this weight: W preserves a pixel unlike all others, although no eigenvector captures it.
 
     Args:
-        alpha: the sliders, of any shape that :func:`weigh_layers` takes.
-        weight: of the residual.
+        alpha: the sliders, of any shape that :func:`weigh_layers` accepts.
+        weight: weight of the residual.
         residual: (B, C, H, W).
         remainder: r, (B, 1, H, W).
     """
@@ -167,26 +169,26 @@ def spectral_filter(
     residual: float | Tensor = 0.0,
     coefficients: Tensor | None = None,
 ) -> Tensor:
-    """Filter an image with any response: ``V f(S) V^T y``, plus ``residual`` times what V does not capture.
+    """Filter an image with any response f: ``V f(S) V^T y``, plus ``residual`` times ``y - V V^T y``.
 
     Paper: eq. (10), (13), and Sec. V-D, where f is a fractional power.
 
     Args:
         spectrum: of the operator.
         image: y, (B, C, H, W).
-        response: f, an elementwise function of the eigenvalues (B, R), differentiable in torch; it may hold parameters.
+        response: f, an elementwise function of the eigenvalues (B, R), differentiable in torch; may have parameters.
         residual: weight of ``y - V V^T y``, a number or a tensor of shape () or the spectrum's (B,).
-        coefficients: ``spectrum.coefficients(image)``, computed before; with them a further response reads the factor
+        coefficients: ``spectrum.coefficients(image)``, if already computed; a further response then reads the factor
             once instead of twice. None computes them.
 
     Returns:
         (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
-        ``response``, with a finite gradient where eigenvalues are equal.
+        ``response``, with a finite gradient also if eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size,
-            ``coefficients`` are not as many as it has, ``response`` does not return a finite gain for every eigenvalue,
-            or ``residual`` is not finite or has another shape.
+            ``coefficients`` do not have the shape of those of ``image``, ``response`` does not return a finite gain for
+            every eigenvalue, or ``residual`` is not finite or has the wrong shape.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -214,27 +216,27 @@ def spectral_filter(
         check_same_size(image, spectrum.size, "image", "spectrum")
         batch, landmarks, _ = spectrum.factor.shape
         shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
-        check_shape(coefficients, shape, "coefficients", "take spectrum.coefficients of this image")
+        check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
     if isinstance(residual, int | float) and residual == 0:
         return as_given(spectrum.synthesize(response, coefficients), image)
     rho = torch.as_tensor(spectrum.among.copy_to_group(residual)).to(spectrum.root).reshape(-1, 1)
-    # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y: still two passes over the factor.
+    # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y, still in two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
     return as_given(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
 
 
 @full_precision
 def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
-    """Share of the image's energy in the span of the eigenvectors: ``|V^T y|^2 / |y|^2``.
+    """Compute the share of the image's energy in the span of the eigenvectors, ``|V^T y|^2 / |y|^2``.
 
-    Paper: eq. (19); near 1 if bandwidth and landmarks suit the image.
+    Paper: eq. (19). Near 1 if bandwidth and landmarks suit the image.
 
     Args:
         spectrum: of the operator.
         image: y, (B, C, H, W).
 
     Returns:
-        beta, (B,), in [0, 1] to rounding; 1 for a black image. Differentiable in image and operator.
+        beta, (B,), in [0, 1] up to rounding; 1 for a black image. Differentiable in image and operator.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
@@ -248,21 +250,21 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
 
 
 def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
-    """Per-pixel sliders from per-region sliders: those of the mask inside it, ones outside all masks.
+    """Compute per-pixel sliders from per-region sliders: a region's own inside its mask, ones outside all masks.
 
-    Paper: Figs. 12, 13, where eq. (12) acts inside a propagated mask. The result is an ``alpha`` of
-    :func:`polynomial_filter`; with one region it is the edit blended by its mask.
+    Paper: Figs. 12, 13, where eq. (12) acts inside a propagated mask. The result can be passed to
+    :func:`polynomial_filter` as ``alpha``; with one region this blends the filtered image by the mask.
 
     Args:
         masks: (B, K, H, W) in [0, 1] of K regions, soft or hard; normalised where their sum exceeds 1.
         alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
 
     Returns:
-        (B, k+1, H, W), ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in both.
+        (B, k+1, H, W), ``1 + sum_K masks (alpha - 1)``, in the masks' dtype. Differentiable in masks and sliders.
 
     Raises:
-        TypeError, ValueError: if ``masks`` is no such tensor or exceeds [0, 1], or ``alpha`` has another number of
-            regions.
+        TypeError, ValueError: if ``masks`` is not such a tensor or exceeds [0, 1], or ``alpha`` has a different number
+            of regions.
 
     Example:
         >>> masks = torch.tensor([1.0, 0.0, 0.5]).view(1, 1, 1, 3)
@@ -294,19 +296,19 @@ def filter_regions(
     *,
     residual: float | Tensor | None = None,
 ) -> Tensor:
-    """Filter every region with its own sliders and leave the rest of the image as it is.
+    """Filter every region with its own sliders and leave the rest of the image unchanged.
 
-    Paper: eq. (12), (13) inside masks, Figs. 12, 13. With one region it is the filtered image blended by its mask.
+    Paper: eq. (12), (13) inside masks, Figs. 12, 13. With one region the filtered image is blended by the mask.
 
     Args:
         operator: W.
         image: (B, C, H, W).
         masks: (B, K, H, W) in [0, 1], soft or hard; normalised where their sum exceeds 1.
         alpha: (K, k+1), or (B, K, k+1) per image; fine to coarse.
-        residual: of :func:`polynomial_filter`, for all regions.
+        residual: as for :func:`polynomial_filter`, for all regions.
 
     Returns:
-        (B, C, H, W) in the image's dtype, equal to it where all masks are 0. Differentiable in everything.
+        (B, C, H, W) in the image's dtype, equal to the image where all masks are 0. Differentiable in all tensors.
 
     Raises:
         TypeError, ValueError: if ``image`` does not fit the operator, or ``masks`` and ``alpha`` do not fit the image
@@ -332,19 +334,19 @@ def filter_regions(
 
 
 def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
-    """:func:`filter_regions`, where ``edit`` filters the image with sliders (B, k+1, H, W) for every pixel."""
+    """:func:`filter_regions` with any function ``edit`` that filters the image with sliders (B, k+1, H, W)."""
     inside, share = _within(masks, alpha)
     return torch.lerp(image, edit(inside), share.to(image))
 
 
 def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Sliders (B, k+1, H, W), averaged over the regions with their masks as weights, and the sum of masks."""
+    """Sliders (B, k+1, H, W), averaged over the regions with the masks as weights, and the sum of the masks."""
     total = masks.sum(1, keepdim=True)
     return compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha), total.clamp(max=1.0)
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
-    """Gain of every eigenvalue under the sliders ``alpha``: f(0) = alpha_1 and f(1) = alpha_{k+1}.
+    """Compute the gain of every eigenvalue under the sliders ``alpha``: f(0) = alpha_1 and f(1) = alpha_{k+1}.
 
     Paper: eq. (14), in the form ``sum_i alpha_i lambda^(i-1) (1 - lambda) + alpha_{k+1} lambda^k``.
 
@@ -353,7 +355,7 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
         alpha: (k+1,) or (B, k+1) with ``eigenvalues`` (B, R); fine to coarse, at least two entries.
 
     Returns:
-        (..., R), differentiable in both.
+        (..., R), differentiable in eigenvalues and sliders.
 
     Raises:
         TypeError, ValueError: if ``alpha`` is not a floating-point tensor of such a shape with at least two entries.

@@ -95,7 +95,7 @@ def fit_alpha(
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     check_instance(shared, bool, "shared", "pass True or False")
     if loss is not None and not callable(loss):
-        raise TypeError(f"loss must be a function of two images, got {type(loss).__name__}; pass it or None")
+        raise TypeError(f"loss must be a function of two images, got {type(loss).__name__}; pass a function or None")
     if loss is not None:
         operator.among.check_whole("a loss")
     check_order(order)

@@ -1,8 +1,8 @@
-"""A filter fitted to one image and applied to others: frames of a film, a set of photographs, tiles of a large one.
+"""Filters fitted to one image and applied to others: frames of a film, sets of photographs, tiles of a large picture.
 
-What W does to a pixel depends on the pixel's own patch and on a few m-vectors, which are sums over all pixels of the
-image that W was made from. With these vectors fixed, equal patches are edited equally in every frame, so an edit does
-not flicker. On the image it was fitted to, the fitted filter equals the filter.
+The effect of W on a pixel depends on the pixel's own patch and on a few vectors of length M, which are sums over all
+pixels of the image that W was made from. With these vectors fixed, equal patches are edited equally in every frame, so
+an edit does not flicker. On the image it was fitted to, the fitted filter equals the original filter.
 """
 
 from dataclasses import dataclass, replace
@@ -32,14 +32,14 @@ from nlfilter_torch.operator.scaling import PixelScaling
 
 @dataclass(frozen=True, eq=False)
 class FittedFilter:
-    """Detail layers of any image, with the landmarks, balancing and coefficients of the image it was fitted to.
+    """Filter for any image, with the landmarks, balancing and coefficients of the image it was fitted to.
 
     Made by :func:`fit_filter`.
 
     Attributes:
         kernel: landmarks, bandwidths and window.
         balancing: computes the scaling of a pixel.
-        moments: of the images ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
+        moments: moments of the images ``y, W y, ..., W^(k-1) y``, (1, k, M, C).
         captured: coefficients of the part of the image that the eigenvectors capture, (1, M, C).
     """
 
@@ -49,7 +49,7 @@ class FittedFilter:
     captured: Tensor
 
     def to(self, target: Target, dtype: torch.dtype | None = None) -> "FittedFilter":
-        """The filter on another device, or in another precision; as :meth:`NonlocalOperator.to`."""
+        """Move the filter to another device or precision, as :meth:`NonlocalOperator.to`."""
         return moved(self, target, dtype)
 
     @full_precision
@@ -61,17 +61,17 @@ class FittedFilter:
         origin: tuple[int, int] = (0, 0),
         halo: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """Detail layers (B, k+1, C, H, W) of an image of any size, as :func:`detail_layers`; they sum to the image.
+        """Compute detail layers (B, k+1, C, H, W) of an image of any size; like :func:`detail_layers`, they sum to it.
 
         Args:
-            image: (B, C, H, W), with the channels of the fitted image.
-            guide: (B, C', H, W), with the channels of the fitted guide; None is the image.
+            image: (B, C, H, W), with as many channels as the fitted image.
+            guide: (B, C', H, W), with as many channels as the fitted guide; None means the image.
             origin: row and column of the first pixel, for tiles of the fitted image.
-            halo: rows at the top and at the bottom of a tile that patches reach into but that the result does not
-                contain: half a patch, or fewer at the border of the picture.
+            halo: numbers of rows at the top and at the bottom of a tile that are read by patches but not part of the
+                result: half a patch, or fewer at the border of the picture.
 
         Raises:
-            TypeError, ValueError: if ``image`` or ``guide`` is no finite floating-point tensor or they do not fit.
+            TypeError, ValueError: if ``image`` or ``guide`` is not a finite floating-point tensor, or they do not fit.
         """
         return self._planes(image, guide, origin, halo, with_residual=False).to(image.dtype)
 
@@ -86,7 +86,7 @@ class FittedFilter:
         origin: tuple[int, int] = (0, 0),
         halo: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """The image under the sliders ``alpha``, as :func:`polynomial_filter`; see :meth:`FittedFilter.layers`."""
+        """Filter an image with the sliders ``alpha`` as :func:`polynomial_filter`; arguments as for :meth:`layers`."""
         check_tensor(image, "image", "convert it with torch.as_tensor")
         check_alpha(alpha)
         if residual is not None:
@@ -107,14 +107,16 @@ class FittedFilter:
         *,
         with_residual: bool,
     ) -> Tensor:
-        """Layers (B, k+1, C, H, W), with the residual and r as two more if asked for, in the kernel's dtype."""
+        """Layers (B, k+1, C, H, W), followed by residual and r if ``with_residual``, in the kernel's dtype."""
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
         check_pair(origin, "origin")
         check_pair(halo, "halo")
         if sum(halo) >= size[0]:
-            raise ValueError(f"halo must leave a row of the image's {size[0]}, got {tuple(halo)}; pass a taller tile")
+            raise ValueError(
+                f"halo must leave at least one of the image's {size[0]} rows, got {tuple(halo)}; pass a taller tile"
+            )
         if guide is not None:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
@@ -137,12 +139,12 @@ loadable(FittedFilter)
 
 
 def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:
-    """Detail layers (B, k+1, C, n) of some pixels.
+    """Compute detail layers (B, k+1, C, n) of some pixels.
 
     Args:
         columns: of the pixels.
-        coefficients: of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
-        image: their y, (B, C, n).
+        coefficients: moments of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
+        image: y at the pixels, (B, C, n).
     """
     rows = coefficients.to(columns.factor).transpose(2, 3)  # (1, k, C, M), for one read of the columns
     affinities = spread(rows.flatten(1, 2), columns.factor, columns.scaling).unflatten(1, rows.shape[1:3])
@@ -154,16 +156,16 @@ def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> 
 
 @full_precision
 def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> FittedFilter:
-    """Fit a filter to an image, to be applied to other images.
+    """Fit a filter to an image, for application to other images.
 
     Args:
-        operator: W, of one image or a batch of one.
-        image: y, (1, C, H, W): the image that the operator was made from, or another of its size.
+        operator: W, of one image.
+        image: y, (1, C, H, W): the image that the operator was made from, or another of the same size.
         order: k, the number of detail layers.
 
     Returns:
-        The fitted filter; on ``image`` and its guide, its layers are those of :func:`detail_layers`. Differentiable in
-        operator and image.
+        The fitted filter. For ``image`` and its guide it gives the same layers as :func:`detail_layers`. Differentiable
+        in operator and image.
 
     Raises:
         TypeError, ValueError: if ``image`` does not fit the operator, or either is a batch.
@@ -180,14 +182,14 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     check_image(image, "image")
     if operator.factor.shape[0] != 1 or image.shape[0] != 1:
         raise ValueError(
-            f"image must be one image, as the operator's must, got {image.shape[0]} and {operator.factor.shape[0]}; "
-            "fit one filter for each"
+            f"image and operator must have batch size 1, got {image.shape[0]} and {operator.factor.shape[0]}; "
+            "fit one filter per image"
         )
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = weighted(operator.scaling, operator.weights).unsqueeze(1)  # (1, 1, N)
     factor, among = operator.factor, operator.among
-    # The moment of the factor itself has a gradient.
+    # Recomputed from the factor, since the operator's own moment has no gradient.
     balancing = replace(operator.balancing, moment=among.sum(moment(factor, scaling)))
     moments = torch.stack([among.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
     captured = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]

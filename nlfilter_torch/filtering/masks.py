@@ -10,19 +10,19 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.spectrum import Spectrum
 
-FARTHEST = 60.0  # limit of the exponent: masks stay positive, so that their products and ratios are defined
-STEEPEST = 1e30  # limit of pixels / width: a distance of 0 never becomes NaN
+FARTHEST = 60.0  # limit of the exponent; keeps masks positive, so that their products and ratios are defined
+STEEPEST = 1e30  # limit of pixels / width; keeps a distance of 0 from becoming NaN
 CAPTURED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
-CHECKED = 4096  # most pixels of a region that are compared with the landmarks
-ITERATIONS = 20  # of k-means, which starts close to the solution
+CHECKED = 4096  # maximum number of pixels of a region that are compared with the landmarks
+ITERATIONS = 20  # maximum iterations of k-means, which starts close to the solution
 
 
 @full_precision
 def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
-    """Coordinates in which similar pixels lie close together: eigenvectors scaled by ``lambda^t``.
+    """Compute diffusion coordinates, in which similar pixels are close together: eigenvectors scaled by ``lambda^t``.
 
     Paper: eq. (15), with eigenvectors of unit root mean square, ``sqrt(N) v``, so that distances do not shrink as the
-    image grows; with unit-norm ones every mask is 1 to rounding. The constant eigenvector is left out.
+    image grows; with unit-norm eigenvectors every mask would be 1 up to rounding. The constant eigenvector is omitted.
 
     Args:
         spectrum: of the operator.
@@ -49,23 +49,24 @@ def diffusion_mask(
     width: float | Tensor = 4.0,
     negative: Tensor | None = None,
 ) -> Tensor:
-    """How similar every pixel is to a region: ``exp(-D_t^2 / width)``.
+    """Compute a mask of the similarity of every pixel to a region: ``exp(-D_t^2 / width)``.
 
-    Paper: eq. (16), (17), whose width is 1, with D_t the distance to the region's mean in :func:`diffusion_map`. Two
+    Paper: eq. (16), (17), where the width is 1. D_t is the distance to the region's mean in :func:`diffusion_map`. Two
     groups of pixels that W does not connect have a squared distance of at least 4, for images of any size.
 
     Args:
         spectrum: of the operator.
         region: (B, K, H, W), non-negative weights of the pixels of K regions.
         time: diffusion time t > 0, a number or a tensor of shape () or (B,); with larger values masks extend further.
-        width: squared distance at which the mask has fallen to 1/e, likewise.
-        negative: (B, 1 or K, H, W), weights of pixels that the mask avoids: it is halved where a pixel is as close to
-            them as to the region, and smaller where it is closer to them. None is no such region.
+        width: squared distance at which the mask has fallen to 1/e, a number or a tensor of shape () or (B,).
+        negative: (B, 1 or K, H, W), weights of the pixels of negative regions, which the mask avoids: the mask is
+            halved at pixels as close to the negative region as to the region, and smaller at pixels closer to it. None
+            means no negative regions.
 
     Returns:
-        (B, K, H, W) in (0, 1], in the region's dtype (float16 rounds the least to 0); without ``negative`` it grows
-        with time at every pixel.
-        Differentiable in operator, regions, time and width, also where eigenvalues are equal.
+        (B, K, H, W) in (0, 1], in the region's dtype (in float16 the smallest values round to 0). Without ``negative``
+        the mask increases with time at every pixel. Differentiable in operator, regions, time and width, also if
+        eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if a region does not fit, is negative or empty, or ``time`` or ``width`` is not positive.
@@ -90,7 +91,7 @@ def diffusion_mask(
         check_negative(others.shape[1], weights.shape[1])
         images = max(len(weights), len(others))
         weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
-    # The constant eigenvector adds nothing to distances, so it may stay, and no eigenvectors need to be chosen.
+    # The constant eigenvector does not contribute to distances, so it is kept, and no eigenvectors need to be formed.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     scale = spectrum.pixels / torch.as_tensor(spectrum.among.copy_to_group(width)).to(distances).reshape(-1, 1, 1)
     exponents = scale.clamp(max=STEEPEST) * distances
@@ -101,7 +102,7 @@ def diffusion_mask(
 
 @torch.no_grad()
 def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
-    """Warn of a region (B, K, N) unlike all landmarks: such pixels all have the diffusion coordinates 0."""
+    """Warn if a region (B, K, N) is unlike all landmarks, since all such pixels have the diffusion coordinates 0."""
     if is_hidden(weights):
         return
     for columns, regions in zip(spectrum.factor, weights.expand(len(spectrum.factor), -1, -1), strict=True):
@@ -110,22 +111,22 @@ def _warn_of_unlike(spectrum: Spectrum, weights: Tensor) -> None:
             few = places[:: 1 + len(places) // CHECKED]
             if len(few) > 0 and columns[:, few].square().sum(0).mean() < CAPTURED:
                 warn(
-                    f"region {number} is like no landmark, so its mask may take in other pixels like none; "
+                    f"region {number} resembles no landmark, so its mask may include other pixels that resemble none; "
                     "raise num_landmarks or photometric_bandwidth"
                 )
 
 
 def check_negative(count: int, regions: int) -> None:
-    """Raise unless there is one ``negative`` for all regions, or one for each."""
+    """Raise unless there is one negative region for all regions, or one for each."""
     if count not in (1, regions):
         raise ValueError(
-            f"negative must have 1 channel or the region's {regions}, got {count}; give one for all regions or one for "
-            "each"
+            f"negative must have 1 channel or those of region, {regions}, got {count}; give one for all regions "
+            "or one for each"
         )
 
 
 def mask_of_exponents(exponents: Tensor, others: Tensor | None) -> Tensor:
-    """Positive masks (B, K, N) from squared distances divided by the width, to the regions and to the negative ones."""
+    """Positive masks (B, K, N) from squared distances over width, to the regions and, ``others``, to negative ones."""
     mask = torch.exp(-exponents.clamp(max=FARTHEST))
     return mask if others is None else mask * torch.sigmoid((others - exponents).clamp(min=-20.0))
 
@@ -134,15 +135,15 @@ def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> T
     """Squared distances (B, K, N) of all pixels to the means of K regions in the coordinates ``basis @ F``.
 
     Args:
-        spectrum: with F, the scaled factor.
+        spectrum: has the scaled factor F.
         basis: (B, M, M), float64.
-        weights: of the regions, (B, K, N), each of unit sum.
+        weights: of the regions, (B, K, N), each with unit sum.
     """
     factor, scaling = spectrum.factor, spectrum.scaling.unsqueeze(1)
     centres = _sums(spectrum, basis, weights).mT.to(factor)  # (B, K, M)
     core, step = basis.to(factor), block_length(len(factor), factor.device, CACHED)
     blocks = zip(factor.split(step, dim=2), scaling.split(step, dim=2), strict=True)
-    # In blocks, since all coordinates take as much memory as the factor.
+    # In blocks, since the coordinates of all pixels take as much memory as the factor.
     return torch.cat([squared_distances((core @ columns) * scales, centres) for columns, scales in blocks], dim=2)
 
 
@@ -161,28 +162,28 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
     if not is_hidden(flat) and bool((total <= 0).any()):
         raise ValueError(
-            f"{name} must each hold a pixel of positive weight, got an empty one; paint or select some pixels"
+            f"{name} must hold a pixel of positive weight in every mask, got an empty one; paint or select some pixels"
         )
     return flat / total
 
 
 @full_precision
 def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 1.0) -> Tensor:
-    """Divide the image among K regions by k-means in the diffusion map, started from the regions' centres.
+    """Partition an image into K segments by k-means in the diffusion map, initialised with the regions' centres.
 
     Paper: Sec. V-A, Figs. 14-16.
 
     Args:
         spectrum: of the operator.
         regions: (B, K, H, W), non-negative weights of the pixels of K regions.
-        time: diffusion time t > 0; larger values weigh coarse structure more.
+        time: diffusion time t > 0; larger values give more weight to coarse structure.
 
     Returns:
-        (B, K, H, W) of zeros and ones, in the regions' dtype, with a single one for each pixel. A cluster that loses
-        all its pixels keeps its centre. Not differentiable.
+        (B, K, H, W) of zeros and ones, in the regions' dtype, with exactly one 1 per pixel. A cluster that loses all
+        its pixels keeps its centre. Not differentiable.
 
     Raises:
-        TypeError, ValueError: if ``regions`` does not fit, is negative or holds an empty one, or ``time`` is not
+        TypeError, ValueError: if ``regions`` does not fit, is negative or has an empty region, or ``time`` is not
             positive.
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
@@ -199,7 +200,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
             sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
             centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
-            if is_hidden(members):  # comparing would synchronise with the device
+            if is_hidden(members):  # a comparison would wait for the device
                 continue
             if not spectrum.among.max((previous != assignment).any().to(members)):
                 break
@@ -213,6 +214,6 @@ def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
 
 
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:
-    """Number (B, N) of the centre (B, M, K) nearest to every pixel in the coordinates ``basis @ F``."""
+    """Index (B, N) of the nearest of the centres (B, M, K) for every pixel, in the coordinates ``basis @ F``."""
     inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor, spectrum.scaling)
     return (inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)).max(1).indices  # ten times as fast as argmax

@@ -1,8 +1,8 @@
 """Linear systems over the eight neighbours of each pixel, by preconditioned conjugate gradients.
 
 With weights ``w_ij`` between neighbours and ``a_i`` of the pixels, the minimum over u of ``sum w_ij (u_i - u_j)^2 +
-sum a_i (u_i - v_i)^2`` solves ``(L + diag(a)) u = a v``, L the Laplacian of the grid: every pixel is a weighted mean of
-its neighbours and of its own value v. Nothing is outside the image.
+sum a_i (u_i - v_i)^2`` solves ``(L + diag(a)) u = a v``, where L is the Laplacian of the grid: every pixel is a
+weighted mean of its neighbours and of its own value v. Pixels at the border have fewer neighbours.
 """
 
 from collections.abc import Callable
@@ -16,15 +16,15 @@ from nlfilter_torch.core.checks import check_count, check_image, check_same_size
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.core.values import is_hidden
 
-OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns to the neighbours that follow: each pair once
+OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (row, column) offsets to half of the neighbours, so each pair occurs once
 STEPS = 300
-SOLVED = {torch.float32: 1e-6, torch.float64: 1e-12}  # residual relative to that at the start
+SOLVED = {torch.float32: 1e-6, torch.float64: 1e-12}  # residual relative to the initial one
 
 Slices = tuple[slice, slice]
 
 
 def _sides(offset: tuple[int, int]) -> tuple[Slices, Slices]:
-    """Rows and columns of the pixels that have such a neighbour, and of the neighbours."""
+    """Slices of the pixels that have a neighbour at ``offset``, and of these neighbours."""
     down, right = offset
     here = (slice(None, -down or None), slice(1, None) if right < 0 else slice(None, -right or None))
     there = (slice(down, None), slice(None, -1) if right < 0 else slice(right, None))
@@ -32,16 +32,17 @@ def _sides(offset: tuple[int, int]) -> tuple[Slices, Slices]:
 
 
 SIDES = tuple(_sides(offset) for offset in OFFSETS)
-PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from the pixels that have it to all
+PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from pixels with such a neighbour to all pixels
 
 
 def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor], *, variance: Tensor | None = None) -> Tensor:
-    """Weights between neighbours, from their squared distance.
+    """Compute weights between neighbours from their squared distances.
 
     Args:
         guide: (B, C, H, W).
-        weight: of squared distances (B, h, w), summed over the channels.
-        variance: (B, 1, H, W), positive; distances are divided by the geometric mean of that of both pixels. None is 1.
+        weight: function of squared distances (B, h, w), summed over the channels.
+        variance: (B, 1, H, W), positive; squared distances are divided by the geometric mean of the variances of both
+            pixels. None means 1.
 
     Returns:
         (B, 4, H, W): weights of each pixel with its neighbour at each of :data:`OFFSETS`, 0 where there is none.
@@ -59,20 +60,21 @@ def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor], *, vari
 def solve_neighbours(
     weights: Tensor, anchor: Tensor, values: Tensor, *, steps: int = STEPS, tolerance: float | None = None
 ) -> Tensor:
-    """The minimum over u of ``sum w_ij (u_i - u_j)^2 + sum a_i (u_i - v_i)^2``.
+    """Minimise ``sum w_ij (u_i - u_j)^2 + sum a_i (u_i - v_i)^2`` over u.
 
     Args:
-        weights: w, (B, 4, H, W), of :func:`neighbour_weights`, not negative.
-        anchor: a, (B, 1, H, W), not negative. 1e5 times the weights fixes a pixel.
-        values: v, (B, C, H, W), with which the iteration starts. A pixel without anchor and neighbours keeps its own.
-        steps: of conjugate gradients at most, about ``sqrt(weights / anchor)`` times a small number. In so many steps a
-            pixel depends on the pixels within as many rows and columns, but for the sums that all pixels share.
-        tolerance: residual, relative to that at the start, below which they end on a CPU; None is 1e-6 in float32 and
-            1e-12 in float64.
+        weights: w, (B, 4, H, W), from :func:`neighbour_weights`, non-negative.
+        anchor: a, (B, 1, H, W), non-negative. 1e5 times the weights fixes a pixel.
+        values: v, (B, C, H, W); the iteration starts from them. A pixel without anchor and neighbours keeps its value.
+        steps: maximum number of conjugate gradient steps; about ``sqrt(weights / anchor)`` times a small number is
+            needed. In n steps a pixel depends on the pixels within n rows and columns, apart from the global inner
+            products.
+        tolerance: residual, relative to the initial one, below which the iteration stops on a CPU; None means 1e-6 in
+            float32 and 1e-12 in float64.
 
     Returns:
-        u, (B, C, H, W), to that tolerance within the range of the values. Differentiable in all three, any number of
-        times.
+        u, (B, C, H, W), within the range of the values up to the tolerance. Differentiable any number of times in
+        weights, anchor and values.
 
     Raises:
         TypeError, ValueError: if the sizes differ.
@@ -95,18 +97,18 @@ def solve_neighbours(
     batch, dtype = max(len(weights), len(anchor), len(values)), working_dtype(values)
     tolerance = SOLVED[dtype] if tolerance is None else tolerance
     weights, anchor, start = (part.to(dtype).expand(batch, -1, -1, -1) for part in (weights, anchor, values))
-    # What is solved for is the difference from the values, which is small where they are fixed.
+    # Solve for the difference from the values, which is small where they are fixed.
     change = _Solution.apply(weights, anchor, -laplacian(weights, start), steps, tolerance)  # type: ignore[no-untyped-call]
     return (start + change).to(values.dtype)
 
 
 def laplacian(weights: Tensor, planes: Tensor) -> Tensor:
-    """``L u`` of planes u (B, C, H, W)."""
+    """``L u`` for planes u (B, C, H, W)."""
     return multiply(weights, degrees(weights), planes)
 
 
 def degrees(weights: Tensor) -> Tensor:
-    """The sum (B, 1, H, W) of the weights of each pixel."""
+    """Sum (B, 1, H, W) of the weights of each pixel to its neighbours."""
     total = torch.zeros_like(weights[:, :1])
     for number, (here, there) in enumerate(SIDES):
         part = weights[:, number : number + 1, *here]
@@ -116,7 +118,7 @@ def degrees(weights: Tensor) -> Tensor:
 
 
 def multiply(weights: Tensor, diagonal: Tensor, planes: Tensor) -> Tensor:
-    """``(diag(d) - w) u`` of planes u (B, C, H, W) and d (B, 1, H, W)."""
+    """``(diag(d) - w) u`` for planes u (B, C, H, W) and d (B, 1, H, W)."""
     product = diagonal * planes
     for number, (here, there) in enumerate(SIDES):
         part = weights[:, number : number + 1, *here]
@@ -126,7 +128,7 @@ def multiply(weights: Tensor, diagonal: Tensor, planes: Tensor) -> Tensor:
 
 
 class _Solution(torch.autograd.Function):
-    """The u with ``(L + diag(a)) u = right``. Its gradient takes one more such system, of the same matrix."""
+    """Solution u of ``(L + diag(a)) u = right``. The gradient takes one more solve with the same matrix."""
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, anchor: Tensor, right: Tensor, steps: int, tolerance: float) -> Tensor:
@@ -148,8 +150,8 @@ class _Solution(torch.autograd.Function):
 
 
 def conjugate_gradients(weights: Tensor, anchor: Tensor, right: Tensor, steps: int, tolerance: float) -> Tensor:
-    """The u (B, C, H, W) with ``(L + diag(a)) u = right``, for each image and channel on its own."""
-    tiny = torch.finfo(right.dtype).tiny  # where the right side is zero, so is the solution
+    """Solve ``(L + diag(a)) u = right`` for u (B, C, H, W), independently for each image and channel."""
+    tiny = torch.finfo(right.dtype).tiny  # avoids 0 / 0: if the right side is zero, so is the solution
     diagonal = degrees(weights) + anchor
     inverse = torch.where(diagonal > 0, 1 / diagonal.clamp(min=tiny), 0.0)
     solution, residual = torch.zeros_like(right), right.clone()

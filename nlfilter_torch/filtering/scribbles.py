@@ -1,11 +1,11 @@
 """Values for every pixel from scribbles, by regression in the eigenbasis. Goes beyond the paper's Sec. V-A.
 
-The values on scribbles are treated as noisy samples of a Gaussian process whose covariance is a random walk over
+The values on scribbles are treated as noisy samples of a Gaussian process whose covariance comes from random walks over
 similar pixels: ``diag(1/d) g diag(1/d)`` with ``g = W + s W^2 + s^2 W^3 + ... = W (I - s W)^-1`` and s the reach. At
-s = 0 it is the kernel K; larger s adds longer walks, so values extend further where no scribble is closer. The
-covariance g alone would give rare pixels a large variance and common ones a small one. As ``W = diag(d) U^T U diag(d)``
-on the span of the factor, the covariance of two pixels is ``u_i^T X u_j`` with the core X of :meth:`Spectrum.gain`, and
-the best estimate takes one m x m solve and no choice of eigenvectors.
+s = 0 it is the kernel K; larger s adds longer walks, so values extend further where no scribble is closer. (With g
+itself as covariance, rare pixels would have a large variance and common pixels a small one.) Since
+``W = diag(d) U^T U diag(d)`` on the span of the factor, the covariance of two pixels is ``u_i^T X u_j`` with the core X
+of :meth:`Spectrum.gain`, and the best estimate takes one M x M solve and no choice of eigenvectors.
 """
 
 from collections.abc import Callable, Iterable
@@ -29,9 +29,9 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
-DAB = 25 / 38400  # area of a dab of the brush, relative to the image: 5x5 pixels of 160x240
-NOISE = 0.08  # variance of the values of one dab, relative to that of the image
-FLOOR = 1e-12  # of eigenvalues; keeps the derivative of their square root finite
+DAB = 25 / 38400  # area of a brush dab, relative to the image: 5x5 pixels of 160x240
+NOISE = 0.08  # noise variance of the values of one dab, relative to the variance of the image
+FLOOR = 1e-12  # lower bound of eigenvalues; keeps the derivative of their square root finite
 
 ScribbledBlocks = Callable[[], Iterable[tuple[Tensor, Tensor, Tensor]]]
 
@@ -51,16 +51,18 @@ def propagate_strokes(
     Args:
         spectrum: of the operator. Coordinates in its features (``spatial_bandwidth``) make values local as well.
         strokes: c, (B, C, H, W), any values, such as chroma, selection or depth; read under the mask only.
-        stroke_mask: (B, 1, H, W) in [0, 1], the weight of a pixel.
-        strength: in [0, 1], a number or a tensor of shape () or (B,): the share of the scribbles' mean that pixels
-            similar to none of them get. At 1 every pixel gets a value, at 0 values fade to 0 with decreasing
+        stroke_mask: (B, 1, H, W) in [0, 1], the weight of each pixel.
+        strength: in [0, 1], a number or a tensor of shape () or (B,): the share of the scribbles' mean that is assigned
+            to pixels similar to no scribble. At 1 every pixel gets a value, at 0 values fade to 0 with decreasing
             similarity.
-        reach: in [0, 1), likewise: probability that a walk over similar pixels continues after a step.
-        smoothness: positive, likewise. Smaller follows the scribbles more closely, larger averages them more.
+        reach: in [0, 1), a number or a tensor of shape () or (B,): probability that a walk over similar pixels
+            continues after a step.
+        smoothness: positive, a number or a tensor of shape () or (B,). Smaller values follow the scribbles more
+            closely, larger values average them more.
 
     Returns:
-        (B, C, H, W) in the dtype of ``strokes``. Linear in ``strokes``; at strength 1 a constant comes back as itself.
-        Differentiable in operator, strokes, mask and parameters, also where eigenvalues are equal.
+        (B, C, H, W) in the dtype of ``strokes``. Linear in ``strokes``; at strength 1 constant scribbles give the same
+        constant. Differentiable in operator, strokes, mask and parameters, also if eigenvalues are equal.
 
     Raises:
         TypeError, ValueError: if sizes or batches differ, ``stroke_mask`` exceeds [0, 1] or is empty, or a parameter
@@ -94,7 +96,7 @@ def propagate_strokes(
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
-    if not weights.requires_grad:  # pixels of weight 0 matter only to the derivative by the weights
+    if not weights.requires_grad:  # pixels of weight 0 matter only for the gradient of the weights
         painted = (weights > 0).any(0).squeeze(0).nonzero().squeeze(1)
         factor, weights, values = factor[:, :, painted], weights[:, :, painted], values[:, :, painted]
     fitted = fit_strokes(
@@ -111,18 +113,18 @@ def propagate_strokes(
 
 @dataclass(frozen=True, eq=False)
 class FittedStrokes:
-    """Values of any pixel by the fitted regression, from its column of the factor alone.
+    """Fitted regression that gives the values of any pixel from its column of the factor.
 
     Attributes:
         coefficients: (B, C, M), float64.
-        share: (B, C, 1), the share of the scribbles' mean that pixels similar to none of them get.
+        share: (B, C, 1), the share of the scribbles' mean that is assigned to pixels similar to no scribble.
     """
 
     coefficients: Tensor
     share: Tensor
 
     def __call__(self, factor: Tensor) -> Tensor:
-        """Values (B, C, n) of pixels with the columns (B, M, n), before scaling."""
+        """Compute values (B, C, n) of pixels with columns (B, M, n) of the unscaled factor."""
         return self.coefficients.to(factor) @ factor + self.share.to(factor)
 
 
@@ -136,17 +138,17 @@ def fit_strokes(
     smoothness: float | Tensor,
     among: Communicator = ALONE,
 ) -> FittedStrokes:
-    """The regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
+    """Fit the regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
     Args:
-        painted: iterates at each call over all scribbled pixels, in blocks of columns of the factor (B, M, n),
-            weights (B, 1, n) and values (B, C, n).
+        painted: returns an iterable over all scribbled pixels, in blocks of columns of the factor (B, M, n), weights
+            (B, 1, n) and values (B, C, n); called more than once.
         pairs: of the operator.
         pixels: N, of the whole image.
-        strength: see there.
-        reach: see there; s of the walks.
-        smoothness: see there; scales the noise.
-        among: ranks that the rows of the image are spread over.
+        strength: as for :func:`propagate_strokes`.
+        reach: as for :func:`propagate_strokes`; s of the walks.
+        smoothness: as for :func:`propagate_strokes`; scales the noise.
+        among: ranks that the rows of the image are distributed over.
     """
     half = walk_basis(pairs, reach).mT  # R, where X = R R^T
     effective_weights = EffectiveWeights.of(painted, half, DAB * pixels, among)
@@ -161,16 +163,16 @@ def fit_strokes(
         sums = sums + (effective * known).double().sum(2)  # (B, C+1)
     gram, target, sums = (among.sum(total) for total in (gram, target, sums))
 
-    # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, and what is inverted is symmetric and positive definite.
+    # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, where the inverted matrix is symmetric and positive definite.
     inner = half.mT @ gram @ half
-    # The noise of a single pixel of a dab.
+    # Noise variance of a single pixel of a dab.
     noise = _per_image(smoothness, gram) * effective_weights.dab * effective_weights.noise
     identity = torch.eye(inner.shape[1]).to(inner)
     lower = torch.linalg.cholesky_ex(inner + noise * identity).L
     solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
 
-    # The last column extends scribbles of ones: how much each pixel is determined by them. Generalised least squares
-    # gets the mean from the residuals of both, and pixels that are not determined get their share of it.
+    # The last column extends scribbles of ones, and tells how far the scribbles determine each pixel. Generalised least
+    # squares computes the mean from the residuals of both; pixels that are not determined get a share of the mean.
     residual = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
     mean = residual[:, :-1] / residual[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
@@ -178,7 +180,7 @@ def fit_strokes(
 
 
 def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
-    """B (B, M, M) with the core ``X = B^T B``: columns u and v of the factor have the covariance ``(B u)^T (B v)``.
+    """Matrix B (B, M, M) with ``X = B^T B``: columns u and v of the factor have the covariance ``(B u)^T (B v)``.
 
     Args:
         pairs: of the operator.
@@ -192,14 +194,14 @@ def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
 class EffectiveWeights:
     """Effective weights of scribbled pixels.
 
-    So that broad scribbles or a large photograph do not outweigh a single dot, pixels similar to few other scribbled
-    pixels count for up to a whole dab. The part of a pixel that the landmarks do not capture carries no information
-    about other pixels, so pixels unlike all others have little weight.
+    Pixels similar to few other scribbled pixels count for up to a whole dab, so that broad scribbles or a large
+    photograph do not outweigh a single dot. The part of a pixel that the landmarks do not capture carries no
+    information about other pixels, so pixels unlike all others have little weight.
 
     Attributes:
         core: X, (B, M, M).
         gram: ``X G X / v`` with G the sum over the scribbled pixels and v their mean captured variance, (B, M, M).
-        dab: number of pixels in a dab of the brush.
+        dab: number of pixels in a brush dab.
         noise: variance of the values of a dab, (B, 1, 1).
     """
 
@@ -210,7 +212,7 @@ class EffectiveWeights:
 
     @staticmethod
     def of(painted: ScribbledBlocks, half: Tensor, dab: float, among: Communicator) -> "EffectiveWeights":
-        """From sums over the scribbled pixels."""
+        """Compute the attributes from sums over the scribbled pixels."""
         gram, residual, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
@@ -218,24 +220,24 @@ class EffectiveWeights:
             total = total + weights.double().sum((1, 2))
         gram, residual, total = (among.sum(part) for part in (gram, residual, total))
         core = half @ half.mT
-        variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # u^T X u, in the mean
+        variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # mean of u^T X u
         noise = NOISE * (variance + residual / total).reshape(-1, 1, 1)
         return EffectiveWeights(core, core @ gram @ core / variance.reshape(-1, 1, 1), dab, noise)
 
     def __call__(self, factor: Tensor, weights: Tensor) -> Tensor:
-        """The weights (B, 1, n) of columns (B, M, n)."""
+        """Compute the effective weights (B, 1, n) of pixels with columns (B, M, n)."""
         noise, own = self.noise.to(weights), diagonal_residual(factor) / min(self.dab, 1.0)
         weights = weights * noise / (noise + own)
         if self.dab <= 1:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
-        # The sum of squared correlations with the scribbled pixels.
+        # Sum of squared correlations with the scribbled pixels.
         similar = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
         return weights * (self.dab / similar.clamp(min=1.0)).clamp(min=1.0)
 
 
 def diagonal_residual(factor: Tensor) -> Tensor:
-    """Residual of columns (B, M, n) on the kernel's unit diagonal, (B, 1, n): 1 for a pixel like no landmark."""
+    """Residual of columns (B, M, n) on the kernel's unit diagonal, (B, 1, n): 1 for a pixel unlike all landmarks."""
     return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 
 
@@ -253,5 +255,5 @@ def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, among: Comm
 
 
 def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
-    """A number or a tensor of shape () or (B,) as (1 or B, 1, 1) in the dtype of ``like``."""
+    """Reshape a number or a tensor of shape () or (B,) to (1 or B, 1, 1) in the dtype of ``like``."""
     return torch.as_tensor(value).to(like).reshape(-1, 1, 1)

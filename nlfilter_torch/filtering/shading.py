@@ -1,5 +1,5 @@
-"""The filter whose details are without shading, for edits of brightness. Imports no torch, as help needs it."""
+"""Options of a filter whose detail layers exclude shading, for edits of brightness. Imports no torch: help reads it."""
 
 LEVELS = 20.0  # photometric bandwidth, in grey levels
-NEAR = 1 / 12  # spatial bandwidth, as a share of the short side: how far shading is compared, so that it is no detail
+NEAR = 1 / 12  # spatial bandwidth, as a fraction of the short side; excludes shading from the detail layers
 LANDMARKS = 300

@@ -63,7 +63,7 @@ def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
     modes = {"1": "L", "L": "LA" if transparent else "L", "LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
     modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
     if image.mode not in modes:
-        sentence = f"{path} is stored in {image.mode} colours, which are not handled; convert it to grey or RGB"
+        sentence = f"{path} is stored in {image.mode} colours, which are not supported; convert it to grey or RGB"
         raise tiff.UnhandledImage(sentence)
     image.load()
     return image.convert(modes[image.mode])

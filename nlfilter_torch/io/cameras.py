@@ -43,7 +43,7 @@ def read_raw(path: Path, check_size: CheckSize) -> Found:
         import rawpy
     except ImportError as error:
         raise ValueError(
-            f"{path} needs the package rawpy, as RAW files do, which is missing; install nlfilter-torch[raw]"
+            f"{path} is a RAW file and needs the package rawpy, which is not installed; install nlfilter-torch[raw]"
         ) from error
     try:
         with rawpy.imread(str(path)) as raw:
@@ -56,7 +56,7 @@ def read_raw(path: Path, check_size: CheckSize) -> Found:
                     exif = _exif_of(bytes(preview.data))
     except rawpy.LibRawError as error:
         raise tiff.UnhandledImage(
-            f"{path} is no RAW file that can be read, or is damaged; copy it again, or convert it to DNG or TIFF"
+            f"{path} cannot be read as a RAW file, or is damaged; copy it again, or convert it to DNG or TIFF"
         ) from error
     return channels, 1, None, exif
 
@@ -72,7 +72,8 @@ def read_heic(path: Path, check_size: CheckSize) -> Found:
         import pillow_heif
     except ImportError as error:
         raise ValueError(
-            f"{path} needs the package pillow-heif, as HEIC files do, which is missing; install nlfilter-torch[heic]"
+            f"{path} is an HEIC file and needs the package pillow-heif, which is not installed; "
+            "install nlfilter-torch[heic]"
         ) from error
     with tiff.decoding(path):
         picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)

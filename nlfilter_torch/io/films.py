@@ -49,7 +49,7 @@ def check_film_output(path: Path) -> str:
     check_file(path)
     kind = FILMS.get(path.suffix.lower())
     if kind is None:
-        raise ValueError(f"{path} must end in .mp4 or .mov, as films do, got {path.suffix!r}; choose one of these")
+        raise ValueError(f"{path} must end in .mp4 or .mov, got {path.suffix!r}; choose one of these")
     return kind
 
 
@@ -57,7 +57,7 @@ def _av() -> Any:
     try:
         import av
     except ImportError as error:
-        raise ValueError("films need the package av, which is missing; install nlfilter-torch[films]") from error
+        raise ValueError("films need the package av, which is not installed; install nlfilter-torch[films]") from error
     return av
 
 
@@ -107,13 +107,15 @@ class Film:
             frames: list[VideoFrame] = packet.decode()
         except av.error.FFmpegError as error:
             raise ValueError(
-                f"{self.path} is damaged after frame {number}: {error.strerror}; copy it again from where it came"
+                f"{self.path} is damaged after frame {number}: {error.strerror}; copy it again from its source"
             ) from error
         for frame in frames:
             if frame.interlaced_frame:
-                raise ValueError(f"{self.path} is interlaced, which is not handled; deinterlace it first")
+                raise ValueError(f"{self.path} is interlaced, which is not supported; deinterlace it first")
             if (frame.width, frame.height) != (self.stream.codec_context.width, self.stream.codec_context.height):
-                raise ValueError(f"{self.path} changes its size after frame {number}; cut it into films of one size")
+                raise ValueError(
+                    f"{self.path} changes its frame size after frame {number}; split it into films of one size"
+                )
         return frames
 
     def pixels(self, frame: "VideoFrame") -> Floats:
@@ -147,7 +149,7 @@ class Film:
                 found.append(self.pixels(frame))
                 last = frame.pts
         if not found:
-            raise ValueError(f"{self.path} holds no frame that can be decoded; copy it again from where it came")
+            raise ValueError(f"{self.path} holds no frame that can be decoded; copy it again from its source")
         return found
 
     def span(self) -> tuple[int, int]:
@@ -170,25 +172,25 @@ def open_film(path: Path) -> Iterator[Film]:
     try:
         container = av.open(str(path))
     except av.error.FFmpegError as error:
-        raise ValueError(f"{path} is no film that can be read, or is cut short; copy it again or convert it") from error
+        raise ValueError(f"{path} cannot be read as a film, or is cut short; copy it again or convert it") from error
     with container:
         if not container.streams:
-            raise ValueError(f"{path} is no film that can be read, or is cut short; copy it again or convert it")
+            raise ValueError(f"{path} cannot be read as a film, or is cut short; copy it again or convert it")
         streams = [
             stream for stream in container.streams.video if not stream.disposition & stream.disposition.attached_pic
         ]
         if not streams or streams[0].codec_context is None or not streams[0].codec_context.pix_fmt:
-            raise ValueError(f"{path} holds no film stream that can be decoded; name a film with pictures")
+            raise ValueError(f"{path} holds no video stream that can be decoded; choose a file with video")
         stored = path.stat().st_size
         ends = [entry.pos + entry.size for stream in container.streams for entry in stream.index_entries]
         if max(ends, default=0) > stored:
             raise ValueError(
-                f"{path} is cut short: it has {stored} of at least {max(ends)} bytes; copy it again from where it came"
+                f"{path} is cut short: it has {stored} of at least {max(ends)} bytes; copy it again from its source"
             )
         stream = streams[0]
         stream.thread_type = "AUTO"
         if stream.codec_context.format.has_palette or _has_alpha(stream.codec_context.pix_fmt):
-            raise ValueError(f"{path} has transparency or a palette, which are not handled; convert it to yuv420p")
+            raise ValueError(f"{path} has transparency or a palette, which are not supported; convert it to yuv420p")
         yield Film(path, container, stream)
 
 
@@ -226,7 +228,7 @@ def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: 
                 if isinstance(error, OSError) and error.filename:
                     raise
                 raise OSError(
-                    f"{path} cannot be written: {error.strerror}; make room there, or choose another type of film"
+                    f"{path} cannot be written: {error.strerror}; free some space there, or choose another file type"
                 ) from error
             beside.replace(path)
     return count
@@ -245,8 +247,8 @@ def _transcode(
             copied[stream.index] = output.add_stream_from_template(stream)
         except ValueError as error:
             raise ValueError(
-                f"{path} cannot hold {stream.codec_context.name} {stream.type} of {film.path}; "
-                "choose the type of that film, or convert it"
+                f"{path} cannot store the {stream.codec_context.name} {stream.type} of {film.path}; "
+                "use the file type of that film, or convert it"
             ) from error
         copied[stream.index].metadata.update(stream.metadata)
     output.metadata.update(
@@ -275,7 +277,7 @@ def _transcode(
             durations[frame.pts] = frame.duration
             put(target.encode(_stored(film, frame, edit(film.pixels(frame)), target)))
     if count == 0:
-        raise ValueError(f"{film.path} holds no frame that can be decoded; copy it again from where it came")
+        raise ValueError(f"{film.path} holds no frame that can be decoded; copy it again from its source")
     put(target.encode(None))
     return count
 

@@ -124,7 +124,7 @@ def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
     """Return the depth of a file whose channels have that dtype; raises ValueError if it is not supported."""
     if dtype.name not in BITS:
         raise ValueError(
-            f"{path} stores its channels as {dtype.name}, which is not handled; convert it to 8 or 16 bits or floats"
+            f"{path} stores its channels as {dtype.name}, which is not supported; convert it to 8 or 16 bits or floats"
         )
     return dtype.name
 
@@ -145,9 +145,9 @@ def first_bytes(path: Path) -> bytes:
         with path.open("rb") as stream:
             head = stream.read(32)
     except PermissionError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}; ask its owner, or copy it") from error
+        raise ValueError(f"{path} cannot be read: {error.strerror}; check its permissions, or copy it") from error
     if not head:
-        raise ValueError(f"{path} is empty; copy it again from where it came")
+        raise ValueError(f"{path} is empty; copy it again from its source")
     return head
 
 
@@ -228,7 +228,7 @@ def check_type(path: str | Path, depth: str, alpha: bool) -> str:
     if depth not in DEPTHS[kind]:
         others = " or ".join(name for name, depths in DEPTHS.items() if depth in depths)
         raise ValueError(
-            f"{path} cannot hold this picture: {kind} has no {BITS[depth]} a channel; "
+            f"{path} cannot hold this picture: {kind} has no {BITS[depth]} per channel; "
             f"write a {others} file or choose a depth of {BITS[DEPTHS[kind][-1]]}"
         )
     if alpha and kind == "JPEG":
@@ -254,7 +254,7 @@ def check_folder(folder: str | Path) -> None:
     """Raise ValueError unless ``folder`` is writable or can be created."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file, not a folder; name a folder for the output")
+        raise ValueError(f"{folder} is a file, not a folder; choose a folder for the output")
     _check_parent(folder / "file" if folder.exists() else folder)
 
 
@@ -298,7 +298,9 @@ def part_beside(path: Path) -> Iterator[Path]:
         if error.errno is None or not str(error.filename or beside).startswith(str(beside)):
             raise
         # A full disk, a quota or missing permission: the system's message does not name the path.
-        raise OSError(f"{path} cannot be written: {error.strerror}; make room there or write elsewhere") from error
+        raise OSError(
+            f"{path} cannot be written: {error.strerror}; free some space there or write elsewhere"
+        ) from error
     finally:
         _remove(beside)
         unfinished.discard(beside)
@@ -358,7 +360,9 @@ def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memo
     needed = width * height * bytes_per_pixel
     free = psutil.virtual_memory().available if memory is None else memory
     if needed > free:
-        limit = f"{_size(free)} is free; " if memory is None else f"{_size(free)} may be used; allow more, or "
+        limit = (
+            f"only {_size(free)} is free; " if memory is None else f"only {_size(free)} may be used; allow more, or "
+        )
         raise TooLarge(
             f"{path} has {width}x{height} pixels and needs about {_size(needed)} of memory, but {limit}"
             "use fewer landmarks, smaller patches or a smaller picture"

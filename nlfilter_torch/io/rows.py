@@ -106,8 +106,8 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
             )
         if stored.cached > memory:
             raise MemoryError(
-                f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but {memory / 1e6:.0f} MB may be "
-                "used; save it in tiles, or allow more"
+                f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but only {memory / 1e6:.0f} MB "
+                "may be used; save it in smaller tiles, or allow more memory"
             )
         yield stored
 
@@ -119,16 +119,16 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         if not path.is_dir():
             check_file(path)
             if path.exists():
-                raise ValueError(f"{path} is a file, but no array of zarr that could be replaced; choose another name")
+                raise ValueError(f"{path} is a file, not a zarr array that can be replaced; choose another name")
         elif not _holds_zarr(path):
-            raise ValueError(f"{path} is a folder, but no array of zarr that could be replaced; choose another name")
+            raise ValueError(f"{path} is a folder, not a zarr array that can be replaced; choose another name")
         return
     kind = check_type(path, depth, picture.alpha)
     needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
     if needed > memory:
         raise MemoryError(
-            f"{path} takes {needed / 1e6:.0f} MB to be put together, but {memory / 1e6:.0f} MB may be used; write a "
-            "TIFF file, or allow more"
+            f"{path} needs {needed / 1e6:.0f} MB of memory to be encoded, but only {memory / 1e6:.0f} MB may be used; "
+            "write a TIFF file, or allow more"
         )
 
 
@@ -189,7 +189,7 @@ def _zarr() -> Any:
         import zarr
     except ImportError as error:
         raise ValueError(
-            "arrays of zarr need the package zarr, which is missing; install nlfilter-torch[zarr]"
+            "zarr arrays need the package zarr, which is not installed; install nlfilter-torch[zarr]"
         ) from error
     return zarr
 
@@ -207,14 +207,14 @@ class _ZarrRows:
         try:
             return _zarr().open_array(self.path, mode="r")
         except (FileNotFoundError, KeyError, TypeError) as error:
-            raise ValueError(f"{self.path} is no array of zarr ({error}); name the folder of one") from error
+            raise ValueError(f"{self.path} is not a zarr array ({error}); choose the folder of one") from error
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         now = tuple(self._open().shape)
         if now != self.shape:
             raise ValueError(
-                f"{self.path} changed while it was read, from the shape {self.shape} to {now}; let nothing write to it "
-                "meanwhile, and start again"
+                f"{self.path} changed its shape while it was read, from {self.shape} to {now}; make sure that nothing "
+                "writes to it, and start again"
             )
         return np.asarray(self.array[rows])
 
@@ -223,7 +223,7 @@ def _open_zarr(path: Path) -> StoredPicture:
     rows = _ZarrRows(path)
     if len(rows.shape) not in (2, 3):
         raise ValueError(
-            f"{path} must have the shape (H, W) or (H, W, S), got {rows.shape}; name the array of a picture"
+            f"{path} must have the shape (H, W) or (H, W, S), got {rows.shape}; choose the array of a picture"
         )
     alpha = len(rows.shape) == 3 and rows.shape[2] in (2, 4)
     chunk = (*rows.array.chunks[:1], *rows.shape[1:])

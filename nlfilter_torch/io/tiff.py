@@ -70,11 +70,11 @@ def check_page(path: Path, page: Any) -> None:
     handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
     if page.photometric not in handled:
         name = getattr(page.photometric, "name", page.photometric)
-        raise UnhandledImage(f"{path} is stored in {name} colours, which are not handled; convert it to grey or RGB")
+        raise UnhandledImage(f"{path} is stored in {name} colours, which are not supported; convert it to grey or RGB")
     bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
     if page.dtype is None or bits != 8 * page.dtype.itemsize:
         raise UnhandledImage(
-            f"{path} has {bits} bits a channel, which is not handled; convert it to 8 or 16 bits or floats"
+            f"{path} has {bits} bits per channel, which is not supported; convert it to 8 or 16 bits or floats"
         )
     if page.axes not in ("YX", "YXS", "SYX"):
         raise UnhandledImage(f"{path} has the axes {page.axes}, which are not those of a picture; save a plain picture")
@@ -381,5 +381,5 @@ class TiffRows:
         if self._look() != self.stamp:
             raise ValueError(
                 f"{self.path} changed while it was read, from {self.stamp[0]} to {self._look()[0]} bytes; "
-                "let nothing write to it meanwhile, and start again"
+                "make sure that nothing writes to it, and start again"
             )

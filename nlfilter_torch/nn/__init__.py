@@ -1,4 +1,4 @@
-"""The functions of this package as ``torch.nn`` layers, which hold parameters and no mathematics."""
+"""The functions of this package as ``torch.nn`` layers, which hold parameters but no mathematics."""
 
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.denoiser import NonlocalDenoiser

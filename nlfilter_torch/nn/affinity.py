@@ -1,4 +1,4 @@
-"""The layer from a guide to an operator."""
+"""A layer that builds an operator from a guide."""
 
 from collections.abc import Collection
 from types import MappingProxyType
@@ -18,17 +18,17 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 
 
 class NonlocalAffinity(Learnable):
-    """From a guide to an operator: a layer around :func:`nonlocal_operator`, with its options.
+    """Layer that builds an operator from a guide by :func:`nonlocal_operator`, with the same options.
 
     Args:
-        learn: the options to learn, any of ``"photometric_bandwidth"`` and ``"spatial_bandwidth"`` (which need initial
+        learn: the options to learn: any of ``"photometric_bandwidth"`` and ``"spatial_bandwidth"`` (which need initial
             values) and ``"patch_weights"``. All stay positive.
-        **options: of :func:`nonlocal_operator`. With a ``generator`` every call draws other landmarks; do not combine
-            it with gradient checkpointing, which expects two runs of the layer to agree. A layer with a ``group``
-            cannot be pickled or copied.
+        **options: of :func:`nonlocal_operator`. With a ``generator`` every call draws different landmarks; do not
+            combine it with gradient checkpointing, which expects two runs of the layer to agree. A layer with a
+            ``group`` cannot be pickled or copied.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or an option is not one of :func:`nonlocal_operator`.
+        TypeError, ValueError: if ``learn`` has any other name, or an option is not valid for :func:`nonlocal_operator`.
     """
 
     learnable = MappingProxyType(
@@ -64,7 +64,7 @@ class NonlocalAffinity(Learnable):
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))
         check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-        Construction(num_landmarks, landmarks, completion, tolerance, generator)  # checks them
+        Construction(num_landmarks, landmarks, completion, tolerance, generator)  # checks the options
         check_group(group)
         window = unit_window(patch_size, patch_weights)
         self.patch_size = patch_size
@@ -80,17 +80,17 @@ class NonlocalAffinity(Learnable):
             check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
             if "photometric_bandwidth" in names:
                 raise ValueError(
-                    "photometric_bandwidth must be a number to learn from, got 'auto'; "
+                    "photometric_bandwidth must be a number if it is learned, got 'auto'; "
                     "pass the mean of estimate_bandwidth over a few guides"
                 )
         if spatial_bandwidth is None and "spatial_bandwidth" in names:
             raise ValueError(
-                "spatial_bandwidth must be a number of pixels to learn from, got None; "
-                "a third of the image's height is a start"
+                "spatial_bandwidth must be a number of pixels if it is learned, got None; "
+                "start with a third of the image's height"
             )
         self.start_positive("photometric_bandwidth", photometric_bandwidth, names, other=str)
         self.start_positive("spatial_bandwidth", spatial_bandwidth, names, other=type(None))
-        # Non-persistent: a fixed window is an option of the constructor, like the others.
+        # Non-persistent: a fixed window is a constructor option like the others.
         self.patch_weights: Tensor | UnitWindow | None
         if "patch_weights" in names:
             self.patch_weights = UnitWindow(window)
@@ -98,7 +98,7 @@ class NonlocalAffinity(Learnable):
             self.register_buffer("patch_weights", None if patch_weights is None else window, persistent=False)
 
     def forward(self, guide: Tensor) -> NonlocalOperator:
-        """Operator of a guide (B, C, H, W)."""
+        """Build the operator of a guide (B, C, H, W)."""
         weights = self.patch_weights
         return nonlocal_operator(
             guide,

@@ -1,4 +1,4 @@
-"""A look whose parts are learned."""
+"""A layer for looks with learned parts."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -16,21 +16,20 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 
 
 class Look(nn.Module):
-    """Image to the image under a look: what its parts, from sliders to a colour matrix, change of it is added up.
+    """Layer that applies a look to an image: the sum of the changes by its parts, from sliders to a colour matrix.
 
-    Paper: eq. (12) for the sliders. Starts from the identity, or from what :func:`fit_look` found.
+    Paper: eq. (12) for the sliders. Starts from the identity, or from the result of :func:`fit_look`.
 
     Args:
-        parts: values to start from, by the names ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K), ``matrix``
-            (3, 3) and ``saturation`` (K,), as :meth:`FittedLook.tensors` gives them; those that are left out are the
-            identity.
-        learn: names of the parts that are learned; the others are buffers.
+        parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K), ``matrix`` (3, 3) and
+            ``saturation`` (K,), as from :meth:`FittedLook.tensors`. Omitted parts start from the identity.
+        learn: names of the parts to learn; the others are buffers.
         knots: K, for curves that start from the identity.
         **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
             short side by default.
 
     Raises:
-        TypeError, ValueError: if a part has another shape or name.
+        TypeError, ValueError: if a part has the wrong shape or an unknown name.
 
     Example:
         >>> layer = Look(learn=("curves", "matrix"))
@@ -75,13 +74,13 @@ class Look(nn.Module):
         self.options = {"photometric_bandwidth": LEVELS / 255, "num_landmarks": LANDMARKS, **options}
 
     def forward(self, image: Tensor, operator: NonlocalOperator | None = None, **parts: Tensor) -> Tensor:
-        """The image under the look, (B, 3, H, W); values may leave [0, 1].
+        """Apply the look to an image: (B, 3, H, W), with values possibly outside [0, 1].
 
         Args:
             image: (B, 3, H, W) in [0, 1].
-            operator: W of its luminance, where it is known; None builds it if the sliders are not all 1.
-            **parts: values for this call in place of the layer's own, such as those that a network computes, with a
-                first dimension of B if they differ between images.
+            operator: W of the image's luminance, if available; None builds it unless the sliders are all 1.
+            **parts: values that replace the layer's own in this call, for example computed by a network, with a first
+                dimension of B if they differ between images.
         """
         check_image(image, "image", channels=3)
         check_learn(list(parts), NAMES, "parts")

@@ -1,4 +1,4 @@
-"""Layers from a spectrum and regions to masks."""
+"""Layers that compute masks from a spectrum and regions."""
 
 from collections.abc import Collection
 from types import MappingProxyType
@@ -12,15 +12,15 @@ from nlfilter_torch.operator.spectrum import Spectrum
 
 
 class DiffusionMask(Learnable):
-    """From a spectrum and regions to masks: a layer around :func:`diffusion_mask`.
+    """Layer that computes masks from a spectrum and regions by :func:`diffusion_mask`.
 
     Args:
         time: diffusion time t > 0.
         width: squared diffusion distance at which the mask has fallen to 1/e.
-        learn: what is learned, any of ``"time"`` and ``"width"``; both stay positive.
+        learn: the options to learn: any of ``"time"`` and ``"width"``; both stay positive.
 
     Raises:
-        TypeError, ValueError: if ``time`` or ``width`` is not positive, or ``learn`` has another name.
+        TypeError, ValueError: if ``time`` or ``width`` is not positive, or ``learn`` has any other name.
     """
 
     learnable = MappingProxyType({"time": "log_time", "width": "log_width"})
@@ -34,7 +34,7 @@ class DiffusionMask(Learnable):
         self.start_positive("width", width, names)
 
     def forward(self, spectrum: Spectrum, region: Tensor, negative: Tensor | None = None) -> Tensor:
-        """Masks (B, K, H, W) in (0, 1] of regions (B, K, H, W), avoiding the regions ``negative``."""
+        """Compute masks (B, K, H, W) in (0, 1] of regions (B, K, H, W) that avoid the regions ``negative``."""
         return diffusion_mask(spectrum, region, time=self.time, width=self.width, negative=negative)
 
     def extra_repr(self) -> str:
@@ -43,7 +43,7 @@ class DiffusionMask(Learnable):
 
 
 class SegmentMask(nn.Module):
-    """From a spectrum and regions to a partition: a layer around :func:`segment_mask`.
+    """Layer that partitions an image from a spectrum and regions by :func:`segment_mask`.
 
     Args:
         time: diffusion time t > 0.
@@ -58,7 +58,7 @@ class SegmentMask(nn.Module):
         self.time = time
 
     def forward(self, spectrum: Spectrum, regions: Tensor) -> Tensor:
-        """Partition (B, K, H, W) of zeros and ones from regions (B, K, H, W)."""
+        """Compute a partition (B, K, H, W) of zeros and ones from regions (B, K, H, W)."""
         return segment_mask(spectrum, regions, time=self.time)
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""Parameters that stay in their range under steps of any size."""
+"""Parameters that stay in their range under optimiser steps of any size."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -11,16 +11,16 @@ from nlfilter_torch.core.checks import check_number, check_positive, described
 
 
 class Learnable(nn.Module):
-    """A layer with options that can be learned, each a :func:`positive_option` or a :class:`UnitWindow`.
+    """Layer with options that can be learned, each a :func:`positive_option` or a :class:`UnitWindow`.
 
     Attributes:
-        learnable: from the name of such an option to that of its parameter.
+        learnable: maps the names of these options to the names of their parameters.
     """
 
     learnable: ClassVar[Mapping[str, str]]
 
     def start_positive(self, name: str, value: Any, learn: frozenset[str], *, other: type | None = None) -> None:
-        """Set a positive option, as a parameter if ``learn`` has its name; values of type ``other`` are not checked."""
+        """Initialise a positive option, as a parameter if in ``learn``; values of type ``other`` are not checked."""
         if name in learn:
             check_number(value, name, "pass the number to start from")
         if other is None or not isinstance(value, other):
@@ -31,7 +31,7 @@ class Learnable(nn.Module):
         setattr(self, f"_{name}", value)
 
     def shown(self, name: str) -> float | str | None:
-        """A positive option as ``extra_repr`` prints it."""
+        """Format a positive option for ``extra_repr``."""
         value: float | str | Tensor | None = getattr(self, name)
         return f"{value.item():.4g}" if isinstance(value, Tensor) else value
 
@@ -45,7 +45,7 @@ class Learnable(nn.Module):
         unexpected_keys: list[str],
         error_msgs: list[str],
     ) -> None:
-        """Accept names and shapes of earlier versions; report learned options that this layer does not learn."""
+        """Accept names and shapes of earlier versions; report learned options that are fixed in this layer."""
         own = dict(self.named_parameters())
         for option, parameter in self.learnable.items():
             earlier = f"{prefix}{option}.logarithm"
@@ -68,7 +68,7 @@ class Learnable(nn.Module):
 def positive_option(name: str, meaning: str) -> Any:
     """Property of a :class:`Learnable` layer: a fixed value, or the exponential of the parameter ``log_<name>``.
 
-    The exponential is positive, and steps of an optimiser become relative.
+    The exponential keeps the value positive and makes optimiser steps relative.
     """
 
     def value(layer: Learnable) -> Any:
@@ -88,7 +88,7 @@ def positive_option(name: str, meaning: str) -> Any:
 
 
 def as_vectors(state_dict: dict[str, Tensor], names: Collection[str]) -> None:
-    """Give numbers in a state_dict the shape (1,) of the parameters: FSDP shards no parameters of shape ()."""
+    """Reshape scalars in a state_dict to (1,), as the parameters, since FSDP cannot shard parameters of shape ()."""
     for name in names:
         if name in state_dict and state_dict[name].ndim == 0:
             state_dict[name] = state_dict[name].reshape(1)
@@ -101,7 +101,7 @@ class UnitWindow(nn.Module):
         logits: parameter (p, p).
     """
 
-    SMALLEST = 1e-6  # start of a weight of zero, which could not change otherwise
+    SMALLEST = 1e-6  # initial value in place of zero weights, which could not change
 
     def __init__(self, start: Tensor) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class UnitWindow(nn.Module):
 
 
 def check_learn(learn: Collection[str], choices: Sequence[str], called: str = "learn") -> frozenset[str]:
-    """The names in ``learn``, which errors call ``called``; raise ValueError if one is not among ``choices``."""
+    """Return the names in ``learn``; raise unless they are among ``choices``. Errors use the name ``called``."""
     is_collection = isinstance(learn, Collection) and not isinstance(learn, Tensor)
     if not is_collection or any(not isinstance(name, str) for name in learn):
         raise TypeError(f"{called} must be a list of names, got {described(learn)}; choose from {', '.join(choices)}")
@@ -125,7 +125,7 @@ def check_learn(learn: Collection[str], choices: Sequence[str], called: str = "l
     unknown = sorted(map(repr, names.difference(choices)))
     if unknown:
         raise ValueError(
-            f"{called} must name {', '.join(map(repr, choices))} or none of them, got {', '.join(unknown)}; "
+            f"{called} must hold only names from {', '.join(map(repr, choices))}, got {', '.join(unknown)}; "
             "choose from these"
         )
     return names

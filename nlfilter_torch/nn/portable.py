@@ -1,4 +1,4 @@
-"""A layer in the form that is exported to ONNX and to programs that run without Python."""
+"""A wrapper for exporting models to ONNX and to programs that run without Python."""
 
 from typing import Any
 
@@ -10,20 +10,20 @@ from nlfilter_torch.operator.portable import PortableForms
 
 
 class Portable(nn.Module):
-    """A model that is exported as operations of torch alone, without operators of this package.
+    """Wrapper that lets a model be exported as operations of torch alone, without custom operators of this package.
 
-    ``torch.onnx.export`` and AOTInductor take it; such programs run without Python. While it is exported, every
-    operator that the model builds is computed in a fixed number of steps: the Nystrom factor by an inverse square root
-    in place of a Cholesky factor, the scaling by Chebyshev's iteration. Results differ by rounding, but for rare images
-    in which pixels would be isolated or eigenvalues of 1 exceeded, which accelerators leave as they are, too. Otherwise
-    it is the model itself.
+    It can be passed to ``torch.onnx.export`` and AOTInductor, whose programs run without Python. In the exported
+    program, operators are built in a fixed number of steps: the Nystrom factor by an inverse square root in place of a
+    Cholesky factor, the scaling by Chebyshev iteration. Results differ by rounding only, except for rare images in
+    which isolated pixels would be removed or eigenvalues above 1 reduced; as on accelerators, this is not done. When
+    not being exported, the wrapper behaves like the model.
 
     Args:
-        module: the model, with :class:`NonlocalFilter` or other layers and functions of this package inside. Landmarks
-            by k-means are at most 256. Spectra, and with them a ``residual``, cannot be exported.
+        module: the model, which may use :class:`NonlocalFilter` and other layers and functions of this package.
+            Landmarks by k-means are limited to 256. Spectra, and therefore ``residual``, cannot be exported.
 
     Raises:
-        TypeError: if ``module`` is no module.
+        TypeError: if ``module`` is not a module.
 
     Example:
         >>> from nlfilter_torch import NonlocalFilter
@@ -39,7 +39,7 @@ class Portable(nn.Module):
         self.module = module
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """What the module returns."""
+        """Call the module."""
         if not torch.compiler.is_compiling():
             return self.module(*args, **kwargs)
         with PortableForms():

@@ -1,4 +1,4 @@
-"""Layers from an operator and an image, or an image alone, to the filtered image."""
+"""Layers that filter an image, with a given operator or with one built from the image."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Literal
@@ -16,14 +16,14 @@ LEARNABLE = ("alpha", "residual")
 
 
 class PolynomialSliders(nn.Module):
-    """From an operator and an image to the filtered image: a layer around :func:`polynomial_filter`.
+    """Layer that filters an image with a given operator by :func:`polynomial_filter`.
 
     Args:
-        alpha: initial sliders, fine to coarse; ones leave the image as it is. Paper: eq. (12). Rows of sliders, one per
-            region, are for :class:`NonlocalFilter` with masks.
-        residual: weight of what the eigenvectors do not capture; None is alpha_1. If it is learned, None starts from
-            alpha_1.
-        learn: what is learned, any of ``"alpha"`` and ``"residual"``; the others are buffers. Pass none of them if a
+        alpha: initial sliders, fine to coarse; ones leave the image unchanged. Paper: eq. (12). Rows of sliders, one
+            per region, are for :class:`NonlocalFilter` with masks.
+        residual: weight of the part that the eigenvectors do not capture; None means alpha_1. If it is learned, None
+            starts from alpha_1.
+        learn: the parameters to learn: any of ``"alpha"`` and ``"residual"``; the others are buffers. Pass none if a
             network computes ``alpha`` for every call.
 
     Attributes:
@@ -31,7 +31,7 @@ class PolynomialSliders(nn.Module):
         residual: (1,), parameter or buffer, or None.
 
     Raises:
-        TypeError, ValueError: if ``alpha`` has fewer than two finite entries, or ``learn`` another name.
+        TypeError, ValueError: if ``alpha`` has fewer than two finite entries, or ``learn`` has any other name.
     """
 
     alpha: Tensor
@@ -61,18 +61,18 @@ class PolynomialSliders(nn.Module):
                 self.register_buffer(name, value)
 
     def forward(self, operator: NonlocalOperator, image: Tensor, alpha: Tensor | None = None) -> Tensor:
-        """Filtered image (B, C, H, W) in the image's dtype.
+        """Filter an image: (B, C, H, W) in the image's dtype.
 
         Args:
             operator: W.
             image: (B, C, H, W).
-            alpha: sliders for this call instead of the layer's own: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
+            alpha: sliders that replace the layer's own in this call: (k+1,), (B, k+1) per image or (B, k+1, H, W) per
                 pixel, of any order k.
         """
         return polynomial_filter(operator, image, self.alpha if alpha is None else alpha, residual=self.residual)
 
     def combine(self, layers: Tensor, alpha: Tensor | None = None) -> Tensor:
-        """The same, with ``residual`` alpha_1, from the layers (B, k+1, C, H, W) of :func:`detail_layers`."""
+        """Filter given the layers (B, k+1, C, H, W) of :func:`detail_layers`, with alpha_1 as ``residual``."""
         check_tensor(layers, "layers")
         if layers.ndim != 5:
             raise ValueError(
@@ -81,7 +81,7 @@ class PolynomialSliders(nn.Module):
         return weigh_layers(layers, self.alpha if alpha is None else alpha)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
-        """Accept the residual of earlier versions, which was of shape ()."""
+        """Accept the residual of earlier versions, whose shape was ()."""
         as_vectors(state_dict, [f"{prefix}residual"])
         super()._load_from_state_dict(state_dict, prefix, *others)
 
@@ -93,33 +93,33 @@ class PolynomialSliders(nn.Module):
 
 
 def _sliders(alpha: Any) -> Tensor:
-    """The sliders of a constructor as a tensor of the default dtype."""
+    """Convert constructor sliders to a tensor of the default dtype."""
     try:
         return torch.as_tensor(alpha, dtype=torch.get_default_dtype()).detach().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise TypeError(
-            f"alpha must be numbers or rows of equal length of them, got {described(alpha)}; pass (1.0, 1.0, 1.0, 1.0)"
+            f"alpha must be numbers or rows of numbers of equal length, got {described(alpha)}; "
+            "pass (1.0, 1.0, 1.0, 1.0)"
         ) from None
 
 
 class NonlocalFilter(nn.Module):
-    """Image to edited image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` in one layer.
+    """Layer that filters an image: :class:`NonlocalAffinity` and :class:`PolynomialSliders` combined.
 
-    Paper: eq. (12), (13). Every call builds the operator from its guide. To try several sliders on one image, keep its
-    operator or its layers and call the two layers.
+    Paper: eq. (12), (13). Every call builds the operator from its guide. To try several sliders on one image, keep the
+    operator or the detail layers, and call :attr:`affinity` and :attr:`sliders` separately.
 
     Args:
-        alpha: initial sliders, fine to coarse; ones leave the image as it is. For K regions, K rows of them, one for
-            each mask.
-        residual: weight of what the eigenvectors do not capture; None is alpha_1.
-        learn: what is learned: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``,
-            ``"spatial_bandwidth"`` and ``"patch_weights"``; see the two layers. Gradients reach image and guide in
-            any case.
+        alpha: initial sliders, fine to coarse; ones leave the image unchanged. For K regions, K rows of sliders, one
+            for each mask.
+        residual: weight of the part that the eigenvectors do not capture; None means alpha_1.
+        learn: the parameters to learn: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``,
+            ``"spatial_bandwidth"`` and ``"patch_weights"``; see the two layers. Gradients with respect to image and
+            guide are always available.
         **options: of :func:`nonlocal_operator`.
 
     Raises:
-        TypeError, ValueError: if ``learn`` has another name, or ``alpha``, ``residual`` or an option is not as the two
-            layers take it.
+        TypeError, ValueError: if ``learn`` has any other name, or ``alpha``, ``residual`` or an option is invalid.
 
     Example:
         >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), photometric_bandwidth=0.1, num_landmarks=30)
@@ -139,7 +139,7 @@ class NonlocalFilter(nn.Module):
 
     @property
     def residual(self) -> Tensor | None:
-        """Weight of what the eigenvectors do not capture, (1,), or None for alpha_1."""
+        """Weight of the part that the eigenvectors do not capture, (1,), or None for alpha_1."""
         return self.sliders.residual
 
     @property
@@ -171,10 +171,11 @@ class NonlocalFilter(nn.Module):
         """Filter an image.
 
         Args:
-            image: (B, C, H, W), or one image (C, H, W), with guide, mask and alpha of one image, too.
-            guide: (B, C', H, W) from which the operator is built; None is the image itself.
-            mask: (B, K, H, W) in [0, 1]: one where the filter acts, zero where the image stays; None is one everywhere.
-            alpha: sliders for this call instead of the layer's own, such as those computed by a network: (k+1,),
+            image: (B, C, H, W), or one image (C, H, W); then guide, mask and alpha are also those of one image.
+            guide: (B, C', H, W) from which the operator is built; None means the image itself.
+            mask: (B, K, H, W) in [0, 1]: 1 where the image is filtered, 0 where it is unchanged; None means 1
+                everywhere.
+            alpha: sliders that replace the layer's own in this call, for example computed by a network: (k+1,),
                 (B, k+1) per image or (B, k+1, H, W) per pixel; for K > 1 masks (K, k+1) or (B, K, k+1).
 
         Returns:
@@ -185,7 +186,7 @@ class NonlocalFilter(nn.Module):
         """
         if isinstance(image, Tensor) and image.ndim == 3:
             guide, mask = _as_batch(guide), _as_batch(mask)
-            of_regions = mask is not None and mask.shape[1] > 1  # then three dimensions are (B, K, k+1)
+            of_regions = mask is not None and mask.shape[1] > 1  # then a 3-dimensional alpha is (B, K, k+1)
             return self(image.unsqueeze(0), guide, mask, alpha if of_regions else _as_batch(alpha)).squeeze(0)
         check_image(image, "image", empty=True)
         operator = self.affinity(image if guide is None else guide)
@@ -206,5 +207,5 @@ class NonlocalFilter(nn.Module):
 
 
 def _as_batch(tensor: Tensor | None) -> Tensor | None:
-    """Three dimensions, which belong to one image, as a batch of one; all else as it is."""
+    """Add a batch dimension to a tensor of three dimensions, which belongs to one image; return others unchanged."""
     return tensor.unsqueeze(0) if isinstance(tensor, Tensor) and tensor.ndim == 3 else tensor

@@ -1,4 +1,4 @@
-"""Weights from a safetensors file, checked against what a layer needs."""
+"""Reading weights from a safetensors file, with checks of names and shapes."""
 
 import json
 from collections.abc import Mapping
@@ -9,22 +9,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-LENGTH = 8  # bytes of the header's length, which come first
+LENGTH = 8  # size in bytes of the first field, the length of the header
 
 
 def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """Tensors of these names and shapes, in float32.
+    """Read float32 tensors of the given names and shapes.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or holds other tensors.
+        ValueError: if the file is damaged, or lacks a tensor of that name and shape.
     """
     try:
         content = path.read_bytes()
     except OSError as error:
         raise FileNotFoundError(
-            f"weights must be a safetensors file, but {path} cannot be read: {error.strerror}; install the "
-            "package anew, or name another file"
+            f"weights must be a safetensors file, but {path} cannot be read: {error.strerror}; reinstall "
+            "the package, or choose another file"
         ) from None
     try:
         end = LENGTH + int.from_bytes(content[:LENGTH], "little")
@@ -32,13 +32,13 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         header.pop("__metadata__", None)
         found = {name: _tensor(entry, memoryview(content)[end:]) for name, entry in header.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise ValueError(f"weights must be a whole safetensors file, but {path} is damaged: {error}") from None
+        raise ValueError(f"weights must be a complete safetensors file, but {path} is damaged: {error}") from None
     for name, shape in shapes.items():
         got = tuple(found[name].shape) if name in found else None
         if got != shape:
             raise ValueError(
                 f"weights must hold {name} of shape {shape}, but {path} has {'none' if got is None else got}; "
-                "they are of another layer"
+                "they belong to another layer"
             )
     return {name: found[name] for name in shapes}
 

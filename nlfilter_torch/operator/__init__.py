@@ -1,1 +1,1 @@
-"""Guide to W: features, landmarks, Nystrom factor, balancing, products, spectrum, operator."""
+"""From a guide to the operator W: features, landmarks, Nystrom factor, balancing, products, spectrum."""

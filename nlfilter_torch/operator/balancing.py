@@ -1,13 +1,13 @@
-"""Factor to balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
+"""Balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
-The scaling of a completed kernel comes from :mod:`~nlfilter_torch.operator.newton`, that of any other from Chebyshev's
-semi-iteration on ``log d``. On processors, damped steps of Newton's method continue where these do not converge. The
-gradient is implicit and the same for all methods.
+A kernel with a completed diagonal is balanced by Newton's method (:mod:`~nlfilter_torch.operator.newton`), any other
+kernel by Chebyshev semi-iteration on ``log d``. On CPUs, a damped Newton method continues where these do not converge.
+The gradient is implicit and the same for all methods.
 
 With ``v = log d`` the equation is ``v + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies
-in [1, 2]. The semi-iteration for that interval reduces the error by a factor of 5.8 a sweep; plain Sinkhorn iteration
-barely converges. The paper's method (``completion="none"``), whose affinities may be negative and whose scalings are
-large, is balanced this way.
+in [1, 2]. The semi-iteration for that interval reduces the error by a factor of 5.8 per sweep; plain Sinkhorn iteration
+barely converges. The semi-iteration balances the kernels of the paper's method (``completion="none"``), whose
+affinities may be negative and whose scalings are large.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,15 +31,15 @@ from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, Solution, i
 Found = TypeVar("Found", bound=Balancing)
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-# Larger residuals raise a warning, unless the tolerance allows them.
+# Larger residuals cause a warning, unless the tolerance allows them.
 ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}
-# Of the semi-iteration:
+# Chebyshev semi-iteration:
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # reading the residual would stall the queue of an accelerator
-TRUSTED = (1e-2, 1e2)  # row sums outside are clamped before their logarithm
-SMALLEST_SUM = 1e-12  # of the first guess, whose row sums may be negative
-STALL = 1e-3  # below this residual, the iteration ends after two sweeps in turn that do not halve it
-LARGEST_SCALING = 1e30  # of a pixel that no scaling balances, as its approximate affinities are negative
+TRUSTED = (1e-2, 1e2)  # row sums are clamped to this range before taking their logarithm
+SMALLEST_SUM = 1e-12  # lower bound of the initial row sums, which may be negative
+STALL = 1e-3  # below this residual, the iteration ends after two consecutive sweeps that do not halve it
+LARGEST_SCALING = 1e30  # for pixels that no scaling balances because their approximate affinities are negative
 
 
 def balance(
@@ -56,11 +56,12 @@ def balance(
     Args:
         factor: (B, M, N).
         diagonal: (B, N), non-negative.
-        tolerance: residual at which to stop; None is 1e-5 in float32 and 1e-12 in float64. On processors, a final
-            residual above it and above 1e-4 (1e-9 in float64) raises a warning.
-        completed: whether K has a unit diagonal and no negative entries but for errors; a faster method then applies.
-        among: ranks that the rows of the image are spread over.
-        weights: number of equal pixels that each point stands for, (B, N), a constant; None is one each.
+        tolerance: residual at which to stop; None means 1e-5 in float32 and 1e-12 in float64. On CPUs, a final
+            residual above both this and 1e-4 (1e-9 in float64) causes a warning.
+        completed: whether K has a unit diagonal and, up to approximation errors, no negative entries; a faster method
+            then applies.
+        among: ranks that the rows of the image are distributed over.
+        weights: number of identical pixels that each point represents, (B, N), a constant; None means one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
     scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, among, weights)  # type: ignore[no-untyped-call]
@@ -69,31 +70,31 @@ def balance(
 
 
 def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
-    """Warn, on processors, of row sums that are off by more than was asked for and more than rounding."""
+    """Warn, on CPUs, if row sums deviate from 1 by more than the tolerance and more than rounding."""
     if not is_hidden(residual) and not bool((residual <= max(tolerance or 0.0, ALARM[dtype])).all()):
         remedy = "raise photometric_bandwidth or num_landmarks" + (
             ", or use completion='diagonal'" if not completed else ""
         )
-        warn(f"balancing left row sums off by up to {residual.max().item():.1e}; {remedy}")
+        warn(f"balancing left row sums that differ from 1 by up to {residual.max().item():.1e}; {remedy}")
 
 
 def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:
-    """The residual that balancing aims at: the tolerance, or the rounding error of row sums if that is larger."""
+    """Return the target residual: the tolerance, or the rounding error of row sums if that is larger."""
     pixels = among.pixels(factor.shape[2])
-    # |u . t| is formed from terms of up to |u| |t|, and |t|^2 is at most the number of pixels.
+    # u . t is a sum of terms of magnitude up to |u| |t|, and |t|^2 is at most the number of pixels.
     return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
 
 
 class _Balance(torch.autograd.Function):
     """Implicit differentiation of ``log d + log(K d) = 0``.
 
-    Differentiated, ``(I + W) d(log d) = -diag(d) dK d``. With g the gradient of the loss in d, ``(I + W) x = d * g``
-    and ``a = d * x``, the loss changes by ``-a^T dK d``. Its gradient is ``-(z a^T + s d^T)`` in the factor, with
-    z = factor d and s = factor a, and ``-a d`` in the diagonal.
+    Differentiating gives ``(I + W) d(log d) = -diag(d) dK d``. With g the gradient of the loss with respect to d,
+    ``(I + W) x = d * g`` and ``a = d * x``, the loss changes by ``-a^T dK d``. Its gradient with respect to the factor
+    is ``-(z a^T + s d^T)``, with z = factor d and s = factor a; with respect to the diagonal it is ``-a d``.
 
-    With r = d^2 c the equation reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, which solves a system of
-    M equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`. Conjugate gradients solve it,
-    preconditioned by the approximate inverse of J from balancing.
+    With r = d^2 c the equation for x reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, the solution of M
+    equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`. They are solved by conjugate
+    gradients, preconditioned by the approximate inverse of J from balancing.
     """
 
     @staticmethod
@@ -117,13 +118,13 @@ class _Balance(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling, moment, inverse, weights = ctx.saved_tensors
         matrix = KernelMatrix(factor, diagonal, weights, ctx.among)
-        solution = Balancing(scaling, moment, scaling, 0)  # the residual takes no part
+        solution = Balancing(scaling, moment, scaling, 0)  # the residual is not used
         gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
         return *gradients, None, None, None, None
 
 
 def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
-    """Balance a kernel, by the method that suits it, and by the damped one where that fails."""
+    """Balance a kernel by the method that suits it, and continue with the damped method if that does not converge."""
     found = newton.solve(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
     goal = attainable(matrix.factor, tolerance, matrix.among)
     if not is_hidden(matrix.factor) and not bool((found.residual <= goal).all()):
@@ -134,10 +135,10 @@ def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
 def implicit_gradients(
     matrix: KernelMatrix, balancing: Balancing, inverse: Tensor, grad: Tensor, completed: bool
 ) -> tuple[Tensor, Tensor]:
-    """The gradients by factor and diagonal, given that by the scaling; see :class:`_Balance`."""
+    """Gradients with respect to factor and diagonal from that with respect to the scaling; see :class:`_Balance`."""
     factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
     scaling, total, dtype = balancing.scaling, balancing.moment, factor.dtype
-    if not completed:  # d may be 1e25 without completion, its square too large for float32
+    if not completed:  # without completion d may reach 1e25, and its square overflows float32
         factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
     share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
     weight = scaling.square() * share
@@ -153,18 +154,18 @@ def implicit_gradients(
 
 @dataclass(frozen=True)
 class Rounds(Generic[Found]):
-    """A balancing after which no pixel is isolated, and how it was found.
+    """A balancing without isolated pixels, and the rounds that led to it.
 
     Attributes:
-        factor: (B, M, N), zero at the pixels that were isolated.
-        diagonal: (B, N), 1 at these.
+        factor: (B, M, N), zero at the removed pixels.
+        diagonal: (B, N), 1 at the removed pixels.
         found: the balancing.
-        residual: largest deviation of a row sum from 1; 0 where values are hidden.
-        before: moments of the rounds in which pixels were found to be isolated.
-        removed: these pixels, (B, N) bool, or None.
+        residual: largest deviation of a row sum from 1; 0 if values are hidden.
+        before: moments of the earlier rounds, in which isolated pixels were found.
+        removed: the isolated pixels, (B, N) bool; None if there are none.
     """
 
-    MOST: ClassVar[int] = 8  # rounds; one or two are usual
+    MOST: ClassVar[int] = 8  # maximum number of rounds; one or two are usual
 
     factor: Tensor
     diagonal: Tensor
@@ -182,7 +183,7 @@ def balance_in_rounds(
     completed: bool,
     among: Communicator = ALONE,
 ) -> Rounds[Found]:
-    """Balance and remove isolated pixels until there are none, if the kernel is ``completed`` and values are shown."""
+    """Balance a kernel. If it is ``completed``, remove isolated pixels and repeat until there are none."""
     found, worst = balanced(factor, diagonal)
     before: list[Tensor] = []
     removed: Tensor | None = None
@@ -198,7 +199,7 @@ def balance_in_rounds(
 
 
 def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
-    """Weights (momentum, gradient) of the semi-iteration for a spectrum in [low, high]."""
+    """Generate the weights (momentum, gradient) of Chebyshev semi-iteration for a spectrum in [low, high]."""
     centre, radius = (high + low) / 2, (high - low) / 2
     sigma = centre / radius
     rho = 1 / sigma
@@ -209,10 +210,10 @@ def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
 
 
 def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
-    """Balance any kernel by the semi-iteration; on processors until the residual is at most ``tolerance`` or stalls."""
+    """Balance any kernel by Chebyshev semi-iteration; on CPUs until the residual reaches ``tolerance`` or stalls."""
     factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
     sums = matrix.affinities(matrix.moment(torch.ones_like(diagonal))) + diagonal
-    scaling = sums.clamp(min=SMALLEST_SUM).rsqrt()  # a first guess: (K 1)^(-1/2)
+    scaling = sums.clamp(min=SMALLEST_SUM).rsqrt()  # initial guess: (K 1)^(-1/2)
     total = matrix.moment(scaling)
     move = torch.zeros_like(scaling)
     watched = not is_hidden(factor)
@@ -220,7 +221,7 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
     for sweeps, (momentum, gain) in enumerate(chebyshev_weights(1.0, 2.0), start=1):
         current, following = total.to(factor).mT, torch.empty_like(scaling)
         next_total, residual = torch.zeros_like(total), scaling.new_zeros(scaling.shape[0])
-        # One read of the factor: while a block is cached, its row sums, its update and its part of the next moment.
+        # One read of the factor: row sums, update and contribution to the next moment while a block is in the cache.
         for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
             rows, d = factor[:, :, block], scaling[:, block]
             sums = d * (spread(current, rows).squeeze(1) + diagonal[:, block] * d)  # row sums of W
@@ -233,7 +234,7 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
         residual, next_total = among.max(residual), among.sum(next_total)
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0
-        stalled = worst < STALL and slow > 1  # by rounding; a single slow step may have other causes
+        stalled = worst < STALL and slow > 1  # because of rounding; a single slow sweep may have other causes
         if worst <= tolerance or stalled or sweeps == (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS):
             break
         scaling, total = following, next_total
@@ -260,10 +261,10 @@ def _fake_settled(
 def settle(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Balance a kernel: d (B, N), moments, residual (B,), inverse of the Jacobian, and the pixels that it removed.
+    """Balance a kernel: return d (B, N), moments, residual (B,), inverse Jacobian and a mask of the removed pixels.
 
-    The moments, one more than there may be rounds, are those of the rounds and the last one repeated. If eigenvalues
-    shall be ``bound`` and exceed 1, it warns.
+    The moments are those of the rounds, padded with copies of the last to ``Rounds.MOST + 1``. With ``bound``, warn if
+    eigenvalues exceed 1.
     """
 
     def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Any, float]:
@@ -286,7 +287,7 @@ def settle(
 def balance_in_graph(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Balancing, tuple[Tensor, ...]]:
-    """Factor and diagonal without isolated pixels, their balancing, and the moments that found these pixels."""
+    """Factor and diagonal without isolated pixels, their balancing, and the moments of the rounds before it."""
     scaling, moments, residual, inverse, removed = settle(
         factor.detach(), diagonal.detach(), tolerance, completed, bound
     )
@@ -296,7 +297,7 @@ def balance_in_graph(
 
 
 class _Settled(torch.autograd.Function):
-    """A solution d (B, N) of the balancing, which is differentiated in the factor and the diagonal."""
+    """Attach the implicit gradient in factor and diagonal to a solution d (B, N) of the balancing."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""Guide, or features, to operator: landmarks, Nystrom factor, completion, balancing. Paper: Sec. II."""
+"""Building an operator from a guide or from features: landmarks, Nystrom factor, balancing. Paper: Sec. II."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -38,7 +38,7 @@ from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScalin
 
 @dataclass(frozen=True)
 class Construction:
-    """How an operator is made from features: options of :func:`nonlocal_operator`, which are checked."""
+    """Checked options for building an operator from features; see :func:`nonlocal_operator`."""
 
     num_landmarks: int
     landmarks: Sampling
@@ -47,8 +47,8 @@ class Construction:
     generator: torch.Generator | None
 
     def __post_init__(self) -> None:
-        """Raise unless each option is as the documentation has it."""
-        remedy = "choose one of these, and pass how many there are as num_landmarks"
+        """Raise an error for an invalid option."""
+        remedy = "choose one of these, and pass the number of landmarks as num_landmarks"
         check_choice(self.landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
         check_choice(self.completion, "completion", ("diagonal", "none"))
         check_count(self.num_landmarks, "num_landmarks")
@@ -56,11 +56,11 @@ class Construction:
             check_number(self.tolerance, "tolerance", "pass a float or None")
             check_positive(self.tolerance, "tolerance")
         if self.generator is not None:
-            check_instance(self.generator, torch.Generator, "generator", "make one with torch.Generator()")
+            check_instance(self.generator, torch.Generator, "generator", "create one with torch.Generator()")
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:
-    """Whether a photometric bandwidth is one for an image in [0, 1], or ``"auto"``."""
+    """Whether a photometric bandwidth is ``"auto"`` or below 1, as for an image in [0, 1]."""
     if isinstance(bandwidth, Tensor):
         return not is_hidden(bandwidth) and bool((bandwidth.detach() < 1).all())
     return isinstance(bandwidth, str) or bandwidth < 1
@@ -70,7 +70,7 @@ def _largest(guide: Tensor) -> Tensor:
     """The largest magnitude of each image, (B,)."""
     if is_hidden(guide) or guide.shape[0] == 0:
         return guide.abs().amax((1, 2, 3))
-    return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # quicker on processors
+    return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # faster on CPUs
 
 
 @uncompiled_with("generator", "group")
@@ -90,41 +90,42 @@ def nonlocal_operator(
     generator: torch.Generator | None = None,
     group: Any = None,
 ) -> NonlocalOperator:
-    """The global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
+    """Build the global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
 
-    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, under
-    autocast too. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks
-    (for k-means, the assignment of pixels to centroids) held fixed.
+    Paper: Sec. II, eq. (1), (18), Fig. 2. Runs in float64 for a float64 guide and in float32 for all others, also under
+    autocast. Differentiable once in the guide, the bandwidths and the patch weights, with the choice of landmarks (for
+    k-means, the assignment of pixels to centroids) held fixed.
 
     Args:
-        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. One of 1 or 3
-            channels with values above 16 is worth a warning, on processors, if the bandwidth is ``"auto"`` or below 1:
-            it is probably in [0, 255].
-        patch_size: p, odd, at most 101; pixels outside the image are reflected.
+        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. On CPUs, a guide of 1
+            or 3 channels with values above 16 causes a warning if the bandwidth is ``"auto"`` or below 1, since it is
+            probably in [0, 255].
+        patch_size: p, odd, at most 101; the image is reflected at its border.
         photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
             shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
-        spatial_bandwidth: h_x in pixels, likewise; None leaves out the spatial term, so that W is fully nonlocal.
+        spatial_bandwidth: h_x in pixels, a positive number or a tensor of shape () or (B,); None leaves out the spatial
+            term, so that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
         completion: ``"diagonal"`` corrects the diagonal of the kernel to 1; ``"none"`` is the paper's method, which
             fails at small bandwidths.
-        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. Guides
-            of another number of channels are taken whole.
-        patch_weights: (p, p), non-negative, in place of the Gaussian window; scaled to unit sum.
-        tolerance: largest deviation of a row sum from 1; None is 1e-5 in float32 and 1e-12 in float64.
-        generator: source of randomness for the landmarks; None draws the same for every call. The global generator is
+        guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. A
+            guide with any other number of channels is used unchanged.
+        patch_weights: (p, p), non-negative, replaces the Gaussian window; scaled to unit sum.
+        tolerance: largest deviation of a row sum from 1; None means 1e-5 in float32 and 1e-12 in float64.
+        generator: source of randomness for the landmarks; with None every call draws the same. The global generator is
             never used.
-        group: a process group of torch.distributed over whose ranks the rows of one image are spread; ``guide`` is the
-            rows of this rank, from the top of the image down. All ranks make the same calls, and get the results of one
-            process for their own rows; see :mod:`nlfilter_torch.core.communicator`. None, or
-            ``torch.distributed.group.WORLD`` before it is initialised, means that the whole image is here.
+        group: a torch.distributed process group over whose ranks the rows of one image are distributed; ``guide`` then
+            holds the rows of this rank, in rank order from top to bottom. All ranks make the same calls, and each gets
+            the single-process result for its own rows; see :mod:`nlfilter_torch.core.communicator`. None, or
+            ``torch.distributed.group.WORLD`` before it is initialised, means that this process holds the whole image.
 
     Returns:
-        The operator, with row sums of 1 to ``tolerance`` or to rounding.
+        The operator, with row sums of 1 to within ``tolerance`` or rounding.
 
     Raises:
-        TypeError, ValueError: naming the argument, what it must be, and what it was.
-        ConnectionError: if another rank of the group is gone; it says which.
+        TypeError, ValueError: for an invalid argument; the message says what it must be and what it was.
+        ConnectionError: if another rank of the group is gone; the message names it.
 
     Example:
         >>> guide = torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(0))
@@ -148,7 +149,7 @@ def nonlocal_operator(
         warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
     among = all_gather_shapes(guide, group)
-    size = (guide.shape[2], guide.shape[3])  # here
+    size = (guide.shape[2], guide.shape[3])  # of the rows of this rank
     height, width = among.whole(size)
     weights = unit_window(patch_size, among.copy_to_group(patch_weights)).to(guide)
     guide, halo = among.with_halo(guide, max(weights.shape[0] // 2, 1))
@@ -181,29 +182,28 @@ def operator_from_features(
     generator: torch.Generator | None = None,
     group: Any = None,
 ) -> NonlocalOperator:
-    """The filter of any points, given their features: landmarks, Nystrom factor, completion and balancing.
+    """Build the filter of any points from their features: landmarks, Nystrom factor, completion and balancing.
 
     Points may be the pixels of an image, every n-th of them, a weighted sample, the voxels of a volume, a point cloud.
-    :func:`nonlocal_operator` is this function on the weighted patches of a guide.
+    :func:`nonlocal_operator` applies the same steps to the weighted patches of a guide.
 
     Args:
         features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
-        size: (H, W) with H * W = N, the shape of images that are filtered; (N,), which is (1, N), for points in no
-            order.
-        weights: (N,) or (B, N), positive: how many equal pixels each point stands for. Landmarks are drawn in
-            proportion to them. None is one each. Constant for gradients.
+        size: (H, W) with H * W = N, the shape of the images to filter; (N,), meaning (1, N), for unordered points.
+        weights: (N,) or (B, N), positive: how many identical pixels each point represents. Landmarks are drawn in
+            proportion to the weights. None means one each. Constant for gradients.
         num_landmarks: M; reduced with a warning where there are fewer points.
-        landmarks: as for :func:`nonlocal_operator`, as are ``completion``, ``tolerance``, ``generator`` and ``group``.
-        completion: see there.
-        tolerance: see there.
-        generator: see there.
-        group: see there; ``features`` and ``size`` are then of the rows of this rank.
+        landmarks: as for :func:`nonlocal_operator`.
+        completion: as for :func:`nonlocal_operator`.
+        tolerance: as for :func:`nonlocal_operator`.
+        generator: as for :func:`nonlocal_operator`.
+        group: as for :func:`nonlocal_operator`; ``features`` and ``size`` are then those of the rows of this rank.
 
     Returns:
         The operator. Differentiable once in the features.
 
     Raises:
-        TypeError, ValueError: naming the argument, what it must be, and what it was.
+        TypeError, ValueError: for an invalid argument; the message says what it must be and what it was.
 
     Example:
         >>> points = torch.rand(1, 3, 500, generator=torch.Generator().manual_seed(0))
@@ -232,7 +232,7 @@ def _assemble(
     weights: Tensor | None = None,
     among: Communicator = ALONE,
 ) -> NonlocalOperator:
-    """Features (B, D, N) to operator; ``recipe`` says how they were computed, if they come from a guide."""
+    """Build an operator from features (B, D, N); ``recipe`` computed them, if they come from a guide."""
     whole = among.whole(size)
     points, count, tolerance = whole[0] * whole[1], method.num_landmarks, method.tolerance
     if count > points:
@@ -269,7 +269,7 @@ def _assemble(
     if watched and bound and exceeds(gram, balancing.moment, allowed):
         limit = limiter(gram, KernelMatrix(factor, diagonal, weights, among).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
-        before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # keeps their products with U
+        before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
         limited = KernelMatrix(factor.detach(), diagonal.detach(), weights, among)
         sums = limited.row_sums(scaling.detach(), limited.moment(scaling.detach()))
         residual = among.max((sums - 1).abs().amax(1))

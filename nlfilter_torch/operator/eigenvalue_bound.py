@@ -1,11 +1,11 @@
-"""Keeping the eigenvalues of W from exceeding 1, and bounding them from above, through M x M matrices.
+"""Limiting the eigenvalues of W to 1, and bounding them from above, by means of M x M matrices.
 
-The entries of an approximate kernel may be negative, so that exact row sums do not imply eigenvalues of at most 1. For
-``W = F^T F + R`` and x above every r a Schur complement decides: W is at most x I exactly where the eigenvalues of
-``S = F (x I - R)^-1 F^T`` are at most 1. At x = 1 the moment ``t = F 1`` is an eigenvector of S, with eigenvalue 1, as
-``F^T t = 1 - r``. Dividing the larger eigenvalues of S by themselves therefore leaves row sums as they are: with
-``X = min(1, S^-1)`` the operator ``F^T X F + R`` is symmetric, has unit row sums and eigenvalues in [0, 1], and differs
-from W only along what exceeded 1.
+The entries of an approximate kernel may be negative, so unit row sums do not imply eigenvalues of at most 1. For
+``W = F^T F + R`` and x above every r, the Schur complement gives a criterion: no eigenvalue of W exceeds x if and only
+if the eigenvalues of ``S = F (x I - R)^-1 F^T`` are at most 1. At x = 1 the moment ``t = F 1`` is an eigenvector of S
+with eigenvalue 1, since ``F^T t = 1 - r``. Reducing the larger eigenvalues of S to 1 therefore preserves the row sums:
+with ``X = min(1, S^-1)`` the operator ``F^T X F + R`` is symmetric, has unit row sums and eigenvalues in [0, 1], and
+differs from W only in the directions whose eigenvalues of S exceed 1.
 """
 
 from collections.abc import Callable
@@ -17,26 +17,26 @@ from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator.spectrum import compute_grams
 
-# By how much eigenvalues may exceed 1 through rounding and inexact row sums; r of a pixel exceeds 1 by less.
+# Amount by which eigenvalues may exceed 1 through rounding and inexact row sums; r exceeds 1 by less.
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}
 MAX_STEPS = 12
-ALWAYS = 1 << 22  # numbers of a factor; up to here the bound takes a few milliseconds
+ALWAYS = 1 << 22  # elements of a factor; up to this size the bound takes a few milliseconds
 
-# (x, k) to ``F (x I - R)^-k F^T``, (B, M, M) in float64, for x (B,)
+# Maps (x, k), x of shape (B,), to ``F (x I - R)^-k F^T``, (B, M, M) in float64.
 ShiftedGram = Callable[[Tensor, int], Tensor]
 
 
 def is_bounded(sampling: str, pixels: int, num_landmarks: int) -> bool:
-    """Whether the eigenvalues of an operator are bounded when it is built.
+    """Whether the eigenvalues of an operator are checked against 1 when it is built.
 
-    Those of large images with landmarks from k-means are not: in thousands of them, of photographs and of adversarial
-    images, none exceeded 1, and the bound would add a third to the time of an operator.
+    They are not for large images with k-means landmarks: among thousands of such operators, of photographs and of
+    adversarial images, no eigenvalue exceeded 1, and the check would add a third to the time of building one.
     """
     return sampling != "kmeans" or pixels * num_landmarks <= ALWAYS
 
 
 def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, among: Communicator) -> ShiftedGram:
-    """The matrices S of an image in memory: factor (B, M, N), d (B, N), r (B, N); differentiable."""
+    """Function that computes S for factor (B, M, N), d (B, N) and r (B, N) in memory; differentiable."""
 
     def gram(at: Tensor, power: int) -> Tensor:
         weights = shift(at, remainder).pow(-power / 2)
@@ -46,30 +46,30 @@ def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, among: Comm
 
 
 def shift(at: Tensor, remainder: Tensor) -> Tensor:
-    """``x - r``, (B, N) in float64, kept from zero."""
+    """``x - r``, (B, N) in float64, clamped to at least 1e-9."""
     return (at.unsqueeze(1) - remainder.double()).clamp(min=1e-9)
 
 
 def slack(dtype: torch.dtype, residual: float) -> float:
-    """By how much eigenvalues may exceed 1 where row sums are off by up to ``residual``."""
+    """Amount by which eigenvalues may exceed 1 if row sums deviate from 1 by up to ``residual``."""
     return max(SLACK[dtype], residual)
 
 
 @torch.no_grad()
 def exceeds(gram: ShiftedGram, moment: Tensor, slack: float) -> bool:
-    """Whether an eigenvalue of W exceeds 1 by more than ``slack``, for any image of a batch; see :func:`limiter`."""
+    """Whether an eigenvalue of W exceeds 1 by more than ``slack``, for any image of a batch."""
     matrix = gram(torch.full_like(moment[:, 0, 0], 1 + slack), 1)
     identity = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
     return bool((torch.linalg.cholesky_ex(identity - matrix).info != 0).any())
 
 
 def limiter(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:
-    """The ``X^(1/2)`` (B, M, M) in float64 by which the factor is multiplied for no eigenvalue to exceed 1 + ``slack``.
+    """Compute ``X^(1/2)``, (B, M, M) in float64; multiplying the factor by it limits eigenvalues to 1 + ``slack``.
 
-    Differentiable in what the matrices S and the moment t = F 1, (B, M, 1) in float64, are.
+    Differentiable in whatever ``gram`` and the moment t = F 1, (B, M, 1) in float64, depend on.
     """
     matrix = gram(torch.full_like(moment[:, 0, 0], 1 + slack), 1)
-    # t is an eigenvector up to the slack; made one exactly, it keeps the row sums exact.
+    # t is an eigenvector up to the slack. Projecting it out makes it an exact one, which keeps the row sums exact.
     unit = moment / moment.norm(dim=1, keepdim=True).clamp(min=torch.finfo(moment.dtype).tiny)
     others = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device) - unit @ unit.mT
     matrix = others @ torch.where(matrix.isfinite(), matrix, torch.zeros_like(matrix)) @ others
@@ -80,12 +80,12 @@ def limiter(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:
 
 
 def largest_eigenvalue(gram: ShiftedGram, remainder: Tensor, dtype: torch.dtype) -> Tensor:
-    """An upper bound of the eigenvalues of W, (B,) in float64: 1 if none exceeds 1 but for rounding.
+    """Upper bound of the eigenvalues of W, (B,) in float64: 1 if none exceeds 1 by more than rounding.
 
-    It takes the matrices S of W, the largest r of each image, (B,), and the dtype of the factor.
+    ``remainder`` is the largest r of each image, (B,), and ``dtype`` that of the factor.
     """
     limit = 1 + SLACK[dtype]
-    # Right above the largest r the matrix is singular; where r exceeds 1, the bound is a thousandth above it.
+    # S is singular at the largest r. If that exceeds the limit, start a thousandth above it.
     at = torch.where(remainder < limit, limit, 1.001 * remainder.double())
     matrix = gram(at, 1)
     identity = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
@@ -97,7 +97,7 @@ def largest_eigenvalue(gram: ShiftedGram, remainder: Tensor, dtype: torch.dtype)
         exceeds = finite & (largest > limit)
         if not bool(exceeds.any()):
             break
-        # The Rayleigh quotient of (x I - R)^-1 F^T v; it converges quadratically from below.
+        # Rayleigh quotient of (x I - R)^-1 F^T v; converges quadratically from below.
         length = (vector.mT @ gram(at, 2) @ vector)[:, 0, 0]
         at = torch.where(exceeds, at + (largest.square() - largest) / length, at)
         matrix = gram(at, 1)

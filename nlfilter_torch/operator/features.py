@@ -1,6 +1,6 @@
-"""Guide image to features: weighted patches and coordinates, scaled by the bandwidths. Paper: eq. (1), (18).
+"""Features of a guide image: weighted patches and coordinates, scaled by the bandwidths. Paper: eq. (1), (18).
 
-Also the photometric bandwidth that suits an image. Paper: Appendix A, eq. (20).
+Also the estimate of the photometric bandwidth. Paper: Appendix A, eq. (20).
 """
 
 import math
@@ -32,7 +32,7 @@ Bandwidth = float | Tensor | None
 def patch_window(patch_size: int) -> Tensor:
     """Gaussian patch weights of unit sum, (patch_size, patch_size), sigma = patch_size / 4.
 
-    With unit sum the photometric bandwidth is in grey levels of the guide whatever the patch size.
+    Because of the unit sum, the photometric bandwidth is in grey levels of the guide for any patch size.
     """
     profile = torch.signal.windows.gaussian(patch_size, std=patch_size / 4, dtype=torch.float64)
     window = torch.outer(profile, profile)
@@ -40,7 +40,7 @@ def patch_window(patch_size: int) -> Tensor:
 
 
 def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
-    """The weights of the patch (p, p), of unit sum."""
+    """Patch weights (p, p) scaled to unit sum; the Gaussian window if none are given."""
     check_patch_size(patch_size)
     if patch_weights is None:
         return patch_window(patch_size)
@@ -53,18 +53,19 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
         )
     if len(patch_weights) > LARGEST_PATCH:
         raise ValueError(
-            f"patch_weights must have at most {LARGEST_PATCH} rows, got {len(patch_weights)}; reduce the image instead"
+            f"patch_weights must have at most {LARGEST_PATCH} rows, got {len(patch_weights)}; "
+            "downscale the image instead"
         )
     check_finite(patch_weights, "patch_weights")
     if not is_hidden(patch_weights) and not bool((patch_weights >= 0).all() & (patch_weights.sum() > 0)):
         raise ValueError(
-            "patch_weights must be non-negative with a positive sum, got others; take their softmax or square"
+            "patch_weights must be non-negative with a positive sum, got other values; take their softmax or square"
         )
     return patch_weights / patch_weights.sum()
 
 
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
-    """(B, 3, H, W) to luminance (B, 1, H, W) unless ``guide_channels`` is ``"all"``; other guides are taken whole."""
+    """Reduce three channels to luminance (B, 1, H, W) unless ``guide_channels`` is ``"all"``; keep other guides."""
     if guide_channels == "luminance" and guide.shape[1] == 3:
         from kornia.color import rgb_to_grayscale  # importing kornia takes half a second
 
@@ -82,28 +83,28 @@ def extract_features(
     halo: tuple[int, int] = (0, 0),
     stride: int = 1,
 ) -> Tensor:
-    """Features whose squared distance is the exponent of the kernel: ``K_ij = exp(-||x_i - x_j||^2)``.
+    """Compute features that define the kernel by their squared distances: ``K_ij = exp(-||x_i - x_j||^2)``.
 
-    Paper: eq. (1), with the mean over channels where the guide has several, and eq. (18).
+    Paper: eq. (1), with the mean over channels if the guide has several, and eq. (18).
 
     Args:
-        guide: (B, C, H, W), already reduced to the channels that are compared.
+        guide: (B, C, H, W), already reduced to the channels to be compared.
         patch_weights: (p, p), non-negative, of unit sum; differentiable.
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
-        spatial_bandwidth: h_x in pixels, likewise; None leaves the coordinates out.
+        spatial_bandwidth: h_x in pixels, a number or a tensor of shape () or (B,); None leaves out the coordinates.
         origin: coordinates (row, column) of the first pixel.
-        halo: rows at the top and at the bottom that patches reach into, but that get no features themselves.
-        stride: n, to take only the pixel in the middle of each whole square of n x n pixels.
+        halo: numbers of rows at the top and at the bottom that are read by patches but get no features themselves.
+        stride: n, to use only the pixel in the middle of each complete square of n x n pixels.
 
     Returns:
-        (B, D, N) with D = C p^2, plus 2 with coordinates, N pixels in the rows without the halo. Pixels come last: each
+        (B, D, N) with D = C p^2, plus 2 with coordinates; N counts the pixels outside the halo. Pixels come last: each
         feature is a plane.
     """
     batch, channels, height, width = guide.shape
     size = patch_weights.shape[0]
     scale = patch_weights.to(guide).div(channels).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
     padded = pad_border(guide, size // 2)
-    # Rows of the halo replace reflected ones; a halo shorter than the margin ends at the border of the image.
+    # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
     padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
     features: Tensor = (
         _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
@@ -121,7 +122,7 @@ def extract_features(
 
 
 def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:
-    """Weighted patches (B, C p^2, n) of every ``stride``-th pixel of a padded image."""
+    """Weighted patches (B, C p^2, n) of every ``stride``-th pixel of a padded image, along both axes."""
     size, first = scale.shape[-1], (stride - 1) // 2
     height, width = ((length - size + 1) // stride for length in padded.shape[-2:])
     patches = padded.unfold(2, size, 1).unfold(3, size, 1)[:, :, first::stride, first::stride]
@@ -130,7 +131,7 @@ def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:
 
 
 class _ScaledPatches(torch.autograd.Function):
-    """A plane for each offset of the patch: a shifted copy of the image times the weight of that offset."""
+    """One plane per patch offset: the image shifted by the offset, times the weight of the offset."""
 
     @staticmethod
     def forward(ctx: Any, padded: Tensor, scale: Tensor) -> Tensor:
@@ -161,7 +162,7 @@ class _ScaledPatches(torch.autograd.Function):
 
 
 def pad_border(image: Tensor, margin: int) -> Tensor:
-    """Pad by reflection; an axis that is too short to be reflected is replicated."""
+    """Pad by reflection, or by replication along an axis that is too short for reflection."""
     height, width = image.shape[-2:]
     for pad, length in (((margin, margin, 0, 0), width), ((0, 0, margin, margin), height)):
         image = F.pad(image, pad, mode="reflect" if length > margin else "replicate")
@@ -169,13 +170,13 @@ def pad_border(image: Tensor, margin: int) -> Tensor:
 
 
 def blur_margin(sigma: float) -> int:
-    """How many pixels around a pixel :func:`blur` reads."""
+    """Radius, in pixels, of the neighbourhood that :func:`blur` reads."""
     return math.ceil(3 * sigma)
 
 
 def blur(planes: Tensor, sigma: float) -> Tensor:
-    """Planes (B, C, H, W) under a Gaussian of that many pixels, reflected at the border."""
-    from kornia.filters import gaussian_blur2d  # kornia takes half a second to import
+    """Blur planes (B, C, H, W) by a Gaussian of ``sigma`` pixels, with reflection at the border."""
+    from kornia.filters import gaussian_blur2d  # importing kornia takes half a second
 
     margin = blur_margin(sigma)
     size = 2 * margin + 1
@@ -188,22 +189,22 @@ def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1)
 
 
-# The paper's 0.6 belongs to its own patch weights, whose squares sum to 0.056; under weights of unit sum the same
-# kernel has a bandwidth larger by 1 / sqrt(0.056) = 4.2, hence 2.5.
+# The paper's 0.6 applies to its own patch weights, whose squares sum to 0.056; with weights of unit sum the same kernel
+# has a bandwidth larger by a factor of 1 / sqrt(0.056) = 4.2, hence 2.5.
 FACTOR = 2.5
-SMALLEST = 1.0 / 255.0  # a flat image has no gradient; one grey level keeps the kernel defined
+SMALLEST = 1.0 / 255.0  # one grey level; keeps the kernel defined for a constant image, whose gradient is zero
 
 
 @full_precision
 def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "luminance", group: Any = None) -> Tensor:
-    """Photometric bandwidth h_y: 2.5 times the mean gradient magnitude, at least one grey level of 255.
+    """Estimate the photometric bandwidth h_y: 2.5 times the mean gradient magnitude, at least 1 / 255.
 
-    Paper: eq. (20), whose 1/n is read as the mean (outside the root it would make the bandwidth shrink with the image).
+    Paper: eq. (20), with 1/n read as a mean (outside the root the bandwidth would decrease with image size).
 
     Args:
         guide: (B, C, H, W) in [0, 1].
         guide_channels: ``"luminance"`` reduces three channels to one; ``"all"`` takes the mean over channels.
-        group: as of :func:`nonlocal_operator`: ``guide`` is then the rows of this rank.
+        group: as for :func:`nonlocal_operator`; ``guide`` then holds the rows of this rank.
 
     Returns:
         (B,), in units of the guide, without a gradient.
@@ -212,7 +213,7 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
         TypeError, ValueError: if ``guide`` is not a finite floating-point (B, C, H, W) tensor.
 
     Example:
-        >>> estimate_bandwidth(torch.linspace(0, 1, 101).expand(1, 1, 8, 101)) * 255  # a slope of 0.01 a pixel
+        >>> estimate_bandwidth(torch.linspace(0, 1, 101).expand(1, 1, 8, 101)) * 255  # a slope of 0.01 per pixel
         tensor([6.3119])
     """
     check_image(guide, "guide", empty=True)
@@ -224,7 +225,7 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
 
 
 def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], among: Communicator) -> Tensor:
-    """:func:`estimate_bandwidth` from some rows of an image with a halo of neighbouring rows."""
+    """:func:`estimate_bandwidth` from part of the rows of an image, given with a halo of neighbouring rows."""
     with torch.no_grad():
         magnitude = gradients(guide, halo)
         count = magnitude.shape[1] * among.pixels(magnitude.shape[2] * magnitude.shape[3])
@@ -233,18 +234,18 @@ def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], among: Communicator)
 
 
 def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
-    """Magnitude of the gradient (B, C, h, W) at the rows of a guide that lie between those of its halo."""
-    # Central differences by slices take a twentieth of the time of a convolution, kornia's import not counted.
-    padded = F.pad(guide / 2, (1, 1, 1, 1), mode="replicate")  # halved first: no finite value overflows
+    """Gradient magnitude (B, C, h, W) of the rows of a guide, without those of the halo."""
+    # Central differences by slicing take a twentieth of the time of a convolution, not counting the import of kornia.
+    padded = F.pad(guide / 2, (1, 1, 1, 1), mode="replicate")  # halved first, so that no finite value overflows
     down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
     magnitude = (down.square() + right.square()).sqrt()
     if is_hidden(magnitude) or not bool(magnitude.sum().isfinite()):
-        # hypot cannot overflow, but on processors its last digit depends on the position in memory, and so on tiles.
+        # hypot cannot overflow, but on CPUs its last digit depends on the position in memory, and therefore on tiling.
         magnitude = torch.hypot(down, right)
     return magnitude[:, :, halo[0] : guide.shape[2] - halo[1]]
 
 
 def bandwidth_of_gradient(mean: Tensor) -> Tensor:
-    """The bandwidth for a mean magnitude of the gradient."""
+    """Photometric bandwidth for a mean gradient magnitude."""
     return (FACTOR * mean).clamp(min=SMALLEST)

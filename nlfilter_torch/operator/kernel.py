@@ -1,8 +1,8 @@
-"""Guide to features, and features to columns of the factor, for pixels that the operator was not built from.
+"""Features of guides, and columns of the factor for pixels that the operator was not built from.
 
-A pixel's column of the factor is a function of its own patch and of the landmarks; its scaling follows from that column
-and one m-vector. Tiles of a large image, rows on another machine and other frames of a film therefore get exact
-columns, without seams or flicker, if they share landmarks and moments.
+A pixel's column of the factor is a function of its own patch and of the landmarks; its scaling follows from the column
+and one vector of length M. Tiles of a large image, rows on another machine and other frames of a film therefore get
+exact columns, without seams or flicker, if they share landmarks and moments.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from nlfilter_torch.operator.nystrom import Completion, nystrom_factor
 
 @dataclass(frozen=True, eq=False)
 class GuideFeatures:
-    """From a guide to features. Paper: eq. (1), (18).
+    """The function that computes features of guides. Paper: eq. (1), (18).
 
     Attributes:
         patch_weights: (p, p), of unit sum.
         photometric_bandwidth: h_y, () or (B,) or a number.
-        spatial_bandwidth: h_x in pixels, likewise, or None.
+        spatial_bandwidth: h_x in pixels, () or (B,) or a number, or None.
         guide_channels: ``"luminance"`` or ``"all"``.
     """
 
@@ -32,10 +32,10 @@ class GuideFeatures:
     def __call__(
         self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0), stride: int = 1
     ) -> Tensor:
-        """Features (B, D, N) of the pixels of any guide (B, C, H, W), or of a tile; see :func:`extract_features`.
+        """Compute features (B, D, N) of any guide (B, C, H, W), or of a tile; see :func:`extract_features`.
 
-        The guide has the channels of the one that the landmarks come from, and the origin is in the coordinates of that
-        one. A halo is half a patch, or less at the border of the whole guide.
+        The guide must have the channels of the original guide, from which the landmarks come, and ``origin`` is in
+        coordinates of the original guide. A halo is half a patch, or less at the border of the whole guide.
         """
         return extract_features(
             reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels),
@@ -56,8 +56,8 @@ class Kernel:
         landmarks: (B, D, M).
         inverse_cholesky: (B, M, M).
         completion: ``"diagonal"`` or ``"none"``.
-        limiter: (B, M, M) that the factor is multiplied by so that no eigenvalue of W exceeds 1, or None.
-        features: how features come from a guide; None where the operator was made from features.
+        limiter: (B, M, M) matrix by which the factor is multiplied so that no eigenvalue of W exceeds 1, or None.
+        features: computes features of a guide; None if the operator was made from features.
     """
 
     landmarks: Tensor
@@ -68,14 +68,14 @@ class Kernel:
 
     @property
     def recipe(self) -> GuideFeatures:
-        """How features come from a guide.
+        """The function that computes features of a guide.
 
         Raises:
             ValueError: if the operator was made from features.
         """
         if self.features is None:
             raise ValueError(
-                "operator must come from nonlocal_operator to be applied to other guides, got one made from features; "
+                "operator must be built by nonlocal_operator to be applied to other guides, got one from features; "
                 "use operator.at(features)"
             )
         return self.features
@@ -83,10 +83,10 @@ class Kernel:
     def columns(
         self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0)
     ) -> tuple[Tensor, Tensor]:
-        """Factor (B, M, N) and diagonal (B, N) of the pixels of any guide; see :class:`GuideFeatures`."""
+        """Compute factor (B, M, N) and diagonal (B, N) of the pixels of any guide; see :class:`GuideFeatures`."""
         return self.factor(self.recipe(guide, origin=origin, halo=halo))
 
     def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
+        """Compute factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
         factor, diagonal = nystrom_factor(features, self.landmarks, self.inverse_cholesky, self.completion)
         return factor if self.limiter is None else self.limiter @ factor, diagonal

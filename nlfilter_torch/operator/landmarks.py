@@ -1,4 +1,4 @@
-"""Features to landmarks, the few points that all affinities are computed from. Paper: Sec. II-C, set A."""
+"""Landmarks: the few points whose affinities to all pixels determine the kernel. Paper: Sec. II-C, set A."""
 
 from functools import partial
 from typing import Literal
@@ -12,23 +12,24 @@ from nlfilter_torch.core.kernels.library import register
 
 Sampling = Literal["kmeans", "uniform", "random"]
 
-CAPTURED = 1e-4  # a point with a residual below this on the unit diagonal counts as captured
-# More features or iterations move the centroids by less than their sampling error: at 512x400 pixels and m = 100, twice
-# as many features lower the mean diagonal correction by at most 2 %; ten iterations by at most 3 %.
+CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured
+# Candidates per landmark. More candidates or iterations move the centroids by less than their sampling error: at
+# 512x400 pixels and m = 100, twice as many candidates lower the mean diagonal correction by at most 2 %; ten iterations
+# by at most 3 %.
 PER_LANDMARK = 64
-STARTED_FROM = 32  # of them; more do not lower the error of W y
-# Without bounds the cost would be quadratic in the number of landmarks. At 256x256 and m = 1000, 16384 candidates raise
-# the mean diagonal by 5 % over 32768; a start from more of them does not lower it.
+STARTED_FROM = 32  # candidates per landmark from which the start is drawn; more do not lower the error of W y
+# Without bounds the cost would be quadratic in the number of landmarks. At 256x256 and m = 1000, the mean diagonal is
+# 5 % higher with 16384 candidates than with 32768; drawing the start from more of them does not lower it.
 MOST_CANDIDATES = 32768
 MOST_STARTED_FROM = 8192
-DRAWN_SINGLY = 256  # landmarks; where there are more, the start is drawn in blocks, by matrix products
-BLOCK, PROPOSED = 64, 8  # landmarks in a block, and proposals for each
+DRAWN_SINGLY = 256  # with more landmarks than this, the start is drawn in blocks, by matrix products
+BLOCK, PROPOSED = 64, 8  # landmarks in a block, and proposals per landmark
 ITERATIONS = 5
-# Scores that differ by so many units of rounding are tied. Constant and periodic pictures with coordinates have many
-# ties, which must not be decided by the order in which a kernel adds up.
+# Scores that differ by at most this many units of rounding are tied. Constant and periodic pictures with coordinates
+# have many ties, which must not be decided by a kernel's order of summation.
 TIE = 16
-LARGEST = 1e16  # features whose squares float32 can still add up
-MANY = 1 << 24  # a permutation of more pixels would take more memory than the image
+LARGEST = 1e16  # limit of features: sums of their squares do not overflow float32
+MANY = 1 << 24  # a permutation of more pixels than this would take more memory than the image
 
 
 def choose_landmarks(
@@ -48,14 +49,14 @@ def choose_landmarks(
         count: M, at most N. With M = N the landmarks are the pixels themselves.
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
-        generator: source of randomness; None is a new one with seed 0, so that equal calls give equal landmarks.
-        among: ranks that the rows of the image are spread over; N is then the number of pixels here, and all ranks use
-            what the first one draws.
-        weights: (B, N), how many pixels each point stands for: candidates of k-means are drawn in proportion to them.
+        generator: source of randomness; None means a new one with seed 0, so that equal calls give equal landmarks.
+        among: ranks that the rows of the image are distributed over; N is then the number of pixels of this rank, and
+            all ranks use what the first one draws.
+        weights: (B, N), number of pixels that each point represents; k-means candidates are drawn in proportion to it.
 
     Returns:
-        (B, D, M), differentiable in the features (k-means with the assignment held). All images of a batch draw the
-        same pixels, so that a batch gives what single calls give.
+        (B, D, M), differentiable in the features (for k-means with the assignment held fixed). The same pixels are
+        drawn for all images of a batch, so that a batch gives the same results as single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if count == features.shape[-1] and among.size == 1:
@@ -70,7 +71,7 @@ def choose_landmarks(
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
-    """Indices of distinct pixels, from whose features :func:`condense` computes ``count`` landmarks."""
+    """Draw indices of distinct pixels, from whose features :func:`condense` computes ``count`` landmarks."""
     pixels = size[0] * size[1]
     if count == pixels:
         return torch.arange(pixels)
@@ -85,9 +86,9 @@ def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, gene
 
 
 def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Candidates of k-means among points with weights (N,): what :func:`stratified` picks of the pixels in order."""
+    """Draw k-means candidates by :func:`stratified` sampling of the pixels represented by points of weights (N,)."""
     summed = weights.double().cumsum(0).cpu()
-    summed = summed * (len(summed) / summed[-1]).clamp(min=1.0)  # a point may stand for less than a pixel
+    summed = summed * (len(summed) / summed[-1]).clamp(min=1.0)  # a point may represent less than a pixel
     pixels = round(float(summed[-1]))
     wanted = min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count))
     return torch.searchsorted(summed, stratified(pixels, wanted, generator).double(), right=True).clamp_(
@@ -96,7 +97,7 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
 
 
 def condense(subset: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE) -> Tensor:
-    """Landmarks (B, D, M) from the features (B, D, S) of the candidates: centroids where there are more than M."""
+    """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M."""
     if subset.shape[2] == count:
         return subset
     start, assignment = clusters(subset.detach(), count, generator, among)
@@ -106,9 +107,9 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, among: Comm
 def clusters(
     points: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE
 ) -> tuple[Tensor, Tensor]:
-    """Which of the points (B, D, S) start the clusters of k-means, (B, 1, M), and the cluster of each, (B, S)."""
+    """Cluster points (B, D, S) by k-means: indices (B, 1, M) of the initial centroids, and assignment (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
-    points = points.clamp(-LARGEST, LARGEST).float()  # a choice needs no more, and the kernels in C take no more
+    points = points.clamp(-LARGEST, LARGEST).float()  # float32 suffices here, and the kernels in C take nothing else
     few = draw_few(points.shape[2], count, generator).to(points.device)
     chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
     start = among.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
@@ -117,23 +118,23 @@ def clusters(
 
 
 def draw_few(candidates: int, count: int, generator: torch.Generator) -> Tensor:
-    """Indices of the candidates, half of them, among which those are that M clusters start from."""
+    """Draw the indices of up to half of the candidates, from which the initial centroids are chosen."""
     few = torch.randperm(candidates, generator=generator, device=generator.device)
     return few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)]
 
 
 def means_of_clusters(subset: Tensor, assignment: Tensor, start: Tensor) -> Tensor:
-    """Landmarks (B, D, M) from candidates (B, D, S) and their :func:`clusters`."""
+    """Compute landmarks (B, D, M) from candidates (B, D, S) and the result of :func:`clusters`."""
     return _cluster_means(subset, assignment, pick(subset, start))
 
 
 def candidate_count(pixels: int, count: int, sampling: str) -> int:
-    """How many :func:`candidate_pixels` there are."""
+    """Number of pixels that :func:`candidate_pixels` draws."""
     return min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count)) if sampling == "kmeans" else count
 
 
 def _bounded(candidates: int, most: int, count: int) -> int:
-    """So many candidates for ``count`` landmarks, or ``most``, or twice the landmarks if that is more."""
+    """Limit a number of candidates to ``most``, or to twice ``count`` if that is more."""
     return min(candidates, max(most, 2 * count))
 
 
@@ -152,9 +153,9 @@ def _grid(size: tuple[int, int], count: int) -> Tensor:
 
 
 def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
-    """``count`` distinct pixels, one from each of ``count`` equal stretches of the image.
+    """Draw ``count`` distinct pixels, one from each of ``count`` equal intervals of pixel indices.
 
-    From front to back: in that order they are picked three times as quickly as in a random one.
+    In ascending order, since gathering them takes a third of the time that it takes in random order.
     """
     device = generator.device
     offsets = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
@@ -162,28 +163,29 @@ def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
 
 
 def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Indices (B, count) of points (B, D, S) to start k-means from: the pivots of a random Cholesky decomposition.
+    """Choose initial centroids (B, count) among points (B, D, S): pivots of a randomly pivoted Cholesky decomposition.
 
-    Each is drawn by what the ones before do not capture of the kernel's unit diagonal (Chen, Epperly, Tropp and
-    Webber, 2022). Patches that are rare but unlike all others get a landmark, which a uniform draw would miss, and
-    k-means would never move one there. The fourth power is greedier than the residual itself: at h_y = 40/255 the
-    error of W y on the small astronaut of benchmarks.accuracy is 0.55 grey levels with it, 0.79 with the first power,
-    0.71 where k-means starts from any candidates.
+    Each pivot is drawn in proportion to the fourth power of the residual: the part of the kernel's unit diagonal that
+    the earlier pivots do not capture (Chen, Epperly, Tropp and Webber, 2022). Rare patches that are unlike all others
+    thus get a landmark; uniform sampling would miss them, and k-means would never move a centroid there. The fourth
+    power is greedier than the residual itself: at h_y = 40/255 the error of W y on the small astronaut of
+    benchmarks.accuracy is 0.55 grey levels with it, 0.79 with the first power, and 0.71 if k-means starts from
+    arbitrary candidates.
     """
     draws = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points)
     if count > DRAWN_SINGLY:
         offsets = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points.device)
-        images = points.split(1) if points.device.type == "cpu" else [points]  # columns of one at a time
+        images = points.split(1) if points.device.type == "cpu" else [points]  # on CPUs one image at a time
         return torch.cat([_pivots_by_blocks(image, draws, offsets) for image in images])
     return pivots(points, draws, CAPTURED)
 
 
 def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
-    """Pivots as in :func:`_pivots`, but a block at a time, so that matrix products do nearly all of the work.
+    """Choose pivots as in :func:`_pivots`, but a block at a time, so that nearly all of the work is matrix products.
 
-    Within a block, pivots are drawn one by one from a systematic sample of proposals. Half of these come in proportion
-    to the fourth power of the residual before the block, half evenly, since a few points may hold all of the residual.
-    Weights in the draw are divided by the probability of a proposal.
+    Within a block, pivots are drawn one by one from a systematic sample of proposals. Half of the proposals are drawn
+    in proportion to the fourth power of the residual before the block, the other half uniformly, since a few points may
+    hold all of the residual. In the draw, weights are divided by the probability of the proposal.
     """
     batch, _, size = points.shape
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
@@ -213,13 +215,13 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
 
 
 def _row(matrices: Tensor, pivot: Tensor) -> Tensor:
-    """Row (B, 1, S), at ``pivot`` (B, 1, 1), of symmetric matrices (B, S, S)."""
+    """Row (B, 1, S) with index ``pivot`` (B, 1, 1) of symmetric matrices (B, S, S)."""
     return pick(matrices, pivot).mT
 
 
 def _cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
-    """Mean (B, D, M) of the points (B, D, S) of every cluster; an empty one takes its column of ``fallback``."""
-    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # sums and sizes in one
+    """Means (B, D, M) of the points (B, D, S) of each cluster; for an empty cluster, its column of ``fallback``."""
+    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # for sums and sizes at once
     add = _sums_in_order if points.device.type == "cpu" else _sums_by_product
     sums = add(extended, assignment, fallback.shape[2])
     sizes = sums[:, -1:]
@@ -227,13 +229,13 @@ def _cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tens
 
 
 def _sums_in_order(points: Tensor, assignment: Tensor, count: int) -> Tensor:
-    """Sums (B, D, M) of the points of every cluster, one after the other."""
+    """Sums (B, D, M) of the points of each cluster, added up in order."""
     zeros = points.new_zeros(*points.shape[:2], count)
     return zeros.scatter_add(2, assignment.unsqueeze(1).expand_as(points), points)
 
 
 def _sums_by_product(points: Tensor, assignment: Tensor, count: int) -> Tensor:
-    """The same on accelerators, which would add up in another order every time."""
+    """Sums (B, D, M) as in :func:`_sums_in_order` on accelerators, where scatter_add has no fixed order."""
     members = points.new_zeros(points.shape[0], count, points.shape[2])
     return points @ members.scatter_(1, assignment.unsqueeze(1), 1.0).mT
 
@@ -250,7 +252,7 @@ def _fake_choice(features: Tensor, height: int, width: int, count: int, sampling
     _fake_choice,
 )
 def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates (S,), those that clusters start from (B, 1, M) and the cluster of each (B, S)."""
+    """Choose candidates (S,), initial centroids among them (B, 1, M) and their assignment to clusters (B, S)."""
     generator = torch.Generator().manual_seed(0)
     pixels = candidate_pixels((height, width), count, sampling, generator).to(features.device)
     if len(pixels) == count:
@@ -261,7 +263,7 @@ def choose(features: Tensor, height: int, width: int, count: int, sampling: Samp
 
 
 def choose_in_graph(features: Tensor, size: tuple[int, int], count: int, sampling: Sampling) -> Tensor:
-    """:func:`choose_landmarks` as a compiler records it, with the landmarks of a call without a generator."""
+    """:func:`choose_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
     if count == features.shape[2]:
         return features
     pixels, start, assignment = choose(features.detach(), size[0], size[1], count, sampling)

@@ -5,12 +5,12 @@ are the only unknowns: ``t = sum_i u_i d_i(t)``. The Jacobian of ``t - sum_i u_i
 
     J = I + sum_i p_i u_i u_i^T,    p = d^2 / (1 + c d^2),
 
-with a spectrum in [1, 2] at the solution. Over all pixels the sum costs as much as 14 sweeps over the factor, over a
-sample almost nothing. Pixels are sampled in proportion to their leverage score ``p |u|^2``, because rare pixels, which
-a uniform sample misses, converge last. On photographs of a megapixel each sweep then reduces the error by a factor of
-10 to 100; Chebyshev's iteration reduces it by 5.8.
+with a spectrum in [1, 2] at the solution. Summing over all pixels costs as much as 14 sweeps over the factor, summing
+over a sample almost nothing. Pixels are sampled in proportion to their leverage score ``p |u|^2``, because rare pixels,
+which a uniform sample misses, converge last. On photographs of a megapixel each sweep then reduces the error by a
+factor of 10 to 100; Chebyshev iteration reduces it by 5.8.
 
-:func:`damped` is Newton's method on d with an exact line search: slower than all others, but always convergent.
+:func:`damped` is Newton's method on d with an exact line search: slower than the other methods, but always convergent.
 """
 
 import torch
@@ -24,34 +24,35 @@ from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import KernelMatrix, Solution, scaling_from_moment
 
-PER_LANDMARK = (8, 32, 160)  # sampled pixels at least, usually and at most: the Jacobian is then within 35, 18 or 8 %
-EXPLORED = 8192  # most pixels that the first guess is computed from
-SHARE = 8  # one of so many pixels is sampled, within these bounds
-LARGE = 64  # at least one of so many pixels is sampled: larger images have rarer pixels
-GUESSES = 3  # fixed-point steps of the first guess; more do not help pixels outside its sample
-REFINEMENTS = 3  # steps of Newton's method on a sample; after two the Jacobian still changes
-UNIFORM = 0.05  # part of the sample that is drawn uniformly, so that a pixel stands for at most 20 times its share
-LARGEST = 2.0  # bounds d while t is a guess; a larger d is left to the damped method
+PER_LANDMARK = (8, 32, 160)  # sampled pixels: minimum, usual, maximum; the Jacobian is then within 35, 18 or 8 %
+EXPLORED = 8192  # maximum number of pixels for the initial guess
+SHARE = 8  # one in this many pixels is sampled, within these bounds
+LARGE = 64  # at least one in this many pixels is sampled: larger images have rarer pixels
+GUESSES = 3  # fixed-point steps of the initial guess; more do not help pixels outside its sample
+REFINEMENTS = 3  # Newton steps on a sample; after two the Jacobian still changes
+UNIFORM = 0.05  # fraction of the sample drawn uniformly; limits the weight of a pixel to 20 times the average
+LARGEST = 2.0  # bound of d while t is approximate; solutions with a larger d are left to the damped method
 MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
-FIRST_TOLERANCE = 1e-6  # of the solution in float32 that one in float64 starts from
-RESAMPLED = 0.2  # after a sweep that reduces the error by less than a factor of five, another sample is drawn
+FIRST_TOLERANCE = 1e-6  # tolerance of the float32 solution from which a float64 solution starts
+RESAMPLED = 0.2  # a new sample is drawn after a sweep that reduces the error by less than a factor of five
 MAX_STEPS = 50  # of the damped method; about ten are needed from any start
 SMALL_STEP = 0.1  # relative change of d below which full steps converge quadratically
-# Of conjugate gradients, each of which gains a factor of at least 5.8; or a residual below the rounding of the dtype.
+# Conjugate gradients: maximum number of steps, each of which gains a factor of at least 5.8, and the relative residual,
+# below the rounding of the dtype, at which they stop.
 STEPS = {torch.float32: 10, torch.float64: 24}
 SOLVED = {torch.float32: 1e-7, torch.float64: 1e-16}
 
 
 class JacobianSample(KernelMatrix):
-    """A weighted sample of the pixels, from which the Jacobian is computed; on every rank a sample of its rows."""
+    """A weighted sample of the pixels for computing the Jacobian; each rank samples its own rows."""
 
     def scaling(self, total: Tensor) -> Tensor:
-        """Their d (B, n), given t (B, M, 1) in float64."""
+        """Scaling d (B, n) of the sampled pixels, given t (B, M, 1) in float64."""
         return scaling_from_moment(self.factor, self.diagonal, total.to(self.factor)).clamp_(max=LARGEST)
 
     def moment(self, values: Tensor) -> Tensor:
-        """The sample's estimate of ``factor @ values``, (B, M, 1), added up in the precision of the factor."""
+        """Estimate of ``factor @ values``, (B, M, 1), summed in the precision of the factor."""
         return self.among.sum(gather(weighted(values, self.weights).unsqueeze(1), self.factor).mT.double())
 
     def jacobian(self, scaling: Tensor) -> Tensor:
@@ -62,14 +63,14 @@ class JacobianSample(KernelMatrix):
         return total.double() + torch.eye(total.shape[1], dtype=torch.float64, device=total.device)
 
     def residual(self, total: Tensor, found: Tensor) -> Tensor:
-        """Largest deviation of a row sum from 1 among the sample, (B,), where d(total) has the moment ``found``."""
-        # Where d is the root for the total, row sums lack d u . (total - found).
+        """Largest deviation of a row sum of the sample from 1, (B,), if d(total) has the moment ``found``."""
+        # As d is the root for the given total, row sums are 1 - d u . (total - found).
         lacking = spread((total - found).to(self.factor).mT, self.factor, self.scaling(total))
         return self.among.max(lacking.abs().amax((1, 2)))
 
 
 def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[JacobianSample, Tensor]:
-    """A systematic sample in proportion to leverage scores, and its part of ``scaling``, (B, n)."""
+    """Draw a systematic sample in proportion to leverage scores; also return its part of ``scaling``, (B, n)."""
     factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
     if 2 * count >= factor.shape[2]:
         return JacobianSample(factor, diagonal, weights, among), scaling
@@ -86,13 +87,13 @@ def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[JacobianSa
 
 
 def _guess(matrix: KernelMatrix) -> Tensor:
-    """A first guess of t (B, M, 1), from a few thousand pixels that are spread evenly over the image."""
+    """Initial guess of t (B, M, 1), from a few thousand pixels distributed evenly over the image."""
     factor, diagonal = matrix.factor, matrix.diagonal
     sample = JacobianSample(factor, diagonal, matrix.weights, matrix.among)
     pixels = factor.shape[2]
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
-        # One pixel at random from each stretch: a fixed stride could coincide with the period of a texture.
+        # One random pixel from each interval: a fixed stride could coincide with the period of a texture.
         chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
         each = weighted(torch.ones_like(diagonal), matrix.weights)
         each = each[:, chosen] * (each.sum(1, keepdim=True) / each[:, chosen].sum(1, keepdim=True))
@@ -106,14 +107,14 @@ def _guess(matrix: KernelMatrix) -> Tensor:
 
 
 def _sweep(matrix: KernelMatrix, total: Tensor) -> tuple[Tensor, Tensor]:
-    """d(t) for all points, (B, N), and its moment (B, M, 1): one read of the factor."""
+    """Compute d(t) for all points, (B, N), and its moment (B, M, 1), in one read of the factor."""
     half = (total / 2).squeeze(2).to(matrix.factor)
     scaling, found = sweep(matrix.factor, matrix.diagonal, half, LARGEST, matrix.weights)
     return scaling, matrix.among.sum(found.unsqueeze(2))
 
 
 def solve(matrix: KernelMatrix, tolerance: float) -> Solution:
-    """Balance a kernel with a unit diagonal; on processors until the residual is at most ``tolerance`` or stalls.
+    """Balance a kernel with a unit diagonal; on CPUs until the residual is at most ``tolerance`` or stalls.
 
     On an accelerator the number of sweeps is fixed, as reading a residual would stall its queue.
     """
@@ -135,8 +136,8 @@ def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
         resampled = gain > RESAMPLED if watched else sweeps < 3
         if resampled:
             sample, part = _draw(matrix, scaling, count)
-            # The sample predicts how the moment changes with t. The true moment at the current t is known, and so the
-            # error of the sample there, which is subtracted.
+            # The sample predicts how the moment changes with t. Its error at the current t, where the true moment is
+            # known, is subtracted.
             bias = found - sample.moment(part)
             total = found
             for _ in range(REFINEMENTS):
@@ -148,7 +149,7 @@ def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
         else:
             total = total - inverse @ error
         scaling, found = _sweep(matrix, total)
-        if not resampled:  # a first step is so long that the Jacobian changes along it
+        if not resampled:  # steps with a new sample are so long that the Jacobian changes along them
             inverse = _updated(inverse, total - before, total - found - error)
         if not watched:
             continue
@@ -165,7 +166,7 @@ def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
 
 
 def _refined(matrix: KernelMatrix, tolerance: float) -> Solution:
-    """A solution in float64, whose steps are computed from the factor in float32 by the kernels in C."""
+    """Find a float64 solution by steps that are computed from a float32 copy of the factor, by the kernels in C."""
     each = None if matrix.weights is None else matrix.weights.float()
     single = KernelMatrix(matrix.factor.float(), matrix.diagonal.float(), each, matrix.among)
     rough = _quasi_newton(single, max(tolerance, FIRST_TOLERANCE))
@@ -184,7 +185,7 @@ def _refined(matrix: KernelMatrix, tolerance: float) -> Solution:
 
 
 def _measure(matrix: KernelMatrix, scaling: Tensor, total: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest deviation of a row sum from 1, (B,): with the rounding of d = d(total), and without it."""
+    """Largest deviation of a row sum from 1, (B,): including rounding errors of d = d(total), and excluding them."""
     both = torch.cat([found, total - found], dim=2).to(matrix.factor)
     rows = spread(both.mT, matrix.factor)  # (B, 2, N): one read of the factor
     sums = scaling * (rows[:, 0] + matrix.diagonal * scaling)
@@ -192,8 +193,8 @@ def _measure(matrix: KernelMatrix, scaling: Tensor, total: Tensor, found: Tensor
 
 
 def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """BFGS update of the inverse (B, M, M): it then maps ``change``, of ``t - factor @ d(t)``, to ``step``, of t."""
-    curvature = (step * change).sum(1, keepdim=True)  # positive, as the Jacobian is
+    """BFGS update of the inverse (B, M, M); it then maps a ``change`` of ``t - factor @ d(t)`` to the ``step`` of t."""
+    curvature = (step * change).sum(1, keepdim=True)  # positive, since the Jacobian is positive definite
     rho = torch.where(curvature > 0, 1 / curvature, torch.zeros_like(curvature))
     moved = inverse @ change
     scale = rho * (1 + rho * (change * moved).sum(1, keepdim=True))
@@ -202,12 +203,12 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
 
 
 def damped(matrix: KernelMatrix, start: Solution, goal: float) -> Solution:
-    """Balance from any start until the residual is at most ``goal``, or does not fall any more.
+    """Balance from any start until the residual is at most ``goal`` or stops decreasing.
 
-    A balanced d is the only minimum of ``d^T K d / 2 - sum log d``, which is convex as K is positive semi-definite,
-    even if entries of K are negative. If d changes by ``s d x``, the step x solves ``(I + W) x = 1 - W 1``, a system of
-    M equations with the Jacobian J of all pixels. Along x the function is a quadratic and a sum of logarithms, whose
-    minimum is found without reading the factor again.
+    A balanced d is the unique minimum of ``d^T K d / 2 - sum log d``, which is convex because K is positive
+    semi-definite, even if entries of K are negative. In an update of d by ``s d x``, the step x solves
+    ``(I + W) x = 1 - W 1``, which reduces to M equations with the Jacobian J of all pixels. Along x the function is a
+    quadratic plus a sum of logarithms, whose minimum is found without reading the factor again.
     """
     factor, weights, among = matrix.factor, matrix.weights, matrix.among
     tiny = torch.finfo(factor.dtype).tiny
@@ -237,14 +238,14 @@ def damped(matrix: KernelMatrix, start: Solution, goal: float) -> Solution:
 
 
 def _line_search(step: Tensor, lacking: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
-    """The s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
-    # W 1 = 1 - lacking and W x = lacking - x make the quadratic known.
+    """Find s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
+    # W 1 = 1 - lacking and W x = lacking - x determine the quadratic.
 
     def total(values: Tensor) -> Tensor:
         return among.sum(weighted(values, weights).sum(1, keepdim=True))
 
     linear, square = total(step * (1 - lacking)), total(step * (lacking - step))
-    longest = among.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()  # where a d reaches zero
+    longest = among.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()  # here the first d reaches zero
     low, high = torch.zeros_like(longest), 0.999 * longest
     length = torch.minimum(torch.ones_like(high), 0.5 * high)
     for _ in range(40):
@@ -264,8 +265,8 @@ def weighted_moment(factor: Tensor, weight: Tensor, among: Communicator, total: 
 
 
 def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, among: Communicator) -> Tensor:
-    """The s (B, M, 1) in float64 with ``(I + factor diag(weight) factor^T) s = right``."""
-    tiny = torch.finfo(torch.float64).tiny  # where the right side is zero, so is the solution
+    """Solve ``(I + factor diag(weight) factor^T) s = right`` for s, (B, M, 1) in float64."""
+    tiny = torch.finfo(torch.float64).tiny  # avoids 0 / 0: if the right side is zero, so is the solution
     solution, residual = torch.zeros_like(right), right
     preconditioned = inverse @ residual
     direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)

@@ -1,8 +1,8 @@
-"""Features and landmarks to a factor of the affinity matrix: ``K ~ factor^T factor + diag(diagonal)``.
+"""Nystrom factor of the affinity matrix: ``K ~ factor^T factor + diag(diagonal)``. Paper: Sec. II-C.
 
-Paper: Sec. II-C. Where the paper takes square roots and pseudo-inverses of the landmark block, the inverse of its
-Cholesky factor is used here. ``completion`` restores the unit diagonal of K, so that a pixel unlike all landmarks keeps
-its value; without it the row of such a pixel is nearly zero.
+Where the paper uses square roots and pseudo-inverses of the landmark block, the inverse of its Cholesky factor is used
+here. ``completion`` restores the unit diagonal of K, so that a pixel unlike all landmarks keeps its value; without it
+the row of such a pixel is nearly zero.
 """
 
 from typing import Any, Literal
@@ -17,8 +17,8 @@ from nlfilter_torch.core.values import is_hidden
 
 Completion = Literal["diagonal", "none"]
 
-CANCELLATION = 1e-7  # error of a squared distance between landmarks from which the products are avoided
-JITTER = 1e-5  # added to the landmark block; the inverse Cholesky factor then amplifies rounding at most 316 times
+CANCELLATION = 1e-7  # error of a squared distance above which distances are not computed from matrix products
+JITTER = 1e-5  # added to the landmark block; limits the amplification of rounding by the inverse factor to 316 times
 
 
 def inverse_cholesky(landmarks: Tensor) -> Tensor:
@@ -45,10 +45,10 @@ def invert(affinity: Tensor) -> Tensor:
 
 
 def _squared_distances(points: Tensor) -> Tensor:
-    """Between points (B, D, M) in float64, (B, M, M)."""
+    """Squared distances (B, M, M) between points (B, D, M) in float64."""
     norms = points.square().sum(1)
-    # Products cancel where points lie far apart for the bandwidth, and the matrix of affinities may then have a
-    # negative eigenvalue.
+    # Matrix products cancel where points are many bandwidths apart, and the affinity matrix may then have a negative
+    # eigenvalue.
     if not is_hidden(points) and not float(norms.detach().max()) * torch.finfo(points.dtype).eps < CANCELLATION:
         return torch.stack([(points - one.unsqueeze(2)).square().sum(1) for one in points.unbind(2)], dim=1)
     return norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
@@ -57,18 +57,18 @@ def _squared_distances(points: Tensor) -> Tensor:
 def nystrom_factor(
     features: Tensor, landmarks: Tensor, inverse: Tensor, completion: Completion
 ) -> tuple[Tensor, Tensor]:
-    """Nystrom factor of the affinities of every pixel, and the diagonal that completes it.
+    """Compute the Nystrom factor of the affinities of all pixels, and the correction of its diagonal.
 
-    From features (B, D, N), landmarks (B, D, M) and their :func:`inverse_cholesky`. The factor (B, M, N) has columns of
-    norm at most 1, and the diagonal (B, N) lies in [0, 1] (zero without completion). Differentiable once in the three
-    tensors; the backward pass recomputes the affinities block by block.
+    Takes features (B, D, N), landmarks (B, D, M) and their :func:`inverse_cholesky`. With completion, the factor
+    (B, M, N) has columns of norm at most 1 and the diagonal (B, N) lies in [0, 1]; without it the diagonal is zero.
+    Differentiable once in the three tensors; the backward pass recomputes the affinities block by block.
     """
     factor, diagonal, _ = _NystromFactor.apply(features, landmarks, inverse, completion == "diagonal")  # type: ignore[no-untyped-call]
     return factor, diagonal
 
 
 class _NystromFactor(torch.autograd.Function):
-    """u = A c(x, z), scaled to norm at most 1, and 1 - |u|^2; the third output is the scale, for the backward pass."""
+    """u = A c(x, z), scaled to norm at most 1, and 1 - |u|^2. The third output, the scale, is for the backward pass."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""The filter W as an object. Paper: Sec. II."""
+"""The filter W as an object, with its products, spectrum and diagnostics. Paper: Sec. II."""
 
 from dataclasses import dataclass
 
@@ -48,11 +48,11 @@ class Diagnostics:
         pixels: N.
         num_landmarks: M.
         rank: number of eigenvectors above rounding.
-        photometric_bandwidth: h_y in units of the guide; 1 for an operator that was made from features.
+        photometric_bandwidth: h_y in units of the guide; 1 for an operator made from features.
         balancing_steps: number of sweeps over the factor in balancing.
         row_sum_residual: largest deviation of a row sum from 1.
-        smallest_row_sum: smallest row sum of the kernel before balancing; without completion W fails as it nears zero.
-        largest_eigenvalue: an upper bound, as :meth:`NonlocalOperator.certify` has it.
+        smallest_row_sum: smallest row sum of the kernel before balancing; without completion, W fails if it nears zero.
+        largest_eigenvalue: upper bound of the eigenvalues; see :class:`Certificate`.
         eigenvector_residual: largest ||W v - lambda v|| over the unit eigenvectors.
         orthogonality: largest deviation of V V^T from the identity.
         diagonal_share: mean of the diagonal part r of W, the weight with which a pixel keeps its own value.
@@ -76,11 +76,10 @@ class Certificate:
     """Measured properties of an operator; lists have one entry per image.
 
     Attributes:
-        symmetry: difference of ``x^T W y`` and ``y^T W x`` for random images x and y, relative to their lengths.
+        symmetry: difference of ``x^T W y`` and ``y^T W x`` for random images x and y, relative to their norms.
         row_sums: largest deviation of a row sum from 1.
-        smallest_eigenvalue: a lower bound of the eigenvalues: the smallest r, since the rest of W is positive
-            semi-definite.
-        largest_eigenvalue: an upper bound of the eigenvalues; exactly 1 where none exceeds 1 but for rounding.
+        smallest_eigenvalue: lower bound of the eigenvalues: the smallest r, as the rest of W is positive semi-definite.
+        largest_eigenvalue: upper bound of the eigenvalues; exactly 1 if none exceeds 1 by more than rounding.
     """
 
     symmetry: list[float]
@@ -93,23 +92,23 @@ class Certificate:
 class NonlocalOperator:
     """The symmetric, doubly stochastic filter ``W = diag(d) U^T U diag(d) + diag(r)`` of an image, never formed.
 
-    Made by :func:`nonlocal_operator`. Every pixel is linked to every other one through M landmarks; W has unit row sums
-    and its eigenvalues lie in [0, 1]. Affinities that pass through few landmarks may be negative. A pixel whose
-    affinities to all others sum to less than zero keeps its value; eigenvalues that would exceed 1 are set to 1.
+    Made by :func:`nonlocal_operator`. Every pixel is linked to every other through M landmarks; W has unit row sums and
+    its eigenvalues lie in [0, 1]. With few landmarks, approximate affinities may be negative. A pixel whose affinities
+    to all others sum to less than zero keeps its value; eigenvalues that would exceed 1 are set to 1.
 
     Attributes:
         factor: U, (B, M, N), pixels last.
-        diagonal: c, (B, N), the diagonal correction that gives the kernel its unit diagonal; zeros without completion.
+        diagonal: c, (B, N), the correction that makes the diagonal of the kernel 1; zeros without completion.
         scaling: d, (B, N), positive.
         size: (H, W).
         kernel: computes factor and diagonal of the pixels of other guides.
         remainder: r, (B, N), the diagonal part of W.
-        weights: how many pixels each point stands for, (B, N); None is one each. ``W y`` is then
-            ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points stand for.
+        weights: number of pixels that each point represents, (B, N); None means one each. With weights, ``W y`` is
+            ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points represent.
         balancing: computes the scaling of other pixels.
         residual: largest deviation of a row sum of W from 1, (B,).
         balancing_steps: number of sweeps over the factor in balancing.
-        among: ranks that the rows of the image are spread over; all attributes are then of the rows here.
+        among: ranks that the rows of the image are distributed over; all attributes are then those of this rank's rows.
     """
 
     factor: Tensor
@@ -125,40 +124,40 @@ class NonlocalOperator:
     among: Communicator = ALONE
 
     def to(self, target: Target, dtype: torch.dtype | None = None) -> "NonlocalOperator":
-        """The operator on another device, or in another precision.
+        """Move the operator to another device, or convert it to another precision.
 
         Args:
-            target: a device, or a dtype, float32 or float64; or a tensor that has both.
-            dtype: beside a device.
+            target: a device, a dtype (float32 or float64), or a tensor that has both.
+            dtype: the dtype, if ``target`` is a device.
 
         Raises:
-            TypeError: if the dtype is another one.
+            TypeError: if the dtype is neither float32 nor float64.
         """
         return moved(self, target, dtype)
 
     def at(self, features: Tensor) -> Columns:
-        """The columns of any points, computed from their own features and from sums over the image.
+        """Compute the columns of any points from their own features and from sums over the image.
 
         Args:
-            features: (B, D, n), of points of the image or of another one, with the meaning and scale of the features
-                that the operator was made from.
+            features: (B, D, n), of points of this image or another, with the meaning and scale of the features that the
+                operator was made from.
 
         Raises:
-            TypeError, ValueError: if ``features`` is no finite floating-point tensor of that size D.
+            TypeError, ValueError: if ``features`` is not a finite floating-point tensor with the operator's D.
         """
         check_features(features, "features", self.kernel.landmarks.shape[1])
         factor, diagonal = self.kernel.factor(features.to(self.kernel.landmarks))
         return Columns(factor, *self.balancing(factor, diagonal))
 
     def matmul(self, image: Tensor) -> Tensor:
-        """``W y``, also written ``operator @ image``. Paper: eq. (2).
+        """Compute ``W y``, also written ``operator @ image``. Paper: eq. (2).
 
         Args:
             image: (B, C, H, W) of the guide's height and width, any number of channels, any floating-point dtype. A
                 batch of 1 on either side is broadcast.
 
         Returns:
-            (B, C, H, W) in the image's dtype, with the mean of the image. Differentiable in image and operator.
+            (B, C, H, W) in the image's dtype, with the same mean as the image. Differentiable in image and operator.
 
         Raises:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of that size.
@@ -170,7 +169,7 @@ class NonlocalOperator:
 
     @full_precision
     def powers(self, image: Tensor, order: int) -> Tensor:
-        """``W y, ..., W^k y`` as (B, k, C, H, W) in the operator's dtype; arguments and errors as :meth:`matmul`."""
+        """Compute ``W y, ..., W^k y``, (B, k, C, H, W), in the operator's dtype; arguments and errors as in matmul."""
         check_order(order)
         check_image(image, "image", empty=True)
         check_same_size(image, self.size, "image", "operator")
@@ -192,27 +191,28 @@ class NonlocalOperator:
 
     @full_precision
     def to_dense(self) -> Tensor:
-        """The whole matrix W, (B, N, N), symmetric unless its points have weights. For small images.
+        """Form the whole matrix W, (B, N, N), symmetric unless the points have weights. For small images.
 
         Raises:
-            ValueError: if the image has more than 16384 pixels, or not all of them are here.
+            ValueError: if the image has more than 16384 pixels, or this rank holds only some of its rows.
         """
         self.among.check_whole("to_dense")
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
-                f"the operator must have at most {DENSE_LIMIT} pixels to be dense, got {pixels}; use a smaller image"
+                f"the operator must have at most {DENSE_LIMIT} pixels for a dense matrix, got {pixels}; "
+                "use a smaller image"
             )
-        scaled = self.factor * self.scaling.unsqueeze(1)  # F first: without completion U may be too small to square
+        scaled = self.factor * self.scaling.unsqueeze(1)  # scaled first: without completion U^T U may underflow
         return weighted(scaled.mT @ scaled, self.weights) + torch.diag_embed(self.remainder)
 
     @uncompiled
     @full_precision
     def spectrum(self, rank: int | None = None) -> Spectrum:
-        """Leading eigenvalues and eigenvectors. Paper: eq. (3), (4).
+        """Compute the leading eigenvalues and eigenvectors. Paper: eq. (3), (4).
 
         Args:
-            rank: at most so many; None keeps all that rise above rounding, at most M.
+            rank: maximum number of them; None keeps all that are above rounding, at most M.
 
         Raises:
             TypeError, ValueError: if ``rank`` is not a positive integer.
@@ -255,7 +255,7 @@ class NonlocalOperator:
     @full_precision
     @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
-        """Measure the quality of the operator. Costs several times as much as the spectrum."""
+        """Measure the quality of the operator, at several times the cost of the spectrum."""
         spectrum, certificate = self.spectrum(), self.certify()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]

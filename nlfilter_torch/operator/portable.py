@@ -1,9 +1,9 @@
-"""Exported programs without operators of this package: for ONNX, and for programs that run without Python.
+"""Exported programs without the custom operators of this package: for ONNX, and for programs that run without Python.
 
-A program of ``torch.export`` calls ``torch.ops.nlfilter`` where an operator is built and applied. The forms below
-compute the same from operations that every runtime has. They read no value and take a fixed number of steps: ONNX has
-no Cholesky decomposition, in whose place stands the inverse square root by Newton-Schulz iteration, and Chebyshev's
-semi-iteration balances. As on accelerators, pixels are not isolated, and eigenvalues above 1 are not reduced.
+A program from ``torch.export`` calls ``torch.ops.nlfilter`` where an operator is built and applied. The functions below
+compute the same from operations that every runtime has. They do not depend on values and take a fixed number of steps:
+an inverse square root by Newton-Schulz iteration replaces the Cholesky decomposition, which ONNX lacks, and balancing
+is by Chebyshev semi-iteration. As on accelerators, isolated pixels are not removed and eigenvalues above 1 not reduced.
 """
 
 from collections.abc import Callable
@@ -31,21 +31,21 @@ from nlfilter_torch.operator.landmarks import (
 from nlfilter_torch.operator.nystrom import JITTER
 
 SWEEPS = 16
-CONVERGED = 1e-12  # all eigenvalues of the Newton-Schulz iteration tend to 1
+CONVERGED = 1e-12  # distance from 1, the limit of all eigenvalues of the Newton-Schulz iteration
 
 
 class PortableForms(TorchFunctionMode):
-    """Inside, operators of ``torch.ops.nlfilter``, and what ONNX has not, are recorded in their portable forms."""
+    """Context that replaces ``torch.ops.nlfilter`` operators, and functions ONNX lacks, by their portable forms."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        """Call the portable form of an operator, or another function as it is."""
+        """Call the portable form of a function if there is one, otherwise the function itself."""
         return FORMS.get(func, func)(*args, **(kwargs or {}))
 
 
 def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
-    """As :func:`nlfilter_torch.operator.landmarks.choose`; what is drawn at random is a constant of the program."""
+    """As :func:`nlfilter_torch.operator.landmarks.choose`, with the random numbers as constants of the program."""
     with _disable_current_modes():
         generator = torch.Generator().manual_seed(0)
         drawn = candidate_pixels((height, width), count, sampling, generator)
@@ -121,10 +121,10 @@ def columns(features: Tensor, landmarks: Tensor, inverse: Tensor, limited: bool)
 
 
 def inverse_root(affinity: Tensor) -> Tensor:
-    """The inverse square root (B, M, M) of affinities between landmarks, in the place of the inverse Cholesky factor.
+    """Inverse square root (B, M, M) of the affinities between landmarks, in place of the inverse Cholesky factor.
 
-    Either, times affinities of pixels, is a Nystrom factor; these differ by a rotation. In the coupled iteration of
-    Newton and Schulz all eigenvalues tend to 1; scaled by what the smallest of them may be, it takes half the steps.
+    Either of the two, times the affinities of pixels, gives a Nystrom factor; the factors differ by a rotation. In the
+    coupled Newton-Schulz iteration all eigenvalues tend to 1; scaling by a bound of the smallest halves the steps.
     """
     batch, count, _ = affinity.shape
     identity = torch.eye(count, dtype=affinity.dtype, device=affinity.device).expand(batch, -1, -1)
@@ -142,7 +142,7 @@ def inverse_root(affinity: Tensor) -> Tensor:
 def settle(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As :func:`nlfilter_torch.operator.balancing.settle`, by Chebyshev's semi-iteration alone."""
+    """As :func:`nlfilter_torch.operator.balancing.settle`, by Chebyshev semi-iteration alone."""
     diagonal = diagonal.unsqueeze(2)
     rows = factor.mT
 
@@ -168,12 +168,12 @@ def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tenso
 
 
 def moment(factor: Tensor, images: Tensor) -> Tensor:
-    """As :func:`nlfilter_torch.core.kernels.tall_skinny.moment`, but that it adds up in the precision of the factor."""
+    """As :func:`nlfilter_torch.core.kernels.tall_skinny.moment`, but summed in the precision of the factor."""
     return (factor @ images.mT).double()
 
 
 def hypot(down: Tensor, right: Tensor) -> Tensor:
-    """As :func:`torch.hypot`, which ONNX has not, but that squares of values above 1e19 overflow."""
+    """As :func:`torch.hypot`, which ONNX lacks, except that squares of values above 1e19 overflow."""
     return (down.square() + right.square()).sqrt()
 
 

@@ -20,10 +20,10 @@ def apply_powers(
     among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """``W y, W^2 y, ..., W^k y``, (B, k, C, N), for y (B, C, N), a factor (B, M, N), d, r and weights (B, N).
+    """Compute ``W y, W^2 y, ..., W^k y``, (B, k, C, N), for y (B, C, N), factor (B, M, N), d, r and weights (B, N).
 
-    Differentiable in everything. If the operator needs no gradient, differentiable any number of times in the image,
-    and in forward mode.
+    Differentiable in operator and image. If the operator needs no gradient, differentiable any number of times in the
+    image, also in forward mode.
     """
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, among, weights)  # type: ignore[no-untyped-call]
@@ -41,7 +41,7 @@ def _powers(
     among: Communicator,
     weights: Tensor | None,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """The k + 1 images from y to W^k y, and the k moments (B, M, C) of the images from y to W^(k-1) y."""
+    """Compute the k + 1 images y, ..., W^k y, and the k moments (B, M, C) of the images y, ..., W^(k-1) y."""
     images, moments = [image], []
     each = weighted(scaling.unsqueeze(1), weights)
     for _ in range(order):
@@ -52,10 +52,10 @@ def _powers(
 
 
 class _Powers(torch.autograd.Function):
-    """All products share one gradient of the factor, a single matrix product; autograd would form 2k full matrices.
+    """Powers of W with a single matrix product as gradient of the factor; autograd would form 2k full matrices.
 
-    With ``P_i = W P_(i-1)`` and ``A_(i-1) = G_(i-1) + W^T A_i`` backwards, the loss changes by ``sum_i A_i^T dW
-    P_(i-1)``. Weights are on the right of W: they multiply its columns.
+    With ``P_i = W P_(i-1)`` and, backwards, ``A_(i-1) = G_(i-1) + W^T A_i``, the loss changes by ``sum_i A_i^T dW
+    P_(i-1)``. Weights multiply the columns of W.
     """
 
     @staticmethod
@@ -81,7 +81,7 @@ class _Powers(torch.autograd.Function):
             total = ctx.among.sum(moment(factor, d * adjoint)).to(factor)
             affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
             summed = weighted(before, weights)
-            # d (F^T F p) = d_row scaling on both sides: each side contributes its own product with the other.
+            # The scaling multiplies the factor on both sides; each side contributes a product with the other.
             grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
             grad_remainder += (adjoint * before).sum(1)
             left += [moments[i - 1], total]

@@ -1,7 +1,7 @@
 """The scaling d of points: its moment, row sums of W, and d of any point as a function of the moment.
 
-Given the moment ``t = sum_i w_i d_i u_i`` over all points, w their weights, the equation of a point is
-``d (u . t + c d) = 1``. Its one positive root d(t) depends on the point's own column u and diagonal c only.
+Given the moment ``t = sum_i w_i d_i u_i`` over all points, with weights w, a point's scaling satisfies
+``d (u . t + c d) = 1``. The only positive root d(t) depends only on the point's own column u and diagonal c.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread
 
-EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # by which rounding may take the d of a pixel above 1
+EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # amount by which d of a pixel may exceed 1 through rounding
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Balancing:
 
     Attributes:
         scaling: d, (B, N), positive.
-        moment: t of this scaling, (B, M, 1) in float64, without a gradient.
-        residual: largest deviation of a row sum from 1 with this scaling, (B,).
+        moment: t for this scaling, (B, M, 1) in float64, without a gradient.
+        residual: largest deviation of a row sum from 1, (B,).
         steps: number of sweeps over the factor.
     """
 
@@ -35,16 +35,16 @@ class Balancing:
 
 @dataclass(frozen=True)
 class Solution(Balancing):
-    """What a method of balancing found, and the approximate inverse (B, M, M) of the Jacobian J, in float64."""
+    """Result of a balancing method, with the approximate inverse (B, M, M) of the Jacobian J, in float64."""
 
     inverse: Tensor
 
 
 def scaling_from_moment(factor: Tensor, diagonal: Tensor, total: Tensor) -> Tensor:
-    """The scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
+    """Compute the scaling (B, N) of any pixels, given the moment ``factor @ d`` (B, M, 1) of a balanced image.
 
-    It is the positive root of ``d (u . total + diagonal d) = 1``, computed without cancellation. The sign of
-    ``u . total`` may be either, since approximate affinities may be negative.
+    The scaling is the positive root of ``d (u . total + diagonal d) = 1``, computed without cancellation for either
+    sign of ``u . total``, which may be negative since approximate affinities may be.
     """
     return positive_root(spread((total / 2).mT, factor).squeeze(1), diagonal)
 
@@ -56,8 +56,8 @@ class KernelMatrix:
     Attributes:
         factor: U, (B, M, N).
         diagonal: c, (B, N).
-        weights: number of equal pixels that each point stands for, (B, N); None is one each.
-        among: ranks that the points are spread over.
+        weights: number of identical pixels that each point represents, (B, N); None means one each.
+        among: ranks that the points are distributed over.
     """
 
     factor: Tensor
@@ -66,27 +66,27 @@ class KernelMatrix:
     among: Communicator = ALONE
 
     def moment(self, values: Tensor) -> Tensor:
-        """``U (weights * values)`` of values (B, N), summed over the ranks: (B, M, 1) in float64."""
+        """``U (weights * values)`` for values (B, N), summed over the ranks: (B, M, 1) in float64."""
         return self.among.sum(moment(self.factor, weighted(values, self.weights).unsqueeze(1)))
 
     def affinities(self, total: Tensor) -> Tensor:
-        """``U^T total``, (B, N), of an M-vector (B, M, 1)."""
+        """``U^T total``, (B, N), for a vector of length M, (B, M, 1)."""
         return spread(total.to(self.factor).mT, self.factor).squeeze(1)
 
     def row_sums(self, scaling: Tensor, found: Tensor) -> Tensor:
-        """Row sums (B, N) of W for any scaling d whose moment is ``found``."""
+        """Row sums (B, N) of W for a scaling d with the moment ``found``."""
         return scaling * (self.affinities(found) + self.diagonal * scaling)
 
     def largest(self, values: Tensor) -> Tensor:
-        """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of them is not finite."""
+        """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of the values is NaN."""
         return self.among.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
 
 
 def isolated(scaling: Tensor, residual: float) -> Tensor:
-    """Pixels (B, n) whose affinities to all others sum to less than zero, given the d of a kernel with a unit diagonal.
+    """Find pixels (B, n) whose affinities to all others sum to less than zero, for a kernel with a unit diagonal.
 
-    The diagonal entry of W is then d^2, and the other entries of the row sum to 1 - d^2, so d exceeds 1. It must do so
-    by more than ``residual``, the error of row sums.
+    The diagonal entry of W is d^2 and the other entries of the row sum to 1 - d^2, so d exceeds 1 at these pixels. It
+    must exceed 1 by more than ``residual``, the error of row sums.
     """
     return scaling > 1 + max(EXCESS[scaling.dtype], residual)
 
@@ -97,9 +97,9 @@ class PixelScaling:
 
     Attributes:
         moment: t, (B, M, 1).
-        completed: the kernel has a unit diagonal.
+        completed: whether the kernel has a unit diagonal.
         residual: largest deviation of a row sum from 1.
-        before: moments at which pixels were found to be isolated and then removed, one for each round of balancing.
+        before: moments of earlier rounds of balancing, after each of which isolated pixels were removed.
     """
 
     moment: Tensor
@@ -108,9 +108,9 @@ class PixelScaling:
     before: tuple[Tensor, ...] = ()
 
     def __call__(self, factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
-        """Scaling d and diagonal part r of W, (B, n), of pixels with columns (B, M, n) and (B, n).
+        """Compute d and r, the diagonal part of W, (B, n), of pixels with factor (B, M, n) and diagonal (B, n).
 
-        A pixel that is isolated has d = 0 and r = 1.
+        An isolated pixel has d = 0 and r = 1.
         """
         scaling = scaling_from_moment(factor, diagonal, self.moment.to(factor))
         remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow

@@ -1,8 +1,8 @@
-"""Operator to spectrum, by Rayleigh and Ritz in the span of the factor. Paper: Sec. II-A to II-C, eq. (3), (4).
+"""Spectrum of W by the Rayleigh-Ritz method in the span of the factor. Paper: Sec. II-A to II-C, eq. (3), (4).
 
-With ``F`` (M, N) the scaled factor and ``G = F F^T``, the rows of ``G^(-1/2) F`` are orthonormal, and W projected on
-their span is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. G and T are m x m matrices in float64. The pixels are
-read twice: once for G, and once to form or apply eigenvectors.
+With ``F`` (M, N) the scaled factor and ``G = F F^T``, the rows of ``G^(-1/2) F`` are orthonormal, and W projected onto
+their span is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. G and T are M x M matrices in float64. The factor is read
+twice: once for G, and once to form or apply eigenvectors.
 """
 
 from collections.abc import Callable
@@ -32,11 +32,11 @@ from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_hidden
 
-# Eigenvalues of G below this, relative to the largest, are rounding.
+# Eigenvalues of G below this, relative to the largest, are rounding errors.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
-# If the inverse eigenvalues of G sum to more, eigenvectors from sums in float32 are not orthogonal enough.
+# If the inverse eigenvalues of G sum to more than this, eigenvectors from sums in float32 are not orthogonal enough.
 WEAK = 3e3
-# Eigenvalues this close to 1 count as 1 when the constant vector is picked out of their eigenspace.
+# Eigenvalues this close to 1 count as 1 when the constant vector is selected from their eigenspace.
 CLUSTER = {torch.float32: 1e-3, torch.float64: 1e-8}
 
 Response = Callable[[Tensor], Tensor]
@@ -44,7 +44,7 @@ Response = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class RitzPairs:
-    """What functions of W need besides the factor: matrices that are sums over pixels.
+    """Matrices from sums over pixels, which together with the factor determine functions of W.
 
     Attributes:
         ritz: T, (B, M, M), float64.
@@ -58,33 +58,33 @@ class RitzPairs:
 
     @staticmethod
     def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
-        """From sums over all pixels.
+        """Compute the matrices from sums over all pixels.
 
         Args:
-            grams: ``F F^T`` and, where W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
-            dtype: of the factor, which determines their rounding error.
+            grams: ``F F^T`` and, if W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
+            dtype: of the factor, which determines the rounding error of ``grams``.
         """
         gram = SymmetricMatrix.of(grams[:, 0])
         kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]
         root = gram.apply(torch.rsqrt, kept)
-        # G^(-1/2) G^2 G^(-1/2) is G where it is kept; as a product it would be rounding in its smallest eigenvalues.
+        # G^(-1/2) G^2 G^(-1/2) is the kept part of G; the product would lose its smallest eigenvalues to rounding.
         projected = gram.apply(lambda values: values, kept) + root @ grams[:, 1:].sum(1) @ root
         ritz = SymmetricMatrix.of((projected + projected.mT) / 2)
         ritz = replace(ritz, eigenvalues=ritz.eigenvalues.clamp(max=1.0))
         return RitzPairs(ritz, root, torch.arange(kept.shape[1], device=kept.device) < kept.sum(1, keepdim=True))
 
     def basis(self, response: Response) -> Tensor:
-        """``f(T) G^(-1/2)``, (B, M, M) in float64: ``B^T B`` is the core of ``f(W)^2``."""
+        """``B = f(T) G^(-1/2)``, (B, M, M) in float64; ``B^T B`` is the core of ``f(W)^2``."""
         return self.ritz.apply(response, self.support) @ self.root
 
     def gain(self, response: Response) -> Tensor:
-        """The m x m core X (B, M, M) of ``f(W) = F^T X F``, in float64: ``G^(-1/2) f(T) G^(-1/2)``.
+        """Core ``X = G^(-1/2) f(T) G^(-1/2)`` of ``f(W) = F^T X F``, (B, M, M) in float64.
 
         Args:
             response: f, an elementwise differentiable function of the eigenvalues, (B, R) to (B, R).
 
         Returns:
-            Independent of the choice of eigenvectors; differentiable in the operator and in what ``response`` holds.
+            X, independent of the choice of eigenvectors; differentiable in the operator and the parameters of f.
 
         Raises:
             TypeError, ValueError: if ``response`` does not return a finite gain for every eigenvalue.
@@ -97,12 +97,12 @@ class Spectrum(RitzPairs):
     """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
 
     Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first used. Filters and masks do not need
-    them, since :meth:`gain` applies any f(W) through m x m matrices.
+    them, since :meth:`gain` gives any f(W) through M x M matrices.
 
     Attributes:
-        eigenvalues: (B, R), descending, in [0, 1]; padded with zeros where the images of a batch differ in rank, and on
-            accelerators to M, as reading the rank would stall them. Their gradient is exact, also for repeated
-            eigenvalues.
+        eigenvalues: (B, R), descending, in [0, 1]; padded with zeros if the images of a batch differ in rank, and to
+            R = M on accelerators, where reading the rank would stall the queue. Their gradient is exact, also for
+            repeated eigenvalues.
         ritz: T, (B, M, M), float64.
         root: G^(-1/2), (B, M, M), float64.
         support: (B, M) bool, which eigenvalues of T are above rounding.
@@ -110,9 +110,9 @@ class Spectrum(RitzPairs):
         scaling: d, (B, N).
         size: (H, W).
         largest: the first eigenvalue before it was clamped to 1, (B,).
-        weights: number of pixels that each point stands for, (B, N), or None: eigenvectors are orthonormal in the sum
+        weights: number of pixels that each point represents, (B, N), or None. Eigenvectors are orthonormal in the sum
             over points with these weights.
-        among: ranks that the rows of the image are spread over.
+        among: ranks that the rows of the image are distributed over.
     """
 
     eigenvalues: Tensor
@@ -124,29 +124,29 @@ class Spectrum(RitzPairs):
     among: Communicator = ALONE
 
     def to(self, target: Target, dtype: torch.dtype | None = None) -> "Spectrum":
-        """The spectrum on another device, or in another precision; as :meth:`NonlocalOperator.to`."""
+        """Move the spectrum to another device or precision, as :meth:`NonlocalOperator.to`."""
         return moved(self, target, dtype)
 
     @property
     def pixels(self) -> int:
-        """N, of the whole image; of weighted points the sum of their weights."""
+        """Number of pixels N of the whole image; for weighted points the sum of the weights."""
         if self.weights is not None:
             return round(float(self.among.sum(self.weights[0].sum())))
         return self.among.pixels(self.scaling.shape[1])
 
     @property
     def mass(self) -> Tensor:
-        """(B, N), the scaling d times the weights of the points, by which values are summed up."""
+        """Scaling d times the weights of the points, (B, N): the coefficients of sums over points."""
         return weighted(self.scaling, self.weights)
 
     @property
     def eigenvectors(self) -> Tensor:
-        """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero where those are padding.
+        """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero for padded eigenvalues.
 
-        The first is the constant one as far as the landmarks span it (exactly so for W; without completion to the
-        tolerance of the balancing), positive, also where the eigenvalue 1 is repeated. Differentiable, but with the
-        limits of :func:`torch.linalg.eigh`: the gradient is NaN where eigenvalues are equal. Results that do not depend
-        on the choice of eigenvectors (:func:`spectral_filter`, masks) always have an exact gradient.
+        The first is constant and positive as far as the landmarks span the constant vector (exactly so for W; without
+        completion to the tolerance of the balancing), also if the eigenvalue 1 is repeated. Differentiable, but with
+        the limits of :func:`torch.linalg.eigh`: the gradient is NaN if eigenvalues are equal. Results that do not
+        depend on the choice of eigenvectors (:func:`spectral_filter`, masks) always have an exact gradient.
         """
         return self._recorded if torch.is_grad_enabled() and self.ritz.matrix.requires_grad else self._constant
 
@@ -157,11 +157,11 @@ class Spectrum(RitzPairs):
     @cached_property
     @torch.no_grad()
     def _constant(self) -> Tensor:
-        """Cached apart from eigenvectors with a gradient, so that a call without gradients does not replace those."""
+        """Cached separately, so that a call without gradients does not replace eigenvectors that have a gradient."""
         return self._form(self.ritz.vectors)
 
     def _form(self, vectors: Tensor) -> Tensor:
-        """The eigenvectors (B, R, H, W) from those of T, (B, M, M)."""
+        """Form the eigenvectors (B, R, H, W) from those of T, (B, M, M)."""
         rank = self.eigenvalues.shape[1]
         vectors = (vectors * self.support.unsqueeze(1))[:, :, :rank]
         vectors = self._constant_first(vectors)
@@ -170,9 +170,9 @@ class Spectrum(RitzPairs):
 
     @full_precision
     def coefficients(self, image: Tensor) -> Tensor:
-        """``F y``, the only thing that a response depends on in an image: one read of the factor.
+        """Compute ``F y``, which determines ``f(W) y`` for every response f, in one read of the factor.
 
-        To apply several responses to one image, or to learn one, compute them once: see :func:`spectral_filter`.
+        To apply several responses to one image, or to learn one, compute ``F y`` once; see :func:`spectral_filter`.
 
         Args:
             image: y, (B, C, H, W).
@@ -190,7 +190,7 @@ class Spectrum(RitzPairs):
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
-        """``V f(S) V^T y``, (B, C, H, W), for a response f and coefficients (B, C, M) of y: one read of the factor."""
+        """Compute ``V f(S) V^T y``, (B, C, H, W), from a response f and coefficients (B, C, M) of y."""
         check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
@@ -227,7 +227,7 @@ def compute_spectrum(
     among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Spectrum:
-    """Spectrum of ``W``; ``remainder``, its diagonal part r, is None where W has none."""
+    """Compute the spectrum of ``W``; ``remainder`` is its diagonal part r, or None if it has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
     each = root_weighted(scaling, weights)
@@ -239,7 +239,7 @@ def compute_spectrum(
     shown = factor.shape[1] if is_hidden(factor) else int(pairs.support.sum(1).max())
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
-    # First-order perturbation: the derivative of an eigenvalue is v^T dT v, repeated or not.
+    # First-order perturbation: the derivative of an eigenvalue is v^T dT v, also for repeated ones.
     vectors = pairs.ritz.vectors
     values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
@@ -251,15 +251,15 @@ def compute_spectrum(
 def compute_grams(
     factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, *, exact: bool = False
 ) -> Tensor:
-    """:func:`sum_grams`, differentiable; ``exact`` works in float64."""
+    """:func:`sum_grams` with a gradient, in float64 if ``exact``."""
     recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else _exact_or_quick  # transforms of torch.func do not support such a class
+    sums = _Grams.apply if recorded else _exact_or_quick  # torch.func transforms do not support the class
     grams: Tensor = sums(factor, scaling, remainder, count, exact)
     return grams
 
 
 def _exact_or_quick(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, exact: bool) -> Tensor:
-    """:func:`sum_grams`, in float64 if ``exact``, some pixels at a time."""
+    """:func:`sum_grams`; if ``exact``, in float64, block by block."""
     if not exact:
         return sum_grams(factor, scaling, remainder, count)
     total = factor.new_zeros(())
@@ -270,7 +270,7 @@ def _exact_or_quick(factor: Tensor, scaling: Tensor, remainder: Tensor | None, c
 
 
 class _Grams(torch.autograd.Function):
-    """:func:`sum_grams` with a gradient that keeps none of its blocks."""
+    """:func:`sum_grams` with a hand-written gradient, for which no intermediate blocks are stored."""
 
     @staticmethod
     def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, exact: bool) -> Tensor:

@@ -220,7 +220,7 @@ def film_steps(recipe: Recipe) -> tuple[Step, ...]:
     """
     for step in recipe.steps:
         if step.strokes or step.declared.requires_strokes:
-            raise ValueError(f"edits of a film must be without strokes, got {step.edit} with some; remove that step")
+            raise ValueError(f"edits of a film must not have strokes, got {step.edit} with strokes; remove that step")
     return tuple(
         step.changed(
             spatial_bandwidth="none" if "none" in step.declared["spatial_bandwidth"].words else UNLIMITED_BANDWIDTH

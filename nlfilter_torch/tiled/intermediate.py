@@ -30,7 +30,7 @@ def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iter
                 file.write(np.ascontiguousarray(values).tobytes())
             except OSError as error:
                 gigabytes = kind.itemsize * np.prod(shape) / 1e9
-                reason = f"{error.strerror}, where one step of the edit leaves {gigabytes:.1f} GB to the next"
+                reason = f"{error.strerror}, for a temporary file of {gigabytes:.1f} GB between two steps of the edit"
                 raise OSError(error.errno, reason, str(folder)) from error
         file.flush()
         yield np.memmap(file, kind, "r", shape=shape)

@@ -121,7 +121,7 @@ class Picture:
         if stored.shape != wanted or tuple(self.source.shape[:2]) != self.size:
             raise ValueError(
                 f"{self.name} must keep its size while it is read, {self.size[0]} rows of {self.size[1]}, but gave "
-                f"{stored.shape} for {wanted}; let nothing write to it meanwhile"
+                f"{stored.shape} for {wanted}; make sure that nothing writes to it"
             )
         stored = stored.reshape(last - first, self.size[1], self.samples)
         values: NDArray[np.floating[Any]] = stored[..., : self.colours].astype(

@@ -64,8 +64,8 @@ def read_scribbles(
     over = None if colours is None else _overlay(picture, colours, strokes)
     if over is not None and over.samples != (4 if mask is None else 3):
         raise ValueError(
-            f"{strokes} must have 3 channels and a stroke_mask, or 4 channels and none, got {over.samples} "
-            f"{'without' if mask is None else 'with'} one; add or drop it"
+            f"{strokes} must have 3 channels with a stroke_mask, or 4 channels without one, got {over.samples} "
+            f"channels {'without' if mask is None else 'with'} a stroke_mask; add or drop it"
         )
     called, weights = name, _transparency(over) if mask is None and over is not None else None
     if weights is None:
@@ -132,6 +132,6 @@ def check_scribble_memory(picture: Picture, count: int, num_features: int, memor
     needed = count * floats_per_scribbled_pixel(num_features) * picture.dtype.itemsize
     if needed > memory:
         raise MemoryError(
-            f"the strokes on {picture.name} cover {count} pixels or more and need {needed / 1e6:.0f} MB of memory, but "
-            f"{memory / 1e6:.0f} MB may be used; paint less, or allow more"
+            f"the strokes on {picture.name} cover at least {count} pixels and need {needed / 1e6:.0f} MB of memory, "
+            f"but only {memory / 1e6:.0f} MB may be used; paint less, or allow more memory"
         )

@@ -266,7 +266,7 @@ class Tiled:
         needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
         if needed > self.passes.memory:
             raise MemoryError(
-                f"{self.picture.name} needs {needed / 1e6:.0f} MB of memory at least, but "
+                f"{self.picture.name} needs at least {needed / 1e6:.0f} MB of memory, but only "
                 f"{self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
         return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
@@ -377,8 +377,8 @@ class Tiled:
         most = self.passes.memory // row - 2 * fitted.margin
         if self.size[0] > most and most < fitted.step:
             raise MemoryError(
-                f"{self.picture.name} needs {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory at least, "
-                f"but {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+                f"{self.picture.name} needs at least {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory, "
+                f"but only {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
         rows = max(rows, (1 if self.passes.tile_rows else 4) * fitted.margin)
         if (1 + workers) * row * (rows + 2 * fitted.margin) > self.passes.memory:

@@ -123,9 +123,9 @@ def check_target(target: RowTarget, source: RowSource, *, coloured: bool = False
     picture, shape, what = Picture(source), tuple(source.shape), "the shape of the source"
     if coloured:
         shape = (*picture.size, 3 if picture.samples in (1, 3) else 4)
-        what = "the height and width of the source, three colours, and transparency where that has it"
+        what = "the height and width of the source, three colours, and its transparency if it has one"
     if tuple(target.shape) != shape:
-        raise ValueError(f"target must have {what}, {shape}, got {tuple(target.shape)}; make one of that shape")
+        raise ValueError(f"target must have {what}, {shape}, got {tuple(target.shape)}; pass one of that shape")
 
 
 def fill(target: RowTarget, rows: Rows) -> None:
@@ -172,8 +172,8 @@ def rows_that_fit(
     least = bytes_needed(picture, passes, num_features, num_landmarks, extra_floats)
     if max(row, least) > passes.memory:
         raise MemoryError(
-            f"{picture.name} needs {max(row, least) / 1e6:.0f} MB of memory at least, but {passes.memory / 1e6:.0f} MB "
-            "may be used; allow more, or use fewer landmarks"
+            f"{picture.name} needs at least {max(row, least) / 1e6:.0f} MB of memory, but only "
+            f"{passes.memory / 1e6:.0f} MB may be used; allow more, or use fewer landmarks"
         )
     tiles, together = 1 + passes.workers(num_landmarks), passes.chunk_rows(picture.size[1]) * picture.size[1]
     taken = picture.dtype.itemsize * extra_floats + (tiles - 1) * factor_bytes(together, num_landmarks)

@@ -1,1 +1,1 @@
-"""The package inside other projects, and under what torch itself does with models and tensors."""
+"""The package inside other projects, and with torch's own handling of models and tensors."""

@@ -1,8 +1,8 @@
 """Fake tensors on the device "cuda", on machines without a GPU.
 
-torch asks a guard of the device before it does anything there, and a torch without CUDA has none. One that does nothing
-is compiled here. Fake tensors have shapes, dtypes and devices but no values: tensors of two devices in one operation,
-and every look at a value, raise.
+torch requires a device guard for operations on a device, and a build without CUDA has none for it. A guard that does
+nothing is compiled here. Fake tensors have shapes, dtypes and devices but no values: operations on tensors of two
+devices, and reading a value, raise an error.
 """
 
 import ctypes
@@ -23,7 +23,7 @@ namespace c10::impl { C10_REGISTER_GUARD_IMPL(CUDA, NoOpDeviceGuardImpl<DeviceTy
 
 @cache
 def missing() -> str:
-    """Why fake tensors on "cuda" do not work here; empty where they do. The first call compiles the guard."""
+    """Return why fake tensors on "cuda" do not work here, empty if they do. The first call compiles the guard."""
     if torch.cuda.is_available():
         return ""
     compiler = shutil.which("c++")

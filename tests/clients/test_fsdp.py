@@ -1,4 +1,4 @@
-"""FSDP2: parameters that are sharded over two processes learn what one process learns."""
+"""FSDP2: parameters sharded over two processes learn what one process learns."""
 
 from pathlib import Path
 

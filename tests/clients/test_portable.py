@@ -24,7 +24,7 @@ NLFILTER = torch.ops.nlfilter
     ],
 )
 def test_the_exported_computation_is_the_layer(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it is while a layer is exported, but on tensors with values."""
+    """The code paths of an export, run on tensors with values."""
     layer = NonlocalFilter((3.0, 3.0, 4.0, 1.05), learn=(), num_landmarks=50, **options)
     picture = torch.cat([colour("astronaut", 40, 50), colour("coffee", 40, 50)])
     expected = layer(picture)

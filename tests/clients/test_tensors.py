@@ -1,4 +1,4 @@
-"""Operators and layers are treated by torch as tensors and modules are: moved, saved, faked, empty, transformed."""
+"""Operators and layers under torch: moving, saving, fake tensors, empty batches and transforms."""
 
 import io
 from collections.abc import Callable
@@ -51,7 +51,7 @@ def tensors(value: Any) -> list[Tensor]:
 
 
 def edited(operator: NonlocalOperator, picture: Tensor) -> Tensor:
-    """What makes use of every part of an operator: itself, its spectrum, and columns of another picture."""
+    """Apply every part of an operator: the operator, its spectrum, and columns of another picture."""
     fitted = fit_filter(operator, picture)
     return torch.cat([polynomial_filter(operator, picture, SLIDERS, residual=0.5), fitted(picture.flip(3), SLIDERS)])
 
@@ -103,7 +103,7 @@ def test_operators_spectra_and_fitted_filters_load_as_weights_only(landmarks: st
     saved = operator(landmarks=landmarks, spatial_bandwidth=torch.tensor(9.0))
     torch.testing.assert_close(edited(loaded(saved), picture), edited(saved, picture), atol=0, rtol=0)
     spectrum = saved.spectrum()
-    _ = spectrum.eigenvectors  # is kept in the spectrum
+    _ = spectrum.eigenvectors  # is cached in the spectrum
     again = loaded(spectrum)
     torch.testing.assert_close(again.eigenvectors, spectrum.eigenvectors, atol=0, rtol=0)
     torch.testing.assert_close(
@@ -136,7 +136,7 @@ def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) ->
         assert (found.shape, found.dtype) == (picture.shape, dtype)
 
 
-# --- empty batches, and the order of numbers in memory
+# --- empty batches and memory formats
 
 
 @pytest.mark.client("empty batches", "yes; edits of photographs refuse them")
@@ -174,7 +174,7 @@ def test_the_order_in_memory_is_kept(order: torch.memory_format) -> None:
     torch.testing.assert_close(found[0], layer(image()), atol=2e-6, rtol=0)
 
 
-# --- transforms that building refuses
+# --- transforms that building an operator refuses
 
 
 def traced(function: Callable[[Tensor], Tensor]) -> object:

@@ -66,7 +66,7 @@ def test_a_model_of_the_hub_is_loaded_with_its_options(tmp_path: Path) -> None:
 
 
 class Filtered(Dataset[torch.Tensor]):
-    """Pictures that are filtered where they are asked for."""
+    """Pictures that are filtered when they are loaded."""
 
     def __len__(self) -> int:
         return 2

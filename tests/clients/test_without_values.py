@@ -1,8 +1,8 @@
-"""Every public function where values cannot be read: on a GPU each such read would stall its queue.
+"""Every public function on tensors whose values cannot be read: on a GPU each read would synchronise.
 
-Forward on fake tensors on "cuda", where tensors of two devices do not mix either; forward and backward on "meta", as
-torch's engine of derivatives does not start on a device that is not there. What has to read values is listed with its
-reason in docs/training.md.
+Forward runs on fake tensors on "cuda", which also detect mixed devices; forward and backward run on "meta", as
+autograd does not start on a device that does not exist. Functions that have to read values are listed in
+docs/training.md with the reasons.
 """
 
 import re
@@ -112,7 +112,7 @@ CLASSES = {"Certificate", "Diagnostics", "FittedLook", "NonlocalOperator", "Spec
 
 @pytest.fixture
 def anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run kornia's blur, which reads its width from a tensor on the processor; in fake mode that one is fake, too."""
+    """Replace kornia's blur, which reads its width from a tensor on the CPU; in fake mode that tensor is fake too."""
     monkeypatch.setattr("kornia.filters.gaussian_blur2d", lambda image, *_: F.avg_pool2d(image, 3, 1, 1))
 
 
@@ -152,7 +152,7 @@ def test_backward_reads_no_value(case: str) -> None:
 @pytest.mark.usefixtures("anywhere")
 @pytest.mark.parametrize(
     ("case", "device"),
-    # Whether a tensor on "meta" is true, torch answers without an error.
+    # torch returns the truth value of a tensor on "meta" without an error.
     [
         (case, device)
         for case in READS

@@ -1,4 +1,4 @@
-/* Gradients through the columns of the Nystrom factor; the formulas are in operator/nystrom.py. */
+/* Gradients through the columns of the Nystrom factor; defined in columns.py. */
 
 /* Gradient of a tile of columns before they were scaled to norm at most 1, from the gradient after scaling. */
 INLINE void NAME(column_gradients)(const struct backward *task, long start, long width, float *gradient, float *spare)
@@ -71,8 +71,8 @@ INLINE void NAME(add_products)(const float *left, long left_step, const float *r
 }
 
 /* Gradients of the features of pixels first to last. totals += the gradient of the inverse Cholesky factor (M, M),
- * followed by the products of slopes and features (M, D + 1) from which the gradient of the landmarks is made. Works on
- * as many tiles at a time as fit the cache. */
+ * followed by the products of slopes and features (M, D + 1), from which the gradient of the landmarks is computed.
+ * Processes as many tiles together as fit the cache. */
 static TARGET void NAME(backward)(const struct backward *task, long first, long last, float *scratch, double *totals)
 {
     const long size = task->columns.size, num_landmarks = task->columns.num_landmarks;

@@ -1,4 +1,4 @@
-"""What k-means takes: the points to start from, pivots of a random Cholesky decomposition, and Lloyd's iteration."""
+"""Parts of k-means: initial centroids, from randomly pivoted Cholesky decomposition, and Lloyd's iteration."""
 
 from collections.abc import Callable
 
@@ -7,25 +7,25 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels.library import contiguous, register, run
 
-CACHED_SCORES = 1 << 20  # of points against centres; on a processor a batch goes in parts with no more
+CACHED_SCORES = 1 << 20  # scores of points and centres; on CPUs a batch is divided into parts with at most this many
 
 
 def draw_pivots(
     affinities: Callable[[Tensor], Tensor], residual: Tensor, divisor: Tensor, draws: Tensor, captured: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pivots (B, 1, M) of a random Cholesky decomposition, its rows (B, M, S), and what they were divided by, (B, M).
+    """Randomly pivoted Cholesky decomposition: pivots (B, 1, M), rows (B, M, S) and divisors of the rows (B, M).
 
     Args:
-        affinities: from pivots (B, 1, 1) to their rows (B, 1, S) of the matrix.
-        residual: its diagonal, (B, 1, S).
-        divisor: of the chances to be drawn, (B, 1, S).
-        draws: (M,) in [0, 1).
-        captured: a residual that counts as none.
+        affinities: computes rows (B, 1, S) of the matrix for pivots (B, 1, 1).
+        residual: diagonal of the matrix, (B, 1, S).
+        divisor: divisor of the probabilities in the draw, (B, 1, S).
+        draws: random numbers (M,) in [0, 1).
+        captured: lower bound of residuals; a smaller residual counts as captured.
     """
     rows = residual.new_zeros(residual.shape[0], len(draws), residual.shape[2])
     found, scales = [], []
     for step, draw in enumerate(draws.unbind()):
-        # Summed in float64, as in C: rounding must not decide which of thousands is drawn.
+        # Summed in float64, as in C, so that rounding does not decide which of thousands of points is drawn.
         summed = (chance(residual, captured) / divisor).cumsum(2, dtype=torch.float64)
         pivot = torch.searchsorted(summed, draw * summed[:, :, -1:]).clamp_(max=residual.shape[2] - 1)  # (B, 1, 1)
         before = rows[:, :step]
@@ -40,17 +40,17 @@ def draw_pivots(
 
 
 def chance(residual: Tensor, captured: float) -> Tensor:
-    """Relative probability of a pivot."""
+    """Unnormalised probability of drawing a point as a pivot: the fourth power of its residual."""
     return residual.clamp(min=captured).square().square()
 
 
 def affinities_between(points: Tensor, norms: Tensor, others: Tensor, lengths: Tensor) -> Tensor:
-    """Affinities (B, M, S) of points (B, D, S) and others (B, D, M), with their squared norms (B, 1, S), (B, 1, M)."""
+    """Affinities (B, M, S) of points (B, D, S) to others (B, D, M), given squared norms (B, 1, S) and (B, 1, M)."""
     return torch.baddbmm(norms + lengths.mT, others.mT, points, beta=-1, alpha=2).clamp_(-60.0, 0.0).exp_()
 
 
 def pick(planes: Tensor, at: Tensor) -> Tensor:
-    """Columns (B, R, M) of planes (B, R, S) at indices (B, 1, M)."""
+    """Columns (B, R, M) of planes (B, R, S) with indices (B, 1, M)."""
     return planes.gather(2, at.expand(-1, planes.shape[1], -1))
 
 
@@ -69,9 +69,9 @@ def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
 
 @register("pivots(Tensor points, Tensor draws, float captured) -> Tensor", _compiled_pivots, _fake_pivots)
 def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
-    """Pivots (B, M) of a random Cholesky decomposition of the affinities of points (B, D, S).
+    """Pivots (B, M) of a randomly pivoted Cholesky decomposition of the affinities of points (B, D, S).
 
-    Each is drawn by one of the ``draws`` (M,) in [0, 1). A residual ``captured`` of the unit diagonal counts as none.
+    Uses the random numbers ``draws``, (M,) in [0, 1), one per pivot; see :func:`draw_pivots` for ``captured``.
     """
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
     ones = torch.ones_like(norms)
@@ -99,22 +99,22 @@ def _fake_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -
 
 @register("lloyd(Tensor points, Tensor start, int iterations, float margin) -> Tensor", _compiled_lloyd, _fake_lloyd)
 def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
-    """The nearest centre (B, S) to each of the points (B, D, S), after steps of Lloyd's from the centres (B, D, M).
+    """Run Lloyd's iteration from centres (B, D, M); return the index (B, S) of the nearest centre of points (B, D, S).
 
-    The first of those that are as near but for ``margin`` times the terms of which scores are the sums.
+    Scores that differ by less than ``margin`` times the magnitude of their terms are ties; the first index wins.
     """
     together = max(1, CACHED_SCORES // (points.shape[2] * start.shape[2]))
     if points.device.type == "cpu" and together < points.shape[0]:
         parts = zip(points.split(together), start.split(together), strict=True)
         return torch.cat([lloyd(*part, iterations, margin) for part in parts])
-    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # distances, or sums and sizes, in a product
+    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # for scores, and for sums and sizes
     slack = margin * points.square().sum(1).unsqueeze(2)  # (B, S, 1)
     centres = start
     for step in range(iterations + 1):
-        # Half the squared length of points, less half their squared distance to centres, (B, S, M).
+        # Half the squared norm of points minus half their squared distance to centres, (B, S, M).
         score = extended.mT @ torch.cat([centres, -0.5 * centres.square().sum(1, keepdim=True)], dim=1)
         best = score.amax(2, keepdim=True)
-        nearest = (score >= best - (slack + margin * best.abs())).byte().argmax(2)  # the first of those nearest
+        nearest = (score >= best - (slack + margin * best.abs())).byte().argmax(2)  # the first of the nearest
         if step == iterations:
             break
         members = score.zero_().scatter_(2, nearest.unsqueeze(2), 1.0)

@@ -110,7 +110,7 @@ static void run_backward(struct work *work, long image, long piece, long first, 
     SETS[work->level].backward(&task, first, last, scratch, totals);
 }
 
-/* The gradient of the columns is left right. If `left` is NULL, it is `right` and `rank` the number of landmarks. */
+/* The gradient of the columns is left right; if `left` is NULL, it is `right` and `rank` the number of landmarks. */
 int nlfilter_backward(int level, int threads, long pixels, long images, long size, long num_landmarks,
                       const float *features, long features_step, long features_stride, const float *centre,
                       const float *landmarks, const float *inverse_cholesky, float floor, int limited, float *factor,

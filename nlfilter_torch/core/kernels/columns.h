@@ -1,4 +1,4 @@
-/* Columns of the Nystrom factor from features; defined in operator/nystrom.py. */
+/* Columns of the Nystrom factor from features; defined in columns.py. */
 
 /* Load a tile of centred features x and append a row of ones and a row of |x|^2. Pixels past the image are 0. */
 INLINE void NAME(load_features)(const struct columns *task, long start, long width, float *features, float *edge)
@@ -60,7 +60,7 @@ static TARGET void NAME(columns)(const struct columns *task, long first, long la
                     norm[v] += sums[r][v] * sums[r][v];
                 }
         }
-        /* Only rounding makes a norm exceed 1, but it can do so for many pixels: all those equal to a landmark. */
+        /* Norms exceed 1 only by rounding, but possibly at many pixels: all those equal to a landmark. */
         FLOATS scale[VECTORS];
         for (int v = 0; v < VECTORS; v++)
             *(FLOATS *)(edge + v * LANES) = norm[v];

@@ -1,4 +1,4 @@
-"""Columns of the Nystrom factor, and their derivatives."""
+"""Columns of the Nystrom factor, and their gradients."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from nlfilter_torch.core.values import is_hidden
 
 
 def _empty(features: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor]:
-    """A factor to be filled, and norms that are 1 where nothing else is written."""
+    """An uninitialised factor, and squared norms initialised to 1."""
     batch, _, pixels = features.shape
     return large_empty((batch, landmarks.shape[2], pixels), features), features.new_ones(batch, pixels)
 
@@ -45,10 +45,10 @@ def _compiled_columns(
     _fake_columns,
 )
 def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool) -> tuple[Tensor, Tensor]:
-    """Columns (B, M, N) of the Nystrom factor, and their squared norms (B, N) before they were shortened to norm 1.
+    """Compute columns (B, M, N) of the Nystrom factor, and their squared norms (B, N) before limiting.
 
-    From features (B, D, N), landmarks (B, D, M) and the inverse Cholesky factor (B, M, M) of their affinities. If
-    columns are not ``limited`` to norm 1, the squared norms are ones.
+    Takes features (B, D, N), landmarks (B, D, M) and the inverse Cholesky factor (B, M, M) of the landmark block. If
+    ``limited``, columns are scaled to norm at most 1; otherwise the returned norms are ones.
     """
     factor, norms = _empty(features, landmarks)
     batch, pixels = norms.shape
@@ -58,10 +58,10 @@ def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limit
     parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
     for block, (first, second) in buffered_blocks(columns_of, 2):
         kernel, _ = affinity(parts[:, :, block], first)
-        found = torch.bmm(inverses, kernel, out=second)  # into a buffer: rows of the factor are far apart
+        found = torch.bmm(inverses, kernel, out=second)  # into a buffer, since rows of the factor are far apart
         if limited:
             norm = torch.sum(torch.square(found, out=first), 1, out=norms_of[:, block])
-            # Norms exceed 1 by rounding alone, most blocks need no scaling; looking is a wait on accelerators.
+            # Norms exceed 1 only by rounding, and most blocks need no scaling. Accelerators scale without checking.
             if is_hidden(features) or norm.max().item() > 1.0:
                 found.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
         columns_of[:, :, block] = found
@@ -85,7 +85,7 @@ def _compiled_backward(
     affinity = Affinity(landmarks, limited)
     if affinity.exact:
         return None
-    # The products of these with the derivatives by the exponents move the features.
+    # Times the gradients with respect to the exponents, these give those with respect to the features.
     points = 2.0 * torch.cat([affinity.landmarks, torch.ones_like(landmarks[:, :1])], dim=1)  # (B, D + 1, M)
     grad_features = large_empty(features.shape, features)
     features, factor, right = map(by_rows, (features, factor, gradient[-1]))
@@ -101,7 +101,7 @@ def _compiled_backward(
         sums.data_ptr(),
     )  # fmt: skip
     grad_inverse, products = sums.split([count * count, count * (size + 1)], dim=1)
-    products = products.unflatten(1, (count, size + 1))  # of the derivatives by the exponents with features and 1
+    products = products.unflatten(1, (count, size + 1))  # of the gradients of the exponents with (features, 1)
     grad_landmarks = 2.0 * (products[:, :, :-1].mT - affinity.landmarks * products[:, None, :, -1])
     by_landmarks, by_inverse = contiguous(grad_landmarks.float(), grad_inverse.unflatten(1, (count, count)).float())
     return grad_features, by_landmarks, by_inverse
@@ -123,12 +123,12 @@ def columns_backward(
     gradient: Sequence[Tensor],
     diagonal: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of :func:`columns` by features, landmarks and the inverse Cholesky factor.
+    """Gradients of :func:`columns` with respect to features, landmarks and the inverse Cholesky factor.
 
-    Of a factor that is a triangle, entries above the diagonal may be left out. Beside the arguments of the columns
-    (B, M, N), it takes these, what they were shortened by, (B, N), and the gradient of the loss: by the columns, as
-    (B, M, r) and (B, r, N) whose product it is or as itself alone, (B, M, N), and by 1 - |u|^2, (B, N), where that is
-    not negative.
+    Besides the arguments of :func:`columns`, it takes the columns (B, M, N), the ``scale`` (B, N) by which they were
+    limited, and gradients of the loss: ``gradient`` with respect to the columns, (B, M, N) or the pair (B, M, r) and
+    (B, r, N) whose product it is, and ``diagonal`` (B, N) with respect to 1 - |u|^2 where that is not negative. For a
+    triangular inverse Cholesky factor, its gradient above the diagonal may be omitted.
     """
     grad_features = large_empty(features.shape, features)
     batch, pixels = scale.shape
@@ -146,13 +146,13 @@ def columns_backward(
         part = right[:, :, block]
         grad = second.copy_(part) if left is None else torch.bmm(left, part, out=second)
         if limited:
-            # Columns scaled to u / |u| lose the gradient along themselves; the others gain that of 1 - |u|^2.
+            # Columns scaled to u / |u| have no gradient along themselves; the others add the gradient of 1 - |u|^2.
             shrink = scale[:, None, block]
             along = torch.mul(factor[:, :, block], grad, out=third).sum(1, keepdim=True)
             along = torch.where(shrink < 1.0, along, 2.0 * diagonal[:, None, block])
             grad.sub_(torch.mul(factor[:, :, block], along, out=third)).mul_(shrink)
         grad_inverse += grad @ kernel.mT
-        # K_im = exp(-|x_i - z_m|^2): its derivative is -2 (x_i - z_m) K_im in x_i and the opposite in z_m.
+        # K_im = exp(-|x_i - z_m|^2) has the derivative -2 (x_i - z_m) K_im in x_i, and its negative in z_m.
         pull = torch.bmm(inverse_cholesky.mT, grad, out=third).mul_(kernel)  # (B, M, n)
         grad_parts[:, :, block] = 2.0 * (affinity.landmarks @ pull - centred * pull.sum(1, keepdim=True))
         grad_landmarks += 2.0 * (centred @ pull.mT - affinity.landmarks * pull.sum(2).unsqueeze(1))
@@ -163,5 +163,5 @@ def columns_backward(
 
 
 def _repeat(matrices: Tensor, count: int) -> Tensor:
-    """Matrices (1, ., .) for each of the strips of an image; those of a batch, (B, ., .), which counts as one, once."""
+    """Repeat matrices (1, ., .) for each of ``count`` strips of an image; for a batch (B, ., .), ``count`` is 1."""
     return matrices.repeat(count, 1, 1)

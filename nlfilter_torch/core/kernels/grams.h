@@ -1,4 +1,4 @@
-/* Gram matrices of the scaled factor; see operator/spectrum.py. */
+/* Gram matrices of the scaled factor; defined in grams.py. */
 
 /* totals (J, M, M) += F diag(r^j) F^T over pixels first to last, with F = factor diag(d). Lower triangles only. */
 static TARGET void NAME(grams)(const struct grams *task, long first, long last, float *scratch, double *totals)

@@ -22,10 +22,10 @@ def _compiled_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, c
 
 @register("grams(Tensor factor, Tensor scaling, Tensor? remainder, int count) -> Tensor", _compiled_grams, _fake_grams)
 def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
-    """``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64, block by block.
+    """Compute ``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64.
 
-    F is formed before it is squared: without completion d alone may be too large, and the factor alone too small. The
-    factor is (B, M, N), d and r are (B, N); one sum needs no r.
+    F is formed before the product: without completion d^2 may overflow, and products of the factor underflow. The
+    factor is (B, M, N), d and r are (B, N); r is not needed if ``count`` is 1.
     """
     batch, landmarks, pixels = factor.shape
     parts = strip_count(batch, pixels, factor.device)
@@ -52,5 +52,5 @@ def _compiled_gram(factor: Tensor, weights: Tensor) -> Tensor:
 
 @register("gram(Tensor factor, Tensor weights) -> Tensor", _compiled_gram, _fake_gram)
 def gram(factor: Tensor, weights: Tensor) -> Tensor:
-    """``factor diag(weights) factor^T``, (B, M, M) in the precision of the factor, for weights (B, N) from zero."""
+    """``factor diag(weights) factor^T``, (B, M, M) in the precision of the factor, for weights (B, N) >= 0."""
     return (factor * weights.unsqueeze(1)) @ factor.mT

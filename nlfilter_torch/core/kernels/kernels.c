@@ -5,9 +5,9 @@
  * memory, these kernels keep distances, exponentials and norms in registers, and skip the zero triangle of the inverse
  * Cholesky factor. Tall-skinny products read the factor once, at memory bandwidth.
  *
- * The image is divided into pieces. Per-pixel results do not depend on the number of threads. Sums over pixels are
- * accumulated in float64 within each piece, and the pieces are added in order. Functions return 0 on success and -1 if
- * memory cannot be allocated. */
+ * Images are divided into pieces. Per-pixel results do not depend on the number of threads. Sums over pixels are
+ * accumulated in float64 within each piece, and the sums of the pieces are added in order. Functions return 0 on
+ * success and -1 if memory cannot be allocated. */
 
 #include <math.h>
 #ifdef __x86_64__
@@ -70,7 +70,7 @@ const struct set SETS[] = {
     {6, columns_neon, backward_neon, spread_neon, gather_neon, sweep_neon, grams_neon, assign_neon, pivots_neon},
 };
 
-/* Every processor of this kind has NEON. */
+/* Every AArch64 processor has NEON. */
 int nlfilter_level(void) { return 1; }
 #else
 #error "the kernels are for x86-64 and AArch64"

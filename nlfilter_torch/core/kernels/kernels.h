@@ -5,8 +5,8 @@
  *   LANES     floats per register,
  *   ROWS      rows of a product computed together,
  *   VECTORS   registers of pixels processed together; ROWS * VECTORS sums stay in registers,
- *   STREAM    non-temporal store of a register, to an address aligned to its size, where there is one,
- *   FENCE     what completes such stores.
+ *   STREAM    non-temporal (if available) store of a register to an address aligned to its size,
+ *   FENCE     completes non-temporal stores.
  *
  * Pixels lie along the lanes, so sums over landmarks or patch positions need no shuffles. */
 
@@ -17,8 +17,8 @@ typedef int NAME(ints) __attribute__((vector_size(4 * LANES), aligned(4), may_al
 #define PIXELS (LANES * VECTORS) /* in a tile of affinities */
 #define INLINE static inline TARGET __attribute__((always_inline))
 
-/* The numbers of a register in another order. */
-#ifdef __clang__ /* which finds the shuffle by itself */
+/* The elements of a register in another order. */
+#ifdef __clang__ /* compiles the loop to a shuffle */
 INLINE FLOATS NAME(shuffle)(FLOATS x, INTS order)
 {
     FLOATS shuffled;
@@ -34,7 +34,7 @@ INLINE FLOATS NAME(shuffle)(FLOATS x, INTS order)
 /* 2^x to 1e-7 for -126 < x <= 0, and NaN for NaN. The polynomial is the minimax one on [-1/2, 1/2]. */
 INLINE FLOATS NAME(exp2)(FLOATS x)
 {
-    const float shift = 12582912.0f; /* 1.5 * 2^23: adding it leaves the nearest integer in the lowest bits */
+    const float shift = 12582912.0f; /* 1.5 * 2^23: adding it puts the nearest integer in the lowest bits */
     FLOATS shifted = x + shift, part = x - (shifted - shift);
     FLOATS value = part * 0.0001534581242594868f + 0.0013399930903688073f;
     value = value * part + 0.009618489071726799f;
@@ -123,7 +123,7 @@ INLINE float NAME(total)(FLOATS x)
     return x[0];
 }
 
-/* PIXELS numbers from source. If only `width` of them are in the image, a copy in `edge` padded with `fill`. */
+/* PIXELS elements of source. If only `width` of them are in the image, a copy in `edge` padded with `fill`. */
 INLINE const float *NAME(fetch)(const float *source, long width, float fill, float *edge)
 {
     if (width == PIXELS)

@@ -1,8 +1,8 @@
-/* Choice of landmarks; see operator/landmarks.py. */
+/* Choice of landmarks; defined in clusters.py. */
 
-/* Nearest of the packed centres (c, -|c|^2 / 2) to each point x of (D, S), the one with the largest score
- * x . c - |c|^2 / 2. Scores within rounding of each other are ties, and the first one wins. sums (M, D + 1) += the
- * points of each cluster and their number. */
+/* Nearest of the packed centres (c, -|c|^2 / 2) to each point x of (D, S): the centre with the largest score
+ * x . c - |c|^2 / 2. Scores within rounding of each other are ties; the first index wins. sums (M, D + 1) += the sum
+ * of the points of each cluster, and their number. */
 static TARGET void NAME(assign)(const struct lloyd *task, const float *points, const float *centres, float *tile,
                                 int *nearest, float *sums)
 {
@@ -15,7 +15,7 @@ static TARGET void NAME(assign)(const struct lloyd *task, const float *points, c
             memcpy(tile + k * PIXELS, points + k * count + start, width * sizeof(float));
             memset(tile + k * PIXELS + width, 0, (PIXELS - width) * sizeof(float));
         }
-        FLOATS bar[VECTORS], slack[VECTORS]; /* best score plus its margin of rounding, and the part of it due to x */
+        FLOATS bar[VECTORS], slack[VECTORS]; /* best score plus its rounding margin; the margin's part due to x */
         INTS chosen[VECTORS];
         for (int v = 0; v < VECTORS; v++) {
             bar[v] = (FLOATS){0} - INFINITY;
@@ -70,7 +70,7 @@ INLINE void NAME(accumulate)(const float *left, long step, const float *right, l
 }
 
 /* Pivots (M) of a randomly pivoted Cholesky decomposition of the affinities between points (D, S), with S a multiple of
- * LINE; see operator/landmarks.py. Scratch holds norms, residuals and the columns (M, S). */
+ * LINE. Scratch holds norms, residuals and the columns (M, S). */
 static TARGET void NAME(pivots)(const struct pivots *task, const float *points, long *pivots, float *scratch)
 {
     const long size = task->size, count = task->count;

@@ -1,9 +1,8 @@
-"""The kernels in C, and how torch's dispatcher comes to call them.
+"""The kernels in C, and their registration with torch's dispatcher.
 
 They are compiled when the package is installed (``hatch_build.py``) or its wheel is built, for Linux on x86-64 and
-AArch64, by GCC or Clang. Nothing is compiled or looked for later. Each belongs to an operator of
-``torch.ops.nlfilter``, whose definition in torch computes the same everywhere else: on other devices, in other dtypes,
-under transforms and for derivatives.
+AArch64, by GCC or Clang; never at run time. Each belongs to an operator of ``torch.ops.nlfilter``, whose definition in
+torch computes the same in all other cases: on other devices, in other dtypes, under transforms and for derivatives.
 """
 
 import ctypes
@@ -18,7 +17,7 @@ from torch.autograd import forward_ad
 
 from nlfilter_torch.core import instruction_sets
 
-SMALL = 1 << 15  # numbers of a factor below which a second thread takes longer to call than it saves
+SMALL = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
 OPERATORS = torch.library.Library("nlfilter", "DEF")
 Definition = TypeVar("Definition", bound=Callable[..., Any])
 
@@ -26,7 +25,7 @@ _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ct
 
 
 def _load() -> ctypes.CDLL | None:
-    """The compiled library, if the installation has one."""
+    """Load the compiled library, if the installation has one, and declare its functions."""
     library = instruction_sets.load_library()
     if library is None:
         return None
@@ -47,27 +46,27 @@ def _load() -> ctypes.CDLL | None:
 
 
 def _openmp() -> Any:
-    """The function by which torch's OpenMP library runs another on its threads; None where torch has another library.
+    """``GOMP_parallel`` of torch's OpenMP library, which runs a function on its threads; None for other libraries.
 
-    It is looked for in torch's own library and what that is linked to: torch has no operator that calls a function on
-    its threads, and in C++ torch calls this one.
+    It is looked up in torch's own library and those it links to, since torch has no operator that calls a function on
+    its threads; torch's C++ code calls the same function.
     """
     path = Path(torch.__file__).with_name("lib") / "libtorch_cpu.so"
     return getattr(ctypes.CDLL(str(path)), "GOMP_parallel", None) if path.exists() else None
 
 
 def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
-    """Let kernels run on the threads of an OpenMP library, by its ``GOMP_parallel``; None has them start their own."""
+    """Let kernels run on the threads of an OpenMP library, by its ``GOMP_parallel``; with None they use their own."""
     library.nlfilter_share_threads(ctypes.cast(openmp, _POINTER) if openmp is not None else None)
 
 
 _library = _load()
-level = instruction_sets.level(_library)  # of instruction_sets.NAMES, what this processor and installation can do
+level = instruction_sets.level(_library)  # index of instruction_sets.NAMES supported by this CPU and installation
 
 
 @contextmanager
 def definitions_only() -> Iterator[None]:
-    """Have torch do the work of the kernels in C, for tests and comparisons; in all threads."""
+    """Use the definitions in torch instead of the kernels in C, in all threads; for tests and comparisons."""
     global level
     before, level = level, 0
     try:
@@ -79,14 +78,14 @@ def definitions_only() -> Iterator[None]:
 def register(
     schema: str, compiled: Callable[..., Any] | None, fake: Callable[..., Any], *, differentiable: bool = False
 ) -> Callable[[Definition], Definition]:
-    """Make a function an operator of ``torch.ops.nlfilter``: it defines what that computes, for every dtype and device.
+    """Register a function as the definition of an operator of ``torch.ops.nlfilter``, for all dtypes and devices.
 
     Args:
-        schema: its name and signature.
-        compiled: the same by a kernel in C, for tensors that are float32 and not empty, on processors, which gives None
-            where it leaves the work to the definition; None if there is none.
-        fake: uninitialised results, from the shapes of the arguments.
-        differentiable: whether the definition is made of differentiable operations. Autograd, in reverse and forward
+        schema: name and signature of the operator.
+        compiled: the same computation by a kernel in C, for non-empty float32 tensors on CPUs; may return None to leave
+            it to the definition. None if there is no kernel.
+        fake: returns uninitialised results for the shapes of the arguments.
+        differentiable: whether the definition consists of differentiable operations. Autograd, in reverse and forward
             mode and of any order, and the transforms of ``torch.func`` then see these operations.
     """
     name = schema.partition("(")[0]
@@ -100,9 +99,7 @@ def register(
             if _are_derived(arguments):
                 return definition(*arguments)
             keys = keys & below
-            if (
-                keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU
-            ):  # what redispatching comes to, without its 4 us
+            if keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU:  # same as redispatching, but saves 4 us
                 return on_processors(*arguments)
             return operator.redispatch(keys, *arguments)
 
@@ -119,11 +116,11 @@ def register(
     return decorate
 
 
-# The two below run before every product; as loops they take half the time that generators would.
+# The next two functions run before every product; loops take half the time of generators.
 
 
 def _suit(arguments: Sequence[Any]) -> bool:
-    """Whether the kernels can work on all arguments: numbers, and tensors that are float32 and not empty."""
+    """Whether the kernels support all arguments: all tensors are float32 and not empty."""
     for argument in arguments:
         if isinstance(argument, Tensor):
             if argument.dtype is not torch.float32 or argument.numel() == 0:
@@ -134,7 +131,7 @@ def _suit(arguments: Sequence[Any]) -> bool:
 
 
 def _are_derived(arguments: Sequence[Any]) -> bool:
-    """Whether one of the arguments has derivatives to keep track of."""
+    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
     if torch.is_grad_enabled():
         for argument in arguments:
             if isinstance(argument, Tensor) and argument.requires_grad:
@@ -145,44 +142,44 @@ def _are_derived(arguments: Sequence[Any]) -> bool:
 
 
 def by_rows(planes: Tensor) -> Tensor:
-    """Planes (B, R, N) with each of their rows in one piece, however far they are apart."""
+    """Planes (B, R, N) with contiguous rows, which may have any stride."""
     return planes if planes.stride(2) == 1 else planes.contiguous()
 
 
 def contiguous(*tensors: Tensor) -> Iterator[Tensor]:
-    """Each of the tensors in one piece."""
+    """Each of the tensors, made contiguous."""
     return (tensor.contiguous() for tensor in tensors)
 
 
 def repeated(tensor: Tensor, batch: int, length: int) -> Tensor:
-    """A tensor (B, ..., N) or one that is expanded to it, in one piece."""
+    """Expand a tensor to (B, ..., N) if necessary, and make it contiguous."""
     if tensor.shape[0] != batch or tensor.shape[-1] != length:
         tensor = tensor.expand(batch, *tensor.shape[1:-1], length)
     return tensor.contiguous()
 
 
 def place(planes: Tensor) -> tuple[int, int, int]:
-    """Where planes (B, R, N) with rows in one piece are, and how far images and rows are apart."""
+    """Address of planes (B, R, N) with contiguous rows, and strides between images and between rows."""
     return planes.data_ptr(), planes.stride(0), planes.stride(1)
 
 
 def pointer(tensor: Tensor | None) -> int | None:
-    """Where a tensor in one piece is."""
+    """Address of a contiguous tensor, or None."""
     return None if tensor is None else tensor.data_ptr()
 
 
 def threads(factor: Tensor) -> int:
-    """As many as torch would use, but for small work."""
+    """Number of threads: as many as torch uses, but 1 for small factors."""
     return 1 if factor.numel() < SMALL else torch.get_num_threads()
 
 
 def run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:
     """Run a kernel on ``count`` pixels, or images."""
     if getattr(_library, f"nlfilter_{name}")(level, threads, count, *arguments):
-        raise MemoryError("no memory is left for the buffers of a few rows; make the image smaller")
+        raise MemoryError("not enough memory for buffers of a few rows; use a smaller image")
 
 
 def run_on_factor(name: str, factor: Tensor, *arguments: int | float | None) -> None:
-    """Run a kernel on all pixels of a factor (B, M, N) with rows in one piece."""
+    """Run a kernel on all pixels of a factor (B, M, N) with contiguous rows."""
     batch, landmarks, pixels = factor.shape
     run(name, threads(factor), pixels, batch, landmarks, *place(factor), *arguments)

@@ -59,7 +59,7 @@ static void run_sweep(struct work *work, long image, long piece, long first, lon
     SETS[work->level].sweep(&task, first, last, work->totals + piece * task.num_landmarks);
 }
 
-/* With `diagonal`: out = the scaling d and moment = factor d, where row is half of the guess of the moment.
+/* With `diagonal`: out = the scaling d and moment = factor d, where row is half of the estimated moment.
  * Without: moment = factor diag(scaling) factor^T row, with out as working memory. */
 int nlfilter_sweep(int level, int threads, long pixels, long images, long num_landmarks,
                    const float *factor, long factor_step, long factor_stride, const float *row,

@@ -1,4 +1,4 @@
-/* Tall-skinny products that read the factor once; see tall_skinny.py, and sweeps.py for the sweep. */
+/* Tall-skinny products that read the factor once; defined in tall_skinny.py. */
 
 #define LEAST (FLT_EPSILON / 4)
 
@@ -77,7 +77,7 @@ static TARGET void NAME(gather)(const struct tall_skinny *task, long first, long
 }
 
 /* For pixels first to last: out = the root d of d (u . 2 rows + c d) = 1, or without c the product of `spread`;
- * totals += factor out. Works on few pixels at a time, so that their columns stay cached for the second product. */
+ * totals += factor out. Processes few pixels at a time, so that their columns stay cached for the second product. */
 static TARGET void NAME(sweep)(const struct tall_skinny *task, long first, long last, double *totals)
 {
     const long most = NEAR / task->num_landmarks / 64 * 64, step = most < 256 ? 256 : most;
@@ -85,7 +85,7 @@ static TARGET void NAME(sweep)(const struct tall_skinny *task, long first, long 
         const long end = last - start < step ? last : start + step;
         NAME(spread)(task, start, end);
         for (long i = start; task->diagonal && i < end; i++) {
-            /* positive_root of sweeps.py: without cancellation for either sign of u . t; finite if c = 0 */
+            /* positive_root of tall_skinny.py: without cancellation for either sign of u . t; finite if c = 0 */
             const float half = task->out[i], c = task->diagonal[i], root = sqrtf(half * half + c);
             const float over = half < 0.0f ? root - half : 1.0f, under = half < 0.0f ? c : root + half;
             const float d = over / (under < LEAST ? LEAST : under);

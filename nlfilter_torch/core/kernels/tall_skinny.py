@@ -1,8 +1,8 @@
-"""Products of a factor with a few rows: what filters, balancing and gradients spend their time in.
+"""Tall-skinny products of a factor with a few rows, which dominate the time of filters, balancing and gradients.
 
-They read the factor once and compute next to nothing, so that memory is their limit. BLAS libraries do not reach it:
-MKL multiplies a matrix with one vector on a single core, and with a few by a routine made for many. As a batch of parts
-the same products run on all cores. A sweep of the balancing forms two products and reads the factor once as well.
+They read the factor once and do little arithmetic, so they are limited by memory bandwidth. BLAS libraries do not reach
+it: MKL multiplies a matrix by one vector on a single core, and by a few with a routine meant for many. As a batch of
+strips the same products run on all cores. A sweep of balancing forms two products in one read of the factor.
 """
 
 import torch
@@ -11,8 +11,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
 from nlfilter_torch.core.kernels.library import by_rows, place, pointer, register, repeated, run_on_factor
 
-FEW = range(1, 9)  # rows for which the kernels in C are the quickest
-MOST_SPREAD = 9  # rows; from there on undivided products are no slower
+FEW = range(1, 9)  # numbers of rows for which the kernels in C are fastest
+MOST_SPREAD = 9  # with more rows than this, undivided products are no slower
 MOST_GATHERED = 24
 
 
@@ -39,28 +39,28 @@ def _fake_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) ->
     differentiable=True,
 )
 def spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor:
-    """``rows @ factor diag(scaling)``, (B, R, N), of rows (B, R, M), a factor (B, M, N), perhaps a scaling (B, N)."""
+    """``rows @ factor diag(scaling)``, (B, R, N), for rows (B, R, M), factor (B, M, N) and optional scaling (B, N)."""
     if scaling is not None:
         return spread(rows, factor) * scaling.unsqueeze(1)
     if not _is_parted(rows, factor) or rows.shape[1] > MOST_SPREAD:
         return rows @ factor
     if rows.shape[1] == 1:
         return _spread_one(rows, factor)
-    # One after the other is quicker than several together: a block is in the cache after the first.
+    # One row after the other is faster than several at once, since a block is in the cache after the first.
     blocks = [factor[:, :, block] for block in pixel_blocks(factor.shape[2], 1, factor.device, length=SWEPT)]
     pieces = [[_spread_one(row, block) for row in rows.split(1, dim=1)] for block in blocks]
     return torch.cat([piece for row in zip(*pieces, strict=True) for piece in row], dim=2).view(*rows.shape[:2], -1)
 
 
 def _spread_one(row: Tensor, factor: Tensor) -> Tensor:
-    """``row @ factor``, (1, 1, n), of a row (1, 1, M) and a factor (1, M, n), strip by strip."""
+    """``row @ factor``, (1, 1, n), for a row (1, 1, M) and a factor (1, M, n), as a batch of strips."""
     parts = _parts(factor)  # (P, M, n / P)
     return torch.bmm(row.expand(len(parts), -1, -1), parts).view(1, 1, -1)
 
 
 def gather(images: Tensor, factor: Tensor) -> Tensor:
-    """``images @ factor^T``, (B, R, M), of images (B, R, N) and a factor (B, M, N)."""
-    if torch.compiler.is_compiling():  # the layout of the other would tie a compiler to the number of rows
+    """``images @ factor^T``, (B, R, M), for images (B, R, N) and a factor (B, M, N)."""
+    if torch.compiler.is_compiling():  # the other layout would specialise compiled code to the number of rows
         return (factor @ images.mT).mT
     if not _is_parted(images, factor) or images.shape[1] > MOST_GATHERED:
         return images @ factor.mT
@@ -86,9 +86,9 @@ def _fake_moment(factor: Tensor, images: Tensor) -> Tensor:
 
 @register("moment(Tensor factor, Tensor images) -> Tensor", _compiled_moment, _fake_moment, differentiable=True)
 def moment(factor: Tensor, images: Tensor) -> Tensor:
-    """``factor @ images^T``, (B, M, C) in float64, of a factor (B, M, N) and images (B, C, N): sums over pixels.
+    """``factor @ images^T``, (B, M, C) in float64, for a factor (B, M, N) and images (B, C, N): sums over pixels.
 
-    In float32 the sum over a million pixels would lose what separates a row sum of 1 from one of 1.001.
+    A float32 sum over a million pixels would lose the difference between row sums of 1 and 1.001.
     """
     batch, landmarks, _ = factor.shape
     step = block_length(batch, factor.device, SWEPT)
@@ -100,28 +100,29 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
 
 
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:
-    """Whether parts pay: for one image on a processor. Autograd would keep every part, and has one product instead."""
-    if torch.compiler.is_compiling():  # it would take the size of the batch for a constant
+    """Whether to divide products into strips: for one image on a CPU, unless autograd would store every strip."""
+    if torch.compiler.is_compiling():  # the test of the batch size would make it a constant
         return False
     recorded = torch.is_grad_enabled() and (thin.requires_grad or factor.requires_grad)
     return factor.device.type == "cpu" and len(factor) == len(thin) == 1 and not recorded
 
 
 def _parts(planes: Tensor) -> Tensor:
-    """Planes (1, R, n) as a batch of strips."""
+    """View planes (1, R, n) as a batch of strips."""
     return strips(planes, strip_count(1, planes.shape[2], planes.device))
 
 
 def positive_root(half: Tensor, diagonal: Tensor) -> Tensor:
-    """The positive root d of ``d (2 half + diagonal d) = 1``, without cancellation whichever sign ``half`` has."""
+    """Positive root d of ``d (2 half + diagonal d) = 1``, without cancellation for either sign of ``half``."""
     larger = torch.addcmul(diagonal, half, half).sqrt() + half.abs()
-    # Without a diagonal a negative sum has no root; the bound, below the rounding of 1 - |u|^2, keeps d finite.
+    # With a zero diagonal and negative ``half`` there is no root; the bound, below the rounding of 1 - |u|^2, keeps d
+    # finite.
     least = torch.finfo(half.dtype).eps / 4
     return torch.where(half < 0, larger / diagonal.clamp(min=least), larger.clamp(min=least).reciprocal())
 
 
 def _empty(factor: Tensor) -> tuple[Tensor, Tensor]:
-    """Room for a number of every pixel, (B, N), and a moment of zeros, (B, M) in float64."""
+    """An uninitialised (B, N) tensor, and a moment of zeros, (B, M) in float64."""
     batch, landmarks, pixels = factor.shape
     return factor.new_empty(batch, pixels), factor.new_zeros(batch, landmarks, dtype=torch.float64)
 
@@ -155,10 +156,10 @@ def _compiled_sweep(
 def sweep(
     factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The scaling d (B, N) of every pixel for a guess at the moment, and the moment (B, M) in float64 that it has.
+    """Compute the scaling d (B, N) for an estimate t of the moment, and the moment of d, (B, M) in float64.
 
-    It takes ``half`` of the guess t, (B, M), the ``most`` that d may be, and how many pixels each of them stands for,
-    (B, N); None is one. The moment is ``factor @ (weights * d)``.
+    It takes ``half`` of t, (B, M), the upper limit ``most`` of d, and the number of pixels that each point represents,
+    (B, N); None means one each. The moment is ``factor @ (weights * d)``.
     """
     scaling, found = _empty(factor)
     row = half.unsqueeze(2).mT
@@ -181,7 +182,7 @@ def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
     lambda factor, *_: _empty(factor)[1],
 )
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
-    """``factor diag(weights) factor^T vector``, (B, M) in float64, of a factor (B, M, N), (B, N) and (B, M)."""
+    """``factor diag(weights) factor^T vector``, (B, M) in float64, for a factor (B, M, N), (B, N) and (B, M)."""
     _, found = _empty(factor)
     row = vector.unsqueeze(2).mT
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):

@@ -1,7 +1,7 @@
 /* Arguments of the kernels, and the division of work among threads.
  *
- * Shapes are (rows, columns), for B images of N pixels, D features and M landmarks. Rows are contiguous and a stride
- * apart. */
+ * Shapes are (rows, columns), for B images of N pixels, D features and M landmarks. Rows are contiguous; strides are
+ * the distances between rows. */
 
 #pragma once
 
@@ -11,9 +11,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define CHUNK 33024  /* most pixels that a thread takes at a time; long pieces of each row use memory better */
+#define CHUNK 33024  /* maximum pixels per piece; reading long parts of each row uses memory bandwidth better */
 #define LINE 64      /* pieces are multiples of this: the largest tile, and more than a cache line */
-#define NEAR 196608  /* floats of the factor that fit the second-level cache */
+#define NEAR 196608  /* number of floats of the factor that fit the second-level cache */
 #define MOST_ROWS 6
 #define MOST_PIXELS 64
 
@@ -39,7 +39,7 @@ struct backward {
     struct columns columns;        /* with the inverse transposed; if triangular, blocks begin at the diagonal */
     const float *left, *right;     /* (M, R) in blocks, (R, N) */
     const float *scale, *diagonal; /* (N): scale of the columns, and the gradient of 1 - |u|^2 */
-    const float *points;           /* (D + 1, M) in blocks: derivative of the exponents by the features */
+    const float *points;           /* (D + 1, M) in blocks: derivative of the exponents in the features */
     float *moved;                  /* (D, N), gradient of the features */
     long rank, right_stride, right_step;
     long tiles, rows, feature_rows; /* tiles processed together, and their rows */
@@ -79,7 +79,7 @@ struct lloyd {
     float margin; /* scores closer than this, relative to their terms, are ties */
 };
 
-/* The kernels of an instruction set, on pixels first to last; see the header of the same name. */
+/* The kernels of an instruction set, on pixels first to last; documented in the headers. */
 struct set {
     long rows; /* rows in a block of a packed matrix */
     void (*columns)(const struct columns *, long first, long last, float *scratch);
@@ -108,9 +108,9 @@ struct work {
     double *totals;      /* sums of each piece, or NULL */
     atomic_long next;
     atomic_int failed;
-    int places;             /* for threads of the pool, which guards this and the next */
-    struct work *following; /* in the list of what the pool may do */
-    atomic_int helping;     /* threads of the pool that have begun */
+    int places;             /* threads of the pool still wanted; guarded by the pool's lock, as is the next field */
+    struct work *following; /* next in the pool's list */
+    atomic_int helping;     /* threads of the pool that have started on this work */
 };
 
 /* Run all pieces. Returns 0, or -1 if memory cannot be allocated. */

@@ -1,11 +1,11 @@
-/* Division of work among threads: those of OpenMP that torch uses too, or a pool of our own. */
+/* Division of work among threads: OpenMP threads shared with torch, or a separate pool. */
 
 #include <pthread.h>
 
 #include "tasks.h"
 
 #define MOST_THREADS 256
-#define SPINS 2000 /* looks at a counter before waiting in the kernel, some 20 to 50 microseconds */
+#define SPINS 2000 /* reads of a counter before waiting in the kernel; 20 to 50 microseconds */
 
 #if defined(__x86_64__)
 #define PAUSE() __builtin_ia32_pause()
@@ -15,7 +15,8 @@
 #define PAUSE()
 #endif
 
-/* Wheels run on any glibc that torch does. Newer ones have another version of this function, which is the same. */
+/* Wheels must run on any glibc that torch supports. Newer ones have another version of this function, which is the
+ * same. */
 #if defined(__GLIBC__) && defined(__x86_64__)
 __asm__(".symver pthread_create, pthread_create@GLIBC_2.2.5");
 #elif defined(__GLIBC__) && defined(__aarch64__)
@@ -39,16 +40,16 @@ static void run_worker(void *argument)
 }
 
 /* GOMP_parallel, once its address is known. OpenMP's threads, which torch uses too, keep spinning for a while after a
- * parallel region, so threads of our own would compete with them for the cores. */
+ * parallel region, so separate threads would compete with them for the cores. */
 static void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
 
 void nlfilter_share_threads(void *gomp_parallel) { parallel = gomp_parallel; }
 
-/* The pool. Its threads sleep until there is work with a free place. Who brings the work takes part in it, and waits
- * only for those that have begun: a thread that has not been given a core yet holds up nobody. */
+/* The pool. Its threads sleep until there is work that wants more threads. The thread that submits work takes part in
+ * it, and then waits only for pool threads that have started: a thread without a core yet delays nothing. */
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t brought = PTHREAD_COND_INITIALIZER, finished = PTHREAD_COND_INITIALIZER;
-static struct work *brought_first; /* of a list */
+static struct work *brought_first; /* head of the list of submitted work */
 static int pool_size;
 
 static void *help(void *unused)
@@ -68,13 +69,13 @@ static void *help(void *unused)
         pthread_mutex_unlock(&lock);
         run_worker(work);
         pthread_mutex_lock(&lock);
-        if (atomic_fetch_sub(&work->helping, 1) == 1) /* from here on the work may be gone */
+        if (atomic_fetch_sub(&work->helping, 1) == 1) /* after this, the work may no longer exist */
             pthread_cond_broadcast(&finished);
     }
     return NULL;
 }
 
-/* After a fork the child has none of the threads. */
+/* Reset the pool in a forked child process, which has none of its threads. */
 static void forget_pool(void)
 {
     lock = (pthread_mutex_t)PTHREAD_MUTEX_INITIALIZER;
@@ -83,7 +84,7 @@ static void forget_pool(void)
     pool_size = 0;
 }
 
-/* Let the pool have so many threads, or as many as can be started. */
+/* Grow the pool to `wanted` threads, or as many as can be started. */
 static void grow_pool(int wanted)
 {
     static int registered;
@@ -134,13 +135,13 @@ int run_pieces(struct work *work, int threads)
     if (wanted < 2)
         run_worker(work);
     else if (parallel)
-        parallel(run_worker, work, threads, 0); /* a smaller team would end threads that torch needs again */
+        parallel(run_worker, work, threads, 0); /* a smaller team would end threads that torch will need again */
     else
         run_with_pool(work, wanted - 1);
     return work->failed ? -1 : 0;
 }
 
-/* About four pieces per thread, to balance the load, but none longer than `most`. */
+/* Divide into about four pieces per thread, to balance the load, but none longer than `most`. */
 static void cut(struct work *work, int threads, long most)
 {
     const long wanted = (4 * threads + work->images - 1) / work->images;
