@@ -145,3 +145,11 @@ def test_bad_input(edit: Callable[..., torch.Tensor], image: torch.Tensor, argum
 def test_wrong_types(edit: Callable[..., torch.Tensor], image: torch.Tensor, arguments: dict, sentence: str) -> None:
     with pytest.raises(TypeError, match=sentence):
         edit(image, **arguments)
+
+
+def test_the_amount_of_sharpening_is_not_rounded_to_float32() -> None:
+    exact = torch.tensor(3.3, dtype=torch.float64)
+    options = {"limits": "none", "num_landmarks": 20}
+    close, far = (sharpen(RGB.double(), amount=amount, **options) for amount in (3.3, exact.float().double()))
+    assert torch.equal(sharpen(RGB.double(), amount=exact, **options), close)
+    assert not torch.equal(close, far)

@@ -115,6 +115,21 @@ def test_groups_of_colours_are_kept_apart_image_by_image() -> None:
     assert torch.equal(means[1], torch.zeros(16, 3))
 
 
+def test_a_batch_is_recoloured_like_its_images_where_only_one_has_a_background() -> None:
+    image = noise(2, 3, 20, 24, dtype=torch.float64)
+    dot, other = box(4, 4, 5, 5, size=(20, 24)), box(13, 15, 4, 4, size=(20, 24))
+    blue, green = paint(0.1, 0.3, 0.9, dot), paint(0.1, 0.8, 0.1, other)
+    second = torch.cat([other, 0 * other])  # a second colour, or a scribble on the background, in the first image only
+    for keep in (None, second):
+        strokes, painted = torch.cat([blue, blue]), torch.cat([dot, dot])
+        if keep is None:
+            strokes, painted = torch.cat([blue + green, blue]), painted + second
+        together = recolor(image, strokes, painted, keep=keep, num_landmarks=20)
+        own = None if keep is None else keep[1:]
+        alone = recolor(image[1:], strokes[1:], painted[1:], keep=own, num_landmarks=20)
+        torch.testing.assert_close(together[1:], alone)
+
+
 def test_means_of_regions_are_exact_on_large_images() -> None:
     mask = box(300, 300, 600, 600, size=(1400, 1400)) * 0.7
     image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)

@@ -98,6 +98,16 @@ def test_regions_are_background_to_each_other_and_batches_are_their_images() -> 
     torch.testing.assert_close(together[:1], found, atol=2e-3, rtol=0)
 
 
+def test_a_dot_counts_beside_pixels_that_are_not_painted_or_painted_in_another_image() -> None:
+    image, _ = square()
+    dot, broad = box(18, 20, 2, 2, size=SIZE), box(5, 5, 30, 40, size=SIZE)
+    alone = region_mask(image, dot, num_landmarks=20)
+    recorded = region_mask(image, dot.clone().requires_grad_(), num_landmarks=20)  # with every pixel
+    torch.testing.assert_close(recorded.detach(), alone, atol=1e-3, rtol=0)
+    both = region_mask(image.repeat(2, 1, 1, 1), torch.cat([dot, broad]), num_landmarks=20)
+    torch.testing.assert_close(both[:1], alone, atol=1e-3, rtol=0)
+
+
 def test_what_is_scribbled_over_stays() -> None:
     image, inside = square()
     assert (region_mask(image, inside)[inside > 0] > 0.95).all()  # the whole subject

@@ -305,8 +305,12 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
         others: colours (B, C, k) of the other pixels.
         bandwidth: photometric bandwidth of the regression.
     """
-    every = max(1, scribbled.shape[2] // NUM_COMPARED)
-    some, counted = (t[..., ::every] for t in (scribbled, weights.detach() > 0))
+    # Every n-th pixel of each image's own scribbles, whatever other pixels are given.
+    counted = weights.detach() > 0
+    number = counted.cumsum(1) - 1
+    counted = counted & (number % (counted.sum(1, keepdim=True) // NUM_COMPARED).clamp(min=1) == 0)
+    chosen = counted.any(0)
+    some, counted = scribbled[:, :, chosen], counted[:, chosen]
     scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
     left, right = (lab_of(t.unsqueeze(2)).squeeze(2) for t in (others, some))
     squares = (left.unsqueeze(3) - right.unsqueeze(2)).square().mean(1) / scale.square()  # (B, k, n)
@@ -334,8 +338,8 @@ def _regression(
     pixels = source.size[0] * source.size[1]
     fit = partial(fit_strokes, pairs=operator.pairs, pixels=pixels, reach=reach, smoothness=SMOOTHNESS)
     known = [(columns, total, values)]
-    alone = bool((weights[:, 1].detach() <= 0).all())
-    first = fit(lambda: scribbled_blocks(known), strength=0.0 if alone else 1.0)
+    opposed = (weights[:, 1].detach() > 0).any(1).to(weights)  # 1 for images with scribbles on the background
+    first = fit(lambda: scribbled_blocks(known), strength=opposed)
     unlike = unlike * torch.cat([(1 - first(block)).clamp(0.0, 1.0).square() for block in frame()], dim=2)
     known.append((frame, unlike, torch.zeros_like(unlike)))
     fitted = fit(lambda: scribbled_blocks(known), strength=1.0)

@@ -85,7 +85,7 @@ def fit_sharpen(
     SHARPEN["limits"].check_argument(limits)
     SHARPEN["viewing_size"].check_argument(viewing_size)
     grey = partial(reduce_channels, guide_channels="luminance")  # blurs one channel instead of three
-    middle = torch.as_tensor(amount, dtype=torch.float32).reshape(-1).expand(source.batch)
+    middle = torch.as_tensor(amount, dtype=source.dtype).reshape(-1).expand(source.batch)
     still = torch.zeros_like(middle)
     sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, so that the filter gives the change
 
