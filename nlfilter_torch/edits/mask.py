@@ -23,7 +23,7 @@ from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import enlarged
-from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
+from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source, edited
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 
@@ -242,8 +242,10 @@ def fit_regions(
     return Regions(small.image, step, fit_borders(small.image, torch.cat(rough, dim=1), front, back), both)
 
 
-def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Scribbles:
+def blocks_of(marked: Scribbles, small: Source, width: int, step: float) -> Scribbles:
     """Scribbles on a reduced picture: each block has the weights of the pixels scribbled on, as a share of all.
+
+    And the mean of their colours.
 
     Args:
         marked: scribbles.
@@ -260,7 +262,14 @@ def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Sc
     places, block = (row * small.size[1] + column).unique(return_inverse=True)
     weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
     weights = weights.index_add(2, block, marked.weights) / step**2
-    return Scribbles(places, weights, small.colours(places))
+    colours = marked.colours
+    if colours is not None:
+        total = marked.weights.sum(1, keepdim=True)
+        sums = [
+            part.new_zeros(*part.shape[:2], len(places)).index_add(2, block, part) for part in (colours * total, total)
+        ]
+        colours = sums[0] / sums[1].clamp(min=TINY)
+    return Scribbles(places, weights.clamp(max=1.0), small.colours(places), colours)
 
 
 def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:

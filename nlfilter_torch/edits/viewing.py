@@ -9,12 +9,13 @@ picture, whatever the size of the photograph.
 Detail that is too fine for the viewing size is changed as the coarser detail around it: the slope of the change over
 the brightness, by regression over 5x5 pixels of the small picture, times what the small picture lacks. Texture gets as
 much stronger (or smoother) in its finest parts as in the others, and an edge, which is no detail, remains as sharp as
-it is. The average of the result over a pixel of the small picture is the small result.
+it is. What this adds to the small picture is worked out and taken away again, so that the result, once it is reduced,
+is the small one: the editor, which shows that, shows what is saved.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -29,6 +30,7 @@ from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
 PASSED = 4  # pixels around one that its enlargement depends on once it is reduced again
+RESTORED = 3  # terms of a Neumann series that undoes what enlarging and reducing again smooths
 FAINT = (2 / 255) ** 2  # variance below which a slope over brightness is taken for 0
 
 
@@ -57,6 +59,9 @@ class Reducible(Protocol):
 
     def resized(self, size: tuple[int, int]) -> Any:
         """The picture in a smaller size."""
+
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Planes (B, C, h, w) of all its pixels in a smaller size."""
 
     def held(self, fitted: Fitted) -> Fitted:
         """An edit with the planes that it makes worked out, if there is room for them."""
@@ -107,22 +112,8 @@ def fit_change(
     before, after = reduced.all(Fitted(planes)), reduced.all(fitted)
     image = reduced.all(Fitted(lambda pixels: pixels.image)) if limits == "soft" else before
     coarse = Coarse.of(image, before, after, limits, balance)
-    if small == source.size:
-        return Fitted(lambda pixels: coarse.seen(pixels.image, planes(pixels), source.stride))
-
-    def edit(pixels: Pixels) -> Tensor:
-        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
-        columns = None if width == pixels.width else range(left, left + width)
-        found = resized(
-            lambda start, stop: coarse.planes[:, :, start:stop],
-            small,
-            source.size,
-            range(top, top + height),
-            columns,
-        )
-        return coarse.change(pixels.image, planes(pixels), found)
-
-    return Fitted(edit)
+    found = coarse.changes(source, planes)
+    return Fitted(lambda pixels: coarse.change(pixels.image, *found(pixels)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,18 +140,69 @@ class Coarse:
         parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
-    def change(self, image: Tensor, planes: Tensor, found: Tensor) -> Tensor:
-        """Pixels of the picture, of which ``planes`` are changed, under the part of :attr:`planes` that they see."""
-        blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
-        moved = changed + steepness * (planes - blurred)
+    def changes(self, source: Reducible, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
+        """What pixels of a picture, in which ``planes`` are changed, change by: these planes, and the saturation."""
+        if source.size == (self.planes.shape[-2], self.planes.shape[-1]):
+            return lambda pixels: self.left(planes(pixels), source.stride)
+        finer = self._of_larger(source, planes)
+        return lambda pixels: finer._moved(planes(pixels), finer._at(pixels, source.size))
+
+    def change(self, image: Tensor, moved: Tensor, saturation: Tensor) -> Tensor:
+        """Pixels of the picture under a change of its planes and of its saturation."""
         if self.limits == "none":
             return image + moved
-        saturation = found[:, 3 * self.count :]
         return move_luminance(image, moved, saturation if saturation.shape[1] else None)
 
-    def seen(self, image: Tensor, planes: Tensor, stride: float) -> Tensor:
-        """The picture of the viewing size under what is left of the change where it was enlarged and is reduced."""
-        return self.change(image, planes, enlarged_and_reduced(self.planes, stride))
+    def left(self, planes: Tensor, stride: float) -> tuple[Tensor, Tensor]:
+        """What is left of the changes at the viewing size where the picture was enlarged, changed and is reduced."""
+        found = enlarged_and_reduced(self.planes, stride)
+        changed = self.planes[:, self.count : 2 * self.count]
+        blurred, _, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
+        beyond = steepness * (planes - blurred)
+        moved = enlarged_and_reduced(_restored(changed - beyond, stride), stride) + beyond
+        return moved, found[:, 3 * self.count :]
+
+    def _of_larger(self, source: Reducible, planes: Planes) -> "Coarse":
+        """With a change of which a larger picture, in which ``planes`` are changed, has the mean.
+
+        The change of what the small picture lacks has a mean, too, which is taken away here.
+        """
+        size, count = (self.planes.shape[-2], self.planes.shape[-1]), self.count
+        before, steepness = slice(0, count), slice(2 * count, 3 * count)
+
+        def beyond(pixels: Pixels) -> Tensor:
+            lacking = planes(pixels) - self._at(pixels, source.size, before)
+            return self._at(pixels, source.size, steepness) * lacking
+
+        parts = list(self.planes.split([count, count, self.planes.shape[1] - 2 * count], dim=1))
+        stride = math.sqrt(source.size[0] * source.size[1] / (size[0] * size[1]))
+        parts[1] = _restored(parts[1] - source.shrunk(beyond, size), stride)
+        return replace(self, planes=torch.cat(parts, dim=1))
+
+    def _at(self, pixels: Pixels, size: tuple[int, int], channels: slice = slice(None)) -> Tensor:
+        """Some channels of :attr:`planes`, enlarged for some pixels of a picture (H, W)."""
+        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+        columns = None if width == pixels.width else range(left, left + width)
+        return resized(
+            lambda start, stop: self.planes[:, channels, start:stop],
+            (self.planes.shape[-2], self.planes.shape[-1]),
+            size,
+            range(top, top + height),
+            columns,
+        )
+
+    def _moved(self, planes: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+        """What some planes of the picture change by, from the part of :attr:`planes` that they see."""
+        blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
+        return changed + steepness * (planes - blurred), found[:, 3 * self.count :]
+
+
+def _restored(planes: Tensor, stride: float) -> Tensor:
+    """Planes that are about the given ones once :func:`enlarged_and_reduced`."""
+    found = planes
+    for _ in range(RESTORED - 1):
+        found = found + planes - enlarged_and_reduced(found, stride)
+    return found
 
 
 def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:
