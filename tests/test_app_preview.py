@@ -229,10 +229,12 @@ def test_preview_of_a_large_photograph_shows_what_saving_gives(step: Step, limit
         Step("sharpen", **LOOKED_AT),
         Step("abstract", **LOOKED_AT),
         Step("colorize", (Stroke(HERE, 0.06, "#606880"), Stroke(THERE, 0.06, "#807060")), viewing_size=0.004),
+        Step("recolor", (Stroke(HERE, 0.06, "#606880"),)),
     ],
     ids=lambda step: step.edit,
 )
-def test_preview_of_a_soft_photograph_shows_what_saving_gives(step: Step) -> None:
+def test_preview_of_a_soft_photograph_shows_what_saving_gives(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.edits.mask.VIEWED", LOOKED_AT["viewing_size"])
     image, recipe = 0.3 + 0.4 * resize(cat(1), (140, 209)).clamp(0, 1), Recipe((step,))
     preview = Preview(image, pixels=4000)
     saved = resize(recipe.apply(image), preview.size)

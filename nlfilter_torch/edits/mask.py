@@ -23,11 +23,14 @@ from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import enlarged
+from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source, edited
+from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 
 SOLVED = 1 << 17  # pixels
+VIEWED = VIEWING_SIZE.default  # megapixels, to which a larger picture is reduced first
 CHROMA = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
 AROUND, GRAIN, TEXTURE = 2.0, 1.5, 3.0  # standard deviations in pixels: surroundings, grain, mean of its strength
 TEXTURED = 1.5  # weight of texture
@@ -221,9 +224,12 @@ def fit_regions(
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
     check_count(options["num_landmarks"], "num_landmarks")
-    blocks = math.ceil(source.stride * math.sqrt(source.size[0] * source.size[1] / SOLVED))  # in the photograph
-    step = blocks if source.stride == 1 else max(1.0, blocks / source.stride)
-    small = source.blocks(step, FLOATS + options["num_landmarks"])
+    # The picture that a preview is, so that masks are found in the same pixels there and in the photograph.
+    size = viewed_size(source.size, VIEWED)
+    viewed = source if size == source.size else source.resized(size)
+    blocks = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
+    small = viewed.blocks(blocks, FLOATS + options["num_landmarks"])
+    step = blocks if viewed is source else blocks * source.size[1] / size[1]
     marks = [blocks_of(marked, small, source.size[1], step) for marked in both]
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
