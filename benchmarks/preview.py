@@ -25,6 +25,7 @@ from torch import Tensor
 from benchmarks.photographs import pictures
 from nlfilter_torch.app.preview import PIXELS
 from nlfilter_torch.app.session import Session
+from nlfilter_torch.edits import mask
 from nlfilter_torch.edits.parameters import VIEWING_SIZE
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resize
@@ -73,6 +74,7 @@ def sized(picture: Tensor, pixels: int, stride: int) -> Tensor:
 
 def errors(picture: Tensor, pixels: int, stride: int, recipes: dict[str, Recipe]) -> Iterator[tuple[str, float, float]]:
     """For each recipe its name, the difference between preview and saved file, and how much the edit changes."""
+    mask.VIEWED = VIEWING_SIZE.default * pixels / PIXELS  # in proportion, as in the editor
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.tif"
         photograph = Photograph(sized(picture, pixels, stride))

@@ -14,7 +14,8 @@ from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
-TIMEOUT = 15_000  # milliseconds; a machine may be busy
+SCREENS = [(390, 844), (800, 600), (1280, 800), (1920, 1080)]  # width and height
+TIMEOUT = 60_000  # milliseconds, of everything that is waited for; a machine may be busy
 
 
 @contextmanager
@@ -23,7 +24,8 @@ def chromium() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         # Chromium has no sandbox when run as root, as in most containers; only pages of this machine are opened here.
         options = ["--no-sandbox"] if os.geteuid() == 0 else []
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options, timeout=TIMEOUT)
+        expect.set_options(timeout=TIMEOUT)
         yield browser
         browser.close()
 
@@ -64,7 +66,6 @@ class Tab:
     def __init__(self, page: Page) -> None:
         self.page = page
         page.set_default_timeout(TIMEOUT)
-        expect.set_options(timeout=TIMEOUT)
         self.photo = page.locator(".photo > img").first
         self.mask = page.get_by_alt_text("mask")
 

@@ -20,7 +20,7 @@ from nlfilter_torch.edits.presets import find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from tests.browser import CHROMIUM, Editor, Tab, chromium
+from tests.browser import CHROMIUM, SCREENS, Editor, Tab, chromium
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium")
 
@@ -58,11 +58,12 @@ def folder(editor: Editor) -> Iterator[Path]:
 @pytest.fixture
 def tab(browser: Browser, editor: Editor, folder: Path) -> Iterator[Tab]:
     page = browser.new_page(viewport={"width": 1280, "height": 900})
+    tab = Tab(page)
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.on("request", lambda request: None if request.url.startswith(editor.url) else troubles.append(request.url))
     page.goto(editor.url)
-    yield Tab(page)
+    yield tab
     page.close()
     # Every script, font and picture is served by the editor itself.
     assert [trouble for trouble in troubles if not trouble.startswith(("data:", "blob:", "ws://127.0.0.1:"))] == []
@@ -255,7 +256,7 @@ def test_keyboard_focus_can_be_seen(opened: Tab) -> None:
     assert "rgb(255, 213, 74)" in page.evaluate(frame)
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (800, 600), (1280, 800), (1920, 1080)])
+@pytest.mark.parametrize(("width", "height"), SCREENS)
 def test_layout_on_every_screen(browser: Browser, editor: Editor, folder: Path, width: int, height: int) -> None:
     """Nothing is outside the screen, and on a phone a finger can draw and save."""
     phone = width < 500
@@ -445,7 +446,7 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
         tab = Tab(browser.new_page(viewport={"width": 1280, "height": 900}))
         tab.page.goto(editor.url)
         tab.wait_for_picture()
-        expect(tab.page.locator(".response circle")).not_to_have_count(0, timeout=60_000)
+        expect(tab.page.locator(".response circle")).not_to_have_count(0)
         tab.drag(tab.slider("Texture"), 0.2, 0.8)
         tab.page.get_by_role("button", name="Save photo").click()
         tab.page.get_by_label("Name").fill("out.png")

@@ -41,7 +41,7 @@ def shown(tab: Tab) -> None:
     """Wait for the photograph."""
     expect(tab.page.get_by_text("150×100 pixels")).to_be_visible()
     tab.wait_for_picture()
-    expect(tab.page.locator(".response circle")).not_to_have_count(0, timeout=60_000)
+    expect(tab.page.locator(".response circle")).not_to_have_count(0)
 
 
 def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:

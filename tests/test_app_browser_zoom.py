@@ -12,11 +12,10 @@ from playwright.sync_api import Browser, CDPSession, expect
 
 from nlfilter_torch.edits.presets import find_recipe
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from tests.browser import CHROMIUM, Editor, Tab, chromium
+from tests.browser import CHROMIUM, SCREENS, Editor, Tab, chromium
 from tests.problems import cat
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium")
-SCREENS = [(390, 844), (800, 600), (1280, 800), (1920, 1080)]
 WIDTH, HEIGHT = 450, 300
 
 

@@ -223,7 +223,7 @@ class Preview:
             return change_luminance(self.pixels, change, detail["limits"], balance)
         luminance = reduce_channels(self.pixels, "luminance")
         coarse = Coarse.of(self.pixels, luminance, change, detail["limits"], balance)
-        return coarse.seen(self.pixels, luminance, self.stride)
+        return coarse.change(self.pixels, *coarse.left(luminance, self.stride))
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""
@@ -232,7 +232,8 @@ class Preview:
             return self._filter[1]
         if keep:
             self._filter = None  # first, since two of them would take twice the memory
-        edit = prepare(step, image.clamp(0, 1), stride=self.stride)
+        # A reduced photograph goes a little beyond its range, also where saving reduces it.
+        edit = prepare(step, image.clamp(0, 1) if before else image, stride=self.stride)
         if keep:
             self._filter = (key, edit)
         return edit

@@ -33,6 +33,8 @@ window.closeup = (() => {
       watched = canvas();
       new ResizeObserver(draw).observe(watched);
     }
+    const photo = watched.querySelector(".photo > img");
+    if (photo && !photo.alt) photo.alt = "photograph";
     const box = watched.getBoundingClientRect(), s = now() / density();
     const width = size.width * s, height = size.height * s;
     if (scale === null) { x = size.width / 2; y = size.height / 2; }

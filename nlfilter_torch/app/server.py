@@ -38,7 +38,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
         media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
-    @ui.page("/", title=TITLE)
+    @ui.page("/", title=TITLE, language="en-US")
     def _page(photo: str = "") -> None:
         Editor(library).build(image, photo)
 

@@ -3,6 +3,7 @@
 CSS = """
 :root { --wipe: 0; --cut: 0; }
 body { background: #17181b; }
+.q-btn.bg-primary { --q-primary: #2f6fae; }  /* white on it can be read */
 .nicegui-content { padding: 0 !important; gap: 0 !important; }
 :focus-visible, .q-slider:focus-within:has(:focus-visible) {
   box-shadow: 0 0 0 2px #17181b, 0 0 0 4px #ffd54a !important; border-radius: 3px; }

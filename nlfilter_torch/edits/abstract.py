@@ -12,7 +12,8 @@ from nlfilter_torch.core.checks import check_count, check_photograph, check_reac
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
 from nlfilter_torch.edits.parameters import ABSTRACT
-from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, synthesize
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, synthesize
+from nlfilter_torch.edits.viewing import fit_change, viewed_size
 from nlfilter_torch.operator.features import blur, blur_margin
 
 # The residual of the eigenvectors is multiplied by a power of W's diagonal part r, with the exponent times this factor:
@@ -23,7 +24,7 @@ MIN_REMAINDER = 1e-4  # lower limit of r
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones in flat areas and at edges
 MIN_SQUARED_GRADIENT = 1e-12  # lower limit of squared gradients; keeps the derivative of their square root finite
-EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel, from which on steps have the steepness CRISP
+EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel of the viewing size, from which on steps are CRISP
 
 
 @full_precision
@@ -34,6 +35,7 @@ def abstract(
     edges: float = ABSTRACT.defaults["edges"],
     edge_width: float | None = None,
     tones: int | None = ABSTRACT.defaults["tones"],
+    viewing_size: float = ABSTRACT.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = ABSTRACT.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = ABSTRACT.defaults["patch_size"],
@@ -52,6 +54,8 @@ def abstract(
         edge_width: width of the lines in pixels, at most half the short side; None is 0.2 % of the short side, and at
             least 0.3 pixels.
         tones: number of luminance levels, from 2 to 65536; None does not quantize.
+        viewing_size: in megapixels; a larger image is edited like its reduction to this size, in whose pixels patches
+            and bandwidths are counted; 0 is the size of the image.
         photometric_bandwidth: h_y; larger gives larger flat areas.
         spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
         patch_size: width of the compared patches.
@@ -79,6 +83,7 @@ def abstract(
         edges=edges,
         edge_width=edge_width,
         tones=tones,
+        viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
@@ -88,21 +93,56 @@ def abstract(
 
 
 def fit_abstract(
-    source: Source, *, power: float | Tensor, edges: float, edge_width: float | None, tones: int | None, **options: Any
+    source: Source,
+    *,
+    power: float | Tensor = ABSTRACT.defaults["power"],
+    edges: float = ABSTRACT.defaults["edges"],
+    edge_width: float | None = None,
+    tones: int | None = ABSTRACT.defaults["tones"],
+    viewing_size: float = ABSTRACT.defaults["viewing_size"],
+    spatial_bandwidth: float | Tensor | None = None,
+    num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
+    **options: Any,
 ) -> Fitted:
     """:func:`abstract` for any source."""
-    check_count(options["num_landmarks"], "num_landmarks")
+    check_count(num_landmarks, "num_landmarks")
     ABSTRACT["power"].check_argument(power, source.batch)
     ABSTRACT["edges"].check_argument(edges)
     ABSTRACT["edge_width"].check_argument(edge_width)
+    ABSTRACT["viewing_size"].check_argument(viewing_size)
     width = ABSTRACT["edge_width"].pixels(edge_width, source.size)
     check_reach(width, "edge_width", source.size)
     ABSTRACT["tones"].check_argument(tones)
     if (edges > 0 or tones is not None) and source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3")
+
+    def change(viewed: Source) -> Fitted:
+        flat = flattened(viewed, power, num_landmarks=num_landmarks, spatial_bandwidth=spatial_bandwidth, **options)
+        return Fitted(lambda pixels: flat(pixels) - pixels.image)
+
+    fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
+    if edges == 0 and tones is None:
+        return fitted
+    scale = source.size[0] / viewed_size(source.size, viewing_size)[0]
+    return Fitted(
+        fitted.pixels,
+        lambda _, planes: draw(planes, edges, width, tones, scale),
+        margin=blur_margin(WIDER * width) + 1,
+    )
+
+
+def flattened(
+    source: Source,
+    power: float | Tensor,
+    *,
+    num_landmarks: int,
+    spatial_bandwidth: float | Tensor | None,
+    **options: Any,
+) -> Planes:
+    """Compute ``W^k y``."""
     options |= {
-        "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
-        "spatial_bandwidth": nearby(options["spatial_bandwidth"], ABSTRACT["spatial_bandwidth"].share, source.size),
+        "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
+        "spatial_bandwidth": nearby(spatial_bandwidth, ABSTRACT["spatial_bandwidth"].share, source.size),
         "guide_channels": "all",
     }
     operator = source.operator(Guide(options, spectral=True))
@@ -120,19 +160,13 @@ def fit_abstract(
     residual_gain = operator.each(
         lambda columns: columns.remainder.clamp(MIN_REMAINDER, 1.0).unsqueeze(1) ** residual_exponent
     )
-
-    def flat(pixels: Pixels) -> Tensor:
-        return mean + smoothed(pixels) + residual_gain(pixels) * (varying(pixels) - captured(pixels))
-
-    if edges == 0 and tones is None:
-        return Fitted(flat)
-    return Fitted(flat, lambda _, planes: draw(planes, edges, width, tones), margin=blur_margin(WIDER * width) + 1)
+    return lambda pixels: mean + smoothed(pixels) + residual_gain(pixels) * (varying(pixels) - captured(pixels))
 
 
-def draw(flat: Tensor, edges: float, width: float, tones: int | None) -> Tensor:
-    """Quantize the luminance of an image (B, C, H, W) and draw lines along its edges."""
+def draw(flat: Tensor, edges: float, width: float, tones: int | None, scale: float = 1.0) -> Tensor:
+    """Quantize the luminance of an image (B, C, H, W), see :func:`quantize`, and draw lines along its edges."""
     luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
-    toned = luminance if tones is None else quantize(luminance, tones)
+    toned = luminance if tones is None else quantize(luminance, tones, scale)
     toned = toned * (1 - edges * (1 - edge_lines(luminance, width)))
     return merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned
 
@@ -144,13 +178,18 @@ def edge_lines(luminance: Tensor, width: float) -> Tensor:
     return 1 + torch.tanh(FALLOFF * difference.clamp(max=0.0))
 
 
-def quantize(luminance: Tensor, tones: int) -> Tensor:
-    """Quantize luminance (B, 1, H, W) to ``tones`` levels, with soft steps in flat areas and steep ones at edges."""
+def quantize(luminance: Tensor, tones: int, scale: float = 1.0) -> Tensor:
+    """Quantize luminance (B, 1, H, W) to ``tones`` levels, with soft steps in flat areas and steep ones at edges.
+
+    Gradients are those of a picture with pixels ``scale`` times as large.
+    """
     from kornia.filters import spatial_gradient  # kornia takes half a second to import
 
     step = 1 / (tones - 1)
     nearest = (luminance / step).round() * step
-    gradient = 100 * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=MIN_SQUARED_GRADIENT).sqrt()
+    gradient = (
+        100 * scale * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=MIN_SQUARED_GRADIENT).sqrt()
+    )
     steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
     # Steepness is relative to a step, so that transitions look alike for any number of tones.
     return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)

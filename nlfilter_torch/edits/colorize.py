@@ -23,9 +23,11 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
 from nlfilter_torch.edits.local_values import LocalValues, block_size
+from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
-from nlfilter_torch.edits.source import Fitted, Guide, Operator, Source, edited, luminance
+from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, edited, luminance
+from nlfilter_torch.edits.viewing import Coarse, viewed_size
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.spectrum import Spectrum
@@ -71,6 +73,7 @@ def colorize(
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = COLORIZE.defaults["patch_size"],
     num_landmarks: int = COLORIZE.defaults["num_landmarks"],
+    viewing_size: float = COLORIZE.defaults["viewing_size"],
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Colour a grey image from strokes; its luminance is kept.
@@ -92,6 +95,9 @@ def colorize(
         spatial_bandwidth: in pixels; None is 0.5625 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
+        viewing_size: in megapixels; the colours of a larger image are found in its reduction to this size, patches and
+            bandwidths are in pixels of that, and borders between colours follow the image's; 0 is the size of the
+            image.
         generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
@@ -126,6 +132,7 @@ def colorize(
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         num_landmarks=num_landmarks,
+        viewing_size=viewing_size,
         generator=generator,
     )
 
@@ -142,6 +149,7 @@ def fit_colorize(
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = COLORIZE.defaults["patch_size"],
     num_landmarks: int = COLORIZE.defaults["num_landmarks"],
+    viewing_size: float = COLORIZE.defaults["viewing_size"],
     **options: Any,
 ) -> Fitted:
     """:func:`colorize` for any source; a colour picture is reduced to its luminance."""
@@ -158,10 +166,15 @@ def fit_colorize(
         check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
     check_patch_size(patch_size)
     check_count(num_landmarks, "num_landmarks")
-    pixels = source.size[0] * source.size[1]
+    COLORIZE["viewing_size"].check_argument(viewing_size)
+    scribbles, viewed = source.scribbles(stroke_mask, strokes, "stroke_mask"), source
+    small = viewed_size(source.size, viewing_size)
+    if small != source.size:
+        viewed = source.resized(small)
+        scribbles = blocks_of(scribbles, viewed, source.size[1], source.size[1] / small[1])
+    pixels = small[0] * small[1]
     options["num_landmarks"] = min(num_landmarks, pixels)
-    nearness = nearby(spatial_bandwidth, COLORIZE["spatial_bandwidth"].share, source.size)
-    scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
+    nearness = nearby(spatial_bandwidth, COLORIZE["spatial_bandwidth"].share, small)
 
     def operator_of(stage: Stage) -> Operator:
         scaled = {
@@ -169,20 +182,20 @@ def fit_colorize(
             "photometric_bandwidth": stage.photometric * photometric_bandwidth,
             "spatial_bandwidth": stage.spatial * nearness,
         }
-        return source.operator(Guide(options | scaled, spectral=True))
+        return viewed.operator(Guide(options | scaled, spectral=True))
 
     assert scribbles.colours is not None  # for mypy
     wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
     if method == "kmeans":
         regions, colours, _ = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
-        planes = scribbles.weighted(regions.squeeze(2)).planes(source)
+        planes = scribbles.weighted(regions.squeeze(2)).planes(viewed)
         pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
-        return Fitted(lambda some: merge_luminance(luminance(some), chroma))
-    step = block_size(source.size)
-    guide = source.reduced(luminance, step)
+        return _coloured(source, viewed, lambda _: chroma)
+    step = block_size(small)
+    guide = viewed.reduced(luminance, step)
     # Without green, which follows from red and blue.
-    local = LocalValues.of(guide, step, source.size[1], scribbles.places, scribbles.weights, wanted[:, ::2])
+    local = LocalValues.of(guide, step, small[1], scribbles.places, scribbles.weights, wanted[:, ::2])
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
@@ -200,9 +213,23 @@ def fit_colorize(
         del operator  # frees its factor before the next one is computed
     far, near = parts
 
-    def coloured(some: Any) -> Tensor:
-        grey, alike = luminance(some), far(some) + near(some)
-        connected, influence = local(grey, some.first)
-        return merge_luminance(grey, alike + LOCAL_WEIGHT * (with_green(connected) - influence * alike))
+    def chroma_of(some: Any) -> Tensor:
+        alike = far(some) + near(some)
+        connected, influence = local(luminance(some), some.first)
+        return alike + LOCAL_WEIGHT * (with_green(connected) - influence * alike)
 
-    return Fitted(coloured)
+    return _coloured(source, viewed, chroma_of)
+
+
+def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
+    """A picture in the chroma (B, 3, h, w) of its reduction; the edges of that follow those of its luminance."""
+    if source is viewed and source.stride == 1:
+        return Fitted(lambda some: merge_luminance(luminance(some), chroma(some)))
+
+    def twice(some: Any) -> Tensor:
+        return luminance(some).expand(-1, 2, -1, -1)
+
+    before = viewed.all(Fitted(twice))
+    found = viewed.all(Fitted(lambda some: chroma(some)[:, ::2]))  # without green
+    changes = Coarse.of(before, before, found, "none", None).changes(source, twice)
+    return Fitted(lambda some: merge_luminance(luminance(some), with_green(changes(some)[0])))

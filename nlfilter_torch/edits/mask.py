@@ -23,11 +23,14 @@ from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import enlarged
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
-from nlfilter_torch.edits.source import Blocks, Fitted, Guide, InMemory, Operator, Planes, Source, edited
+from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
+from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source, edited
+from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 
 SOLVED = 1 << 17  # pixels
+VIEWED = VIEWING_SIZE.default  # megapixels; larger pictures are first reduced to this size
 CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
 # Gaussians, in pixels: surrounding colour, grain, average of its strength.
 SURROUND_SIGMA, GRAIN_SIGMA, TEXTURE_SIGMA = 2.0, 1.5, 3.0
@@ -228,9 +231,12 @@ def fit_regions(
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
     check_count(options["num_landmarks"], "num_landmarks")
-    blocks = math.ceil(source.stride * math.sqrt(source.size[0] * source.size[1] / SOLVED))  # in the photograph
-    step = blocks if source.stride == 1 else max(1.0, blocks / source.stride)
-    small = source.blocks(step, FLOATS_PER_PIXEL + options["num_landmarks"])
+    # The size of a preview, so that masks are the same in a preview and in the photograph.
+    size = viewed_size(source.size, VIEWED)
+    viewed = source if size == source.size else source.resized(size)
+    blocks = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
+    small = viewed.blocks(blocks, FLOATS_PER_PIXEL + options["num_landmarks"])
+    step = blocks if viewed is source else blocks * source.size[1] / size[1]
     marks = [blocks_of(marked, small, source.size[1], step) for marked in both]
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
@@ -249,8 +255,8 @@ def fit_regions(
     return Regions(small.image, step, fit_borders(small.image, torch.cat(rough, dim=1), front, back), both)
 
 
-def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Scribbles:
-    """Scribbles on the reduced picture; the weight of a block is the mean weight of its pixels.
+def blocks_of(marked: Scribbles, small: Source, width: int, step: float) -> Scribbles:
+    """Scribbles on the reduced picture; weight and colour of a block are the means of its pixels.
 
     Args:
         marked: scribbles on the picture.
@@ -267,7 +273,14 @@ def blocks_of(marked: Scribbles, small: InMemory, width: int, step: float) -> Sc
     places, block = (row * small.size[1] + column).unique(return_inverse=True)
     weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
     weights = weights.index_add(2, block, marked.weights) / step**2
-    return Scribbles(places, weights, small.colours(places))
+    colours = marked.colours
+    if colours is not None:
+        total = marked.weights.sum(1, keepdim=True)
+        sums = [
+            part.new_zeros(*part.shape[:2], len(places)).index_add(2, block, part) for part in (colours * total, total)
+        ]
+        colours = sums[0] / sums[1].clamp(min=EPSILON)
+    return Scribbles(places, weights.clamp(max=1.0), small.colours(places), colours)
 
 
 def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:

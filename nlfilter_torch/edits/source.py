@@ -141,6 +141,9 @@ class Source(Protocol):
     def resized(self, size: tuple[int, int]) -> "Source":
         """Reduce the picture to a smaller size (H, W)."""
 
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Planes (B, C, h, w) of all its pixels in a smaller size."""
+
     def resized_weights(self, weights: Any, size: tuple[int, int], name: str) -> Any:
         """Reduce weights (B, K, H, W) of the pixels, in the form that this source takes, to a smaller size (H, W).
 
@@ -239,6 +242,10 @@ class InMemory:
         if size == self.size:
             return self
         return InMemory(resize(self.image, size))
+
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Planes of all pixels in another size."""
+        return resize(planes(self), size)
 
     def blocks(self, step: float, floats: int) -> "InMemory":
         """Reduce the image by :func:`block_means`."""

@@ -9,12 +9,13 @@ factor are those of the small picture, whatever the size of the photograph.
 Detail too fine for the viewing size is changed like the coarser detail around it: what the small picture lacks is
 multiplied by the slope of the change over the brightness, from a regression over 5x5 pixels of the small picture. The
 finest parts of a texture are amplified (or smoothed) as much as the others; an edge, which is not detail, stays as
-sharp as it is. The average of the result over a pixel of the small picture is the small result.
+sharp as it is. The mean of what this adds over a pixel of the small picture is
+subtracted, so that the result, when reduced, is the small result: the editor, which shows that, shows what is saved.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -29,6 +30,7 @@ from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
 ROUND_TRIP_RADIUS = 4  # radius in pixels of the kernel that enlarging and reducing again amounts to
+RESTORED = 3  # terms of the Neumann series that inverts the smoothing by enlarging and reducing again
 FAINT_VARIANCE = (2 / 255) ** 2  # variance of brightness below which its slope is attenuated towards 0
 
 
@@ -57,6 +59,9 @@ class Reducible(Protocol):
 
     def resized(self, size: tuple[int, int]) -> Any:
         """Reduce the picture to a smaller size."""
+
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Reduce planes (B, C, h, w) of all its pixels to a smaller size."""
 
     def cached(self, fitted: Fitted) -> Fitted:
         """Compute the result of an edit and keep it in memory, if there is room for it."""
@@ -107,22 +112,8 @@ def fit_change(
     before, after = reduced.all(Fitted(planes)), reduced.all(fitted)
     image = reduced.all(Fitted(lambda pixels: pixels.image)) if limits == "soft" else before
     coarse = Coarse.of(image, before, after, limits, balance)
-    if small == source.size:
-        return Fitted(lambda pixels: coarse.seen(pixels.image, planes(pixels), source.stride))
-
-    def edit(pixels: Pixels) -> Tensor:
-        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
-        columns = None if width == pixels.width else range(left, left + width)
-        found = resized(
-            lambda start, stop: coarse.planes[:, :, start:stop],
-            small,
-            source.size,
-            range(top, top + height),
-            columns,
-        )
-        return coarse.change(pixels.image, planes(pixels), found)
-
-    return Fitted(edit)
+    found = coarse.changes(source, planes)
+    return Fitted(lambda pixels: coarse.change(pixels.image, *found(pixels)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,24 +140,69 @@ class Coarse:
         parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
-    def change(self, image: Tensor, planes: Tensor, found: Tensor) -> Tensor:
-        """Apply the change to pixels of the full-size picture.
+    def changes(self, source: Reducible, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
+        """Function from pixels to the changes of their ``planes`` and of their saturation."""
+        if source.size == (self.planes.shape[-2], self.planes.shape[-1]):
+            return lambda pixels: self.left(planes(pixels), source.stride)
+        finer = self._of_larger(source, planes)
+        return lambda pixels: finer._moved(planes(pixels), finer._at(pixels, source.size))
 
-        Args:
-            image: the pixels.
-            planes: their values to change, luminance or all channels.
-            found: :attr:`planes`, interpolated at these pixels.
-        """
-        blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
-        moved = changed + steepness * (planes - blurred)
+    def change(self, image: Tensor, moved: Tensor, saturation: Tensor) -> Tensor:
+        """Apply a change of the planes and of the saturation to pixels of the picture."""
         if self.limits == "none":
             return image + moved
-        saturation = found[:, 3 * self.count :]
         return move_luminance(image, moved, saturation if saturation.shape[1] else None)
 
-    def seen(self, image: Tensor, planes: Tensor, stride: float) -> Tensor:
-        """Apply the change to a preview at the viewing size as if it had been enlarged, applied and reduced again."""
-        return self.change(image, planes, enlarged_and_reduced(self.planes, stride))
+    def left(self, planes: Tensor, stride: float) -> tuple[Tensor, Tensor]:
+        """Changes in a preview at the viewing size, as if it had been enlarged, changed and reduced again."""
+        found = enlarged_and_reduced(self.planes, stride)
+        changed = self.planes[:, self.count : 2 * self.count]
+        blurred, _, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
+        beyond = steepness * (planes - blurred)
+        moved = enlarged_and_reduced(_restored(changed - beyond, stride), stride) + beyond
+        return moved, found[:, 3 * self.count :]
+
+    def _of_larger(self, source: Reducible, planes: Planes) -> "Coarse":
+        """Correct the change so that its mean over blocks of a larger picture is the change of the small one.
+
+        The change of detail that the small picture lacks has a nonzero mean, which is subtracted here.
+        """
+        size, count = (self.planes.shape[-2], self.planes.shape[-1]), self.count
+        before, steepness = slice(0, count), slice(2 * count, 3 * count)
+
+        def beyond(pixels: Pixels) -> Tensor:
+            lacking = planes(pixels) - self._at(pixels, source.size, before)
+            return self._at(pixels, source.size, steepness) * lacking
+
+        parts = list(self.planes.split([count, count, self.planes.shape[1] - 2 * count], dim=1))
+        stride = math.sqrt(source.size[0] * source.size[1] / (size[0] * size[1]))
+        parts[1] = _restored(parts[1] - source.shrunk(beyond, size), stride)
+        return replace(self, planes=torch.cat(parts, dim=1))
+
+    def _at(self, pixels: Pixels, size: tuple[int, int], channels: slice = slice(None)) -> Tensor:
+        """Channels of :attr:`planes`, enlarged to pixels of a picture of size (H, W)."""
+        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+        columns = None if width == pixels.width else range(left, left + width)
+        return resized(
+            lambda start, stop: self.planes[:, channels, start:stop],
+            (self.planes.shape[-2], self.planes.shape[-1]),
+            size,
+            range(top, top + height),
+            columns,
+        )
+
+    def _moved(self, planes: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+        """Changes of planes of the picture and of its saturation, given :attr:`planes` enlarged to these pixels."""
+        blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
+        return changed + steepness * (planes - blurred), found[:, 3 * self.count :]
+
+
+def _restored(planes: Tensor, stride: float) -> Tensor:
+    """Planes for which :func:`enlarged_and_reduced` returns approximately the given ones."""
+    found = planes
+    for _ in range(RESTORED - 1):
+        found = found + planes - enlarged_and_reduced(found, stride)
+    return found
 
 
 def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:

@@ -167,6 +167,16 @@ class Tiled:
         return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
 
     @torch.no_grad()
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Planes (1, C, h, w) of all pixels in a smaller size."""
+
+        def read(start: int, stop: int) -> Tensor:
+            self.passes.report("Reducing", start, self.size[0])
+            return planes(self.pixels_of(self.picture.tile(start, stop, 0)))
+
+        return self._resized(read, size)
+
+    @torch.no_grad()
     def resized_weights(self, weights: RowSource, size: tuple[int, int], name: str) -> RowSource:
         """Weights, rows (H, W, K) or (H, W), in a smaller size."""
         if tuple(weights.shape[:2]) != self.size:

@@ -1,0 +1,66 @@
+"""axe-core finds no serious defect of accessibility in the editor, on every size of screen, at every step."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from nlfilter_torch.io.photographs import Photograph, write_photograph
+from tests.browser import CHROMIUM, SCREENS, Editor, Tab, chromium
+from tests.pages import ROOT
+from tests.problems import cat
+
+AXE = Path(os.environ.get("AXE_CORE", ROOT / "node_modules" / "axe-core" / "axe.min.js"))
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium"),
+    pytest.mark.skipif(not AXE.exists(), reason="no axe-core here; install it: npm install --no-save axe-core@4"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
+    folder = tmp_path_factory.mktemp("editor")
+    write_photograph(Photograph(cat()), folder / "cat.png")
+    editor = Editor(folder, "cat.png")
+    yield editor
+    editor.stop()
+
+
+def defects(page: Page) -> list[tuple[str, str]]:
+    """Rules that the page breaks seriously, and the first element that does."""
+    # Together, since a page whose connection was lost loads itself again.
+    run = "(axe) => { (0, eval)(axe); return window.axe.run(document, {resultTypes: ['violations']}); }"
+    found: dict[str, Any] = page.evaluate(run, AXE.read_text(encoding="utf-8"))
+    assert found["passes"]  # it has looked
+    serious = [rule for rule in found["violations"] if rule["impact"] in ("serious", "critical")]
+    return [(rule["id"], rule["nodes"][0]["html"][:200]) for rule in serious]
+
+
+@pytest.mark.parametrize(("width", "height"), SCREENS)
+def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height: int) -> None:
+    phone = width < 500
+    context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
+    tab = Tab(context.new_page())
+    page = tab.page
+    page.goto(editor.url)
+    tab.wait_for_picture()
+    expect(page.locator(".response circle")).not_to_have_count(0)
+    found = {"Detail": defects(page)}
+    page.get_by_role("tab", name="Recolor").click()
+    page.get_by_role("button", name="#8a46c8").first.wait_for()
+    found["Recolor"] = defects(page)
+    page.get_by_role("button", name="Save photo").click()
+    page.get_by_label("Name").wait_for()
+    found["saving"] = defects(page)
+    context.close()
+    assert {place: rules for place, rules in found.items() if rules} == {}
