@@ -44,6 +44,13 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int)
         return None
 
 
+def check_apart(option: str, path: Path | None, **files: str) -> None:
+    """Raise ValueError if the picture that an option writes would replace one of the files, given by what they are."""
+    for what, file in files.items():
+        if path is not None and path.resolve() == Path(file).resolve():
+            raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
+
+
 @dataclass
 class Job:
     """A photograph that is edited by rows.
