@@ -9,8 +9,9 @@ from PIL import Image
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.cli.scribbles import Rectangle
+from nlfilter_torch.cli.scribbles import Rectangle, selection
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.io.rows import open_picture
 
 HEIGHT, WIDTH = 48, 64
 LANDMARKS = ("--landmarks", "40")
@@ -166,6 +167,15 @@ def test_rectangles() -> None:
     assert Rectangle.parse("63,47,1,1:", "--region", (48, 64)).note == ""
 
 
+def test_what_is_transparent_in_a_mask_is_not_selected(tmp_path: Path) -> None:
+    planes = torch.ones(1, 3, HEIGHT, WIDTH)
+    write_photograph(Photograph(planes, "uint8", box(8, 10, 6, 8)), tmp_path / "layer.png")
+    with open_picture(tmp_path / "layer.png", 10**9) as stored:
+        found = selection((HEIGHT, WIDTH), tmp_path / "layer.png", None, "--region", lambda _: stored)
+        assert found is not None
+        assert torch.equal(found.at_once(), box(8, 10, 6, 8))
+
+
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     capsys.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
@@ -189,6 +199,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("recolor", ["--region", "1,2,3,x:red"], "--region must be four whole numbers"),
         ("recolor", ["--region", "1,2,3,4"], "--region must end in a colour, such as 1,2,3,4:red, got '1,2,3,4'"),
         ("recolor", ["--region", "1,2,3,4:reddish"], "--region must end in a colour, such as red, #c04020 or rgb("),
+        ("recolor", ["--region", "1,2,3,4:#0000ff80"], "--region must end in an opaque colour, got '#0000ff80'"),
         ("recolor", ["--region", "1,2,0,4:red"], "--region must be at least 1 pixel wide and high, got 0x4"),
         (
             "recolor",

@@ -50,6 +50,12 @@ def test_shares_that_are_none(text: str) -> None:
         Rectangle.parse(text, "--region", (64, 96))
 
 
+@pytest.mark.parametrize("text", ["97,20", "20,65", "-1,20", "101%,50%", "50%,-1%"])
+def test_points_outside(text: str) -> None:
+    with pytest.raises(ValueError, match="--region must be a point in the photograph, which is 96 pixels wide and 64 "):
+        Rectangle.parse(text, "--region", (64, 96))
+
+
 def test_a_share_does_what_pixels_do(photo: Path, tmp_path: Path) -> None:
     one, other = tmp_path / "one.png", tmp_path / "other.png"
     assert main(["recolor", str(photo), str(one), "--region", "25%,50%,9,16:blue"]) == 0
@@ -113,3 +119,22 @@ def test_nothing_to_show(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["detail", str(photo), str(tmp_path / "out.png"), "--show", str(tmp_path / "shown.png")]) == 2
     assert "--show needs scribbles" in capsys.readouterr().err
     assert not (tmp_path / "shown.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("verb", "option"),
+    [
+        (["recolor", "--region", "24,32:blue"], "--show"),
+        (["mask", "--region", "24,32"], "--show"),
+        (["denoise"], "--map"),
+    ],
+)
+def test_the_photograph_is_not_replaced(
+    verb: list[str], option: str, photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, out = photo.read_bytes(), tmp_path / "out.png"
+    for path, what in ((photo, "photograph"), (out, "output")):
+        assert main([*verb, str(photo), str(out), option, str(path)]) == 2
+        assert f"{option} must be another file than the {what}, got" in capsys.readouterr().err
+    assert photo.read_bytes() == before
+    assert not out.exists()

@@ -39,9 +39,10 @@ def run(source: Path, target: Path, *more: str) -> int:
     return main(["mask", str(source), str(target), "--region", REGION, "--background", GROUND, *more])
 
 
-def test_files_of_every_kind(photograph: Path, tmp_path: Path) -> None:
+def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = expected(photograph)
     assert run(photograph, tmp_path / "out.png") == 0
+    assert f"--background {GROUND}: 80 pixels" in capsys.readouterr().out
     with Image.open(tmp_path / "out.png") as opened:
         assert opened.mode == "L"
         np.testing.assert_allclose(np.asarray(opened) / 255, wanted, atol=1 / 255)

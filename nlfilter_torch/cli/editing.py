@@ -60,6 +60,13 @@ def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | No
     return torch.cat(found, dim=1)
 
 
+def check_apart(option: str, path: Path | None, **files: str) -> None:
+    """Raise ValueError if the picture that an option writes would replace one of the files, given by what they are."""
+    for what, file in files.items():
+        if path is not None and path.resolve() == Path(file).resolve():
+            raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
+
+
 @dataclass
 class Job:
     """A photograph that is edited by rows.

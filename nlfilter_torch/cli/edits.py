@@ -271,6 +271,8 @@ def edit_photograph(
         rows = tiled.rows(fitted)
         yield from rows if noise is None else noise.watched(rows, job.picture.rows)
 
+    for which in ("show", "map"):
+        editing.check_apart(f"--{which}", given.get(which), photograph=source, output=target)
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))
     editing.edit_file(
         source,

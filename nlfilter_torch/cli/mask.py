@@ -47,6 +47,7 @@ def mask(
 
     if mask is None and not region:
         raise ValueError(GIVE)
+    editing.check_apart("--show", show, photograph=source, output=target)
     place, floats = Path(target), Path(target).suffix.lower() == PFM
     kind = options.DEPTHS[depth or ("16" if place.suffix.lower() in (".tif", ".tiff") else "8")]
     allowed = editing.allowed_memory(memory)
@@ -64,7 +65,7 @@ def mask(
 
     def tell(drawn: tuple[Any, Any], size: tuple[int, int], read: showing.Read) -> None:
         """Print the colours that scribbles cover, and write the picture of ``--show``."""
-        scribbled = (drawn[:1], {"keep": drawn[1]})
+        scribbled = (drawn[:1], {"background": drawn[1]})
         showing.tell_colours(showing.overlays(scribbled), read)
         if show is not None:
             showing.show(show, "mask", values, size, read, scribbled)

@@ -48,6 +48,7 @@ class Rectangle:
             lengths = [size[1 - i % 2] for i in range(4)]
             parts = numbers.split(",")
             found = [_pixels(part, length) for part, length in zip(parts, lengths[: len(parts)], strict=True)]
+            point = found if len(found) == 2 else [0]
             if len(found) == 2:
                 side = max(1, round(DOT_SIZE * min(size)))
                 found = [min(max(int(at) - side // 2, 0), n - side) for at, n in zip(found, lengths, strict=False)]
@@ -58,6 +59,11 @@ class Rectangle:
                 f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; percentages "
                 "such as 25% and a point X,Y are accepted too"
             ) from None
+        if not all(0 <= at <= length for at, length in zip(point, lengths, strict=False)):
+            raise ValueError(
+                f"{option} must be a point in the photograph, which is {size[1]} pixels wide and {size[0]} high, got "
+                f"{text!r}; move it"
+            )
         if width < 1 or height < 1:
             raise ValueError(f"{option} must be at least 1 pixel wide and high, got {width}x{height} in {text!r}")
         if x < 0 or y < 0 or x + width > size[1] or y + height > size[0]:
@@ -134,7 +140,9 @@ class Regions(Overlay):
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
-        weights[..., 0] = picture.tile(rows.start, rows.stop, 0).pixels.float().mean(1)[0].clamp(0, 1)
+        tile = picture.tile(rows.start, rows.stop, 0)
+        painted = tile.pixels.float().mean(1)[0].clamp(0, 1).numpy()
+        weights[..., 0] = painted * transparency(tile, "float32").prod(2)  # transparent pixels may be stored as white
         return weights
 
 
@@ -187,12 +195,16 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
         if rectangle.note is None:
             raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
         try:
-            colour = ImageColor.getrgb(rectangle.note)[:3]
+            *colour, opacity = (*ImageColor.getrgb(rectangle.note), 255)[:4]
         except ValueError:
             raise ValueError(
                 "--region must end in a colour, such as red, #c04020 or rgb(192,64,32), "
                 f"got {rectangle.note!r} in {text!r}"
             ) from None
+        if opacity < 255:
+            raise ValueError(
+                f"--region must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
+            )
         rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
     return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles)
 

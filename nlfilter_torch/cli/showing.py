@@ -28,7 +28,8 @@ OUTSIDE_BRIGHTNESS = 0.4  # brightness outside the mask, where the picture is sh
 def overlays(drawn: tuple[tuple[Any, ...], dict[str, Any]]) -> Iterator[tuple[str, Overlay]]:
     """Yield the scribbles of an edit, with the option that they come from."""
     scribbles, named = drawn
-    for option, found in (*(("--region", each) for each in scribbles), ("--keep", named.get("keep"))):
+    spared = ((f"--{name}", named.get(name)) for name in ("keep", "background"))
+    for option, found in (*(("--region", each) for each in scribbles), *spared):
         if isinstance(found, Overlay):
             yield option, found
 
@@ -78,7 +79,7 @@ def show(
     stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / MAX_PIXELS)))
     image = _reduced(read, size, stride, F.avg_pool2d).float().clamp(0, 1).expand(-1, 3, -1, -1)
     laid = {option: _planes(overlay, size, stride) for option, overlay in overlays(drawn)}
-    region, kept = laid["--region"], laid.get("--keep")
+    region, kept = laid["--region"], laid.get("--keep", laid.get("--background"))
     is_strokes = any(isinstance(overlay, Strokes) for _, overlay in overlays(drawn))
     painted = region[:, 3:].ceil() if is_strokes else region.amax(1, keepdim=True).ceil()
     options = arguments((image.shape[-2], image.shape[-1]), stride)
