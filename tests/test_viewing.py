@@ -60,6 +60,15 @@ def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
     assert torch.equal(change_luminance(image, change, "none"), image + change)
 
 
+@pytest.mark.parametrize(("rest", "change"), [((87, 160), -0.055), ((170, 90), 0.05)])
+def test_a_channel_near_its_end_causes_no_edge(rest: tuple[int, int], change: float) -> None:
+    ends = [5, 4, 3, 2, 1, 0] if change < 0 else [250, 251, 252, 253, 254, 255]
+    sky = torch.tensor([[end, *rest] for end in ends]).T.reshape(1, 3, 1, 6) / 255  # a smooth saturated area
+    moved = luminance(change_luminance(sky, torch.full((1, 1, 1, 6), change)) - sky).flatten() * 255
+    assert moved.abs().min() > 5
+    assert moved.diff().abs().max() < 1
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 def test_balance_keeps_mean_brightness_and_chroma(channels: int) -> None:
     image, change = drawn()
@@ -83,7 +92,7 @@ def test_edits_keep_mean_brightness_and_chroma(name: str) -> None:
     image = colour("astronaut", 60, 80)
     for size in (0.0025, 0):
         found = EDITS[name](image, viewing_size=size)
-        assert (luminance(found) - luminance(image)).mean().abs() < (1 / 255 if size else 1e-5)
+        assert (luminance(found) - luminance(image)).mean().abs() < (1 / 255 if size else 2e-5)
         assert (
             (found - luminance(found)).norm(dim=1).mean() / (image - luminance(image)).norm(dim=1).mean() - 1
         ) < 0.02

@@ -149,7 +149,8 @@ def _limited(image: Tensor, change: Tensor) -> Tensor:
     if change.shape[1] != image.shape[1]:
         low, high = _ends(image)
         least = torch.where(up, (high - image).amin(1, keepdim=True), (image - low).amin(1, keepdim=True))
-        room = room.pow(1 - CHANNEL_WEIGHT) * least.clamp(min=EPSILON).pow(CHANNEL_WEIGHT)
+        # At least a level: the root is steep at 0, and a channel at 0 beside one at 2 would show as an edge.
+        room = room.pow(1 - CHANNEL_WEIGHT) * least.clamp(min=LEVEL).minimum(room).pow(CHANNEL_WEIGHT)
     moved = -room * torch.expm1(-torch.where(up, change, -change) / room)
     return torch.where(up, moved, -moved)
 
