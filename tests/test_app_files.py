@@ -98,7 +98,7 @@ def test_a_photograph_too_large_for_the_machine(session: Session, monkeypatch: p
     Image.new("L", (10_000, 10_000)).save(session.folder / "copy", format="PNG")
     opened = session.opened
     with pytest.raises(
-        MemoryError, match=r"^huge\.png has 10000x10000 pixels and needs about 76.0 GB of memory, but 8.0 GB is"
+        MemoryError, match=r"^huge\.png has 10000x10000 pixels and needs about 76.0 GB of memory, but only 8.0 GB is"
     ):
         session.open(session.folder / "copy", "huge.png")
     assert session.opened is opened

@@ -152,5 +152,5 @@ def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixtu
         assert message in complaint
         assert complaint.count("\n") == 1
     assert main(["detail", str(before), str(small), "--preset", str(before.with_name("none.json"))]) == 2
-    assert "none.json does not exist" in capsys.readouterr().err
+    assert "none.json is neither a file nor one of the presets" in capsys.readouterr().err
     assert not preset.exists()

@@ -291,7 +291,7 @@ def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
 
 def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["apply", "in.png", str(tmp_path / "out.png"), "--preset", "nothing"]) == 2
-    assert "nothing does not exist" in capsys.readouterr().err
+    assert "nothing is neither a file nor one of the presets" in capsys.readouterr().err
 
 
 def test_more_memory_is_asked_for_by_hungrier_steps() -> None:
