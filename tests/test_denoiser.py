@@ -245,7 +245,12 @@ def test_even_noise_has_one_level() -> None:
         (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), torch.nan), ValueError, "noise must be finite"),
         (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), -1.0), ValueError, "noise must be at least 0"),
         (torch.zeros(1, 3, 8, 8), torch.zeros(1, 1, 8, 9), ValueError, "noise must have the height and width"),
-        (torch.zeros(1, 3, 8, 8), torch.zeros(1, 2, 8, 8), ValueError, "noise must have 1 channel or as many as the image"),
+        (
+            torch.zeros(1, 3, 8, 8),
+            torch.zeros(1, 2, 8, 8),
+            ValueError,
+            "noise must have 1 channel or as many as the image",
+        ),
         (torch.zeros(1, 3, 8, 8), torch.zeros(3), ValueError, "noise must be a number or have shape"),
         (torch.zeros(1, 3, 8, 8), "much", TypeError, "noise must be a number"),
     ],

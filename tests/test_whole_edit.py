@@ -141,8 +141,9 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     for name, options in zip(names, ([], ["--memory", "0.044", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
-    # Rounding in the first step may change the k-means of the second.
-    assert 0 < difference(whole, rows) < 1
+    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes single pixels by 3 levels.
+    assert 0 < difference(whole, rows) < 8
+    assert 255 * (whole - rows).square().mean().sqrt() < 0.5
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
 
 
