@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from playwright.sync_api import TimeoutError as Expired
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -98,6 +99,18 @@ class Tab:
         with self.page.expect_file_chooser() as chooser:
             self.page.get_by_role("button", name=button, exact=True).click()
         chooser.value.set_files(path)
+
+    def choose(self, select: str, option: str) -> None:
+        """Choose an option of a list, which a page that is still being built may close again."""
+        entry = self.page.get_by_role("option", name=option)
+        for _ in range(5):
+            self.page.get_by_role("combobox", name=select).click()
+            try:
+                entry.click(timeout=TIMEOUT / 5)
+                return
+            except Expired:
+                continue
+        raise AssertionError(f"the list {select} did not stay open")
 
     def drag(self, slider: Locator, start: float, end: float, *, steps: int = 4, release: bool = True) -> None:
         """Drag a slider from one fraction of its length to another."""

@@ -207,8 +207,7 @@ def test_preset_and_response(opened: Tab) -> None:
     curve = opened.page.locator(".response polyline")
     flat = curve.get_attribute("points")
     before = opened.source()
-    opened.page.get_by_role("combobox", name="Start from").click()
-    opened.page.get_by_role("option", name="crisp").click()
+    opened.choose("Start from", "crisp")
     opened.wait_for_picture(before)
     expect(opened.page.get_by_text("2.20 ×").first).to_be_visible()
     assert curve.get_attribute("points") != flat
