@@ -114,6 +114,7 @@ class Tab:
 
     def drag(self, slider: Locator, start: float, end: float, *, steps: int = 4, release: bool = True) -> None:
         """Drag a slider from one fraction of its length to another."""
+        expect(slider).to_be_visible()
         box = slider.bounding_box()
         assert box is not None
         y = box["y"] + box["height"] / 2
@@ -127,6 +128,7 @@ class Tab:
 
     def paint(self, *points: tuple[float, float], release: bool = True) -> None:
         """Draw a line through points given as fractions of the picture's size."""
+        expect(self.photo).to_be_visible()
         box = self.photo.bounding_box()
         assert box is not None
         at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
