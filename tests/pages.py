@@ -31,11 +31,11 @@ class Page:
         """Targets of links and pictures, without anchors."""
         return re.findall(r"\]\(([^)#]+)[^)]*\)", self.text)
 
-    def run_python(self) -> dict[str, object]:
-        """Run the Python blocks in order, and return the names that they define."""
+    def run_python(self, *, without: str | None = None) -> dict[str, object]:
+        """Run the Python blocks in order, except those with a certain text; return the names that they define."""
         names: dict[str, object] = {}
         for kind, block in self.blocks():
-            if kind == "python":
+            if kind == "python" and (without is None or without not in block):
                 exec(compile(block, str(self.path), "exec"), names)
         return names
 

@@ -41,6 +41,15 @@ def test_undo_and_redo(session: Session) -> None:
     assert not session.redo()  # a new edit discards what was undone
 
 
+def test_a_file_of_several_pages(session: Session, tmp_path: Path) -> None:
+    assert session.opened is not None
+    assert session.opened.pages == 1
+    Image.new("L", (30, 20)).save(tmp_path / "two.tif", save_all=True, append_images=[Image.new("L", (30, 20), 255)])
+    with pytest.warns(UserWarning, match="only the first is read"):
+        session.open(tmp_path / "two.tif")
+    assert session.opened.pages == 2
+
+
 def test_undo_in_the_midst_of_a_drag_takes_it_back_whole(session: Session) -> None:
     session.set("abstract", power=0.1)
     session.commit()

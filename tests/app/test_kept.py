@@ -1,7 +1,6 @@
 """Edits that persist when the page, the tab or the editor is closed."""
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,16 +8,8 @@ from playwright.sync_api import Browser, Dialog, expect
 
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.io.photographs import Photograph, write_photograph
-from tests.browser import CHROMIUM, Editor, Tab, chromium
+from tests.app.browser import Editor, Tab
 from tests.problems import cat
-
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture
@@ -31,24 +22,17 @@ def shots(tmp_path: Path) -> Path:
     return folder
 
 
-def visit(browser: Browser, url: str) -> Tab:
-    tab = Tab(browser.new_page(viewport={"width": 1280, "height": 800}))
-    tab.page.goto(url)
-    return tab
-
-
 def shown(tab: Tab) -> None:
     """Wait for the photograph."""
     expect(tab.page.get_by_text("150×100 pixels")).to_be_visible()
-    tab.wait_for_picture()
-    expect(tab.page.locator(".response circle")).not_to_have_count(0)
+    tab.wait_until_ready()
 
 
 def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
     editor = Editor(shots, "cat.png")
     kept = shots / "cat.png.edit.json"
     try:
-        tab = visit(browser, editor.url)
+        tab = Tab.at(browser, editor.url)
         page = tab.page
         shown(tab)
         undo = page.get_by_role("button", name="Undo")
@@ -72,7 +56,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
         page.reload()
         expect(page.locator("path.stroke")).to_have_count(1)
         expect(page.get_by_text("In the region")).to_be_visible()
-        other = visit(browser, page.url)
+        other = Tab.at(browser, page.url)
         shown(other)
         expect(other.page.locator("path.stroke")).to_have_count(1)
         other.paint((0.6, 0.2), (0.7, 0.2))
@@ -107,7 +91,7 @@ def test_a_photograph_of_another_folder(browser: Browser, shots: Path) -> None:
     """The browser does not reveal its path: its edit is stored in the user's state folder, and restored from there."""
     editor = Editor(shots)
     try:
-        tab = visit(browser, editor.url)
+        tab = Tab.at(browser, editor.url)
         tab.open(shots.parent / "elsewhere.png")
         shown(tab)
         tab.paint((0.2, 0.9), (0.3, 0.9))
@@ -121,7 +105,7 @@ def test_a_photograph_of_another_folder(browser: Browser, shots: Path) -> None:
         port = editor.url.rstrip("/").rsplit(":", 1)[1]
         editor.stop()
         editor = Editor(shots, "--port", port)
-        tab = visit(browser, address)
+        tab = Tab.at(browser, address)
         expect(tab.page.get_by_text("open the photograph again")).to_be_visible()
         tab.open(shots.parent / "elsewhere.png")
         expect(tab.page.locator("path.stroke")).to_have_count(1)

@@ -1,53 +1,35 @@
 """Zoom and pan in a real browser, by wheel, keys, buttons and fingers, on every size of screen."""
 
-import io
 from collections.abc import Iterator
 from typing import Any
-from urllib.parse import urljoin
 
 import pytest
 import torch
-from PIL import Image
-from playwright.sync_api import Browser, CDPSession, expect
+from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.edits.presets import find_recipe
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from tests.browser import CHROMIUM, SCREENS, Editor, Tab, chromium
+from tests.app.browser import SCREENS, Editor, Fingers, Tab, running
 from tests.problems import cat
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium")
 WIDTH, HEIGHT = 450, 300
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")
 def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
     folder = tmp_path_factory.mktemp("editor")
     write_photograph(Photograph(cat(1)), folder / "cat.png")
-    editor = Editor(folder, "cat.png")
-    yield editor
-    editor.stop()
-    assert editor.log.read_text() == ""  # no traceback, no warning
+    with running(folder, "cat.png") as editor:
+        yield editor
 
 
 class Zoomed(Tab):
     """A page of the editor with the photograph open, and the part of it that is shown."""
 
-    def __init__(self, browser: Browser, editor: Editor, width: int, height: int, *, touch: bool) -> None:
-        self.context = browser.new_context(
-            viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch and width < 500
-        )
-        super().__init__(self.context.new_page())
-        self.page.goto(editor.url)
-        self.wait_for_picture()
-        expect(self.page.locator(".response circle")).not_to_have_count(0)
-        self.level = self.page.locator(".zoom-level")
-        self.pieces = self.page.locator(".pieces img")
+    def __init__(self, page: Page) -> None:
+        super().__init__(page)
+        self.level = page.locator(".zoom-level")
+        self.pieces = page.locator(".pieces img")
 
     def middle(self) -> tuple[float, float]:
         """Of the canvas, in pixels of the page."""
@@ -57,14 +39,12 @@ class Zoomed(Tab):
 
     def share(self, x: float, y: float) -> tuple[float, float]:
         """Return the point of the photograph at a point of the page, as fractions of its width and height."""
-        box = self.photo.bounding_box()
-        assert box is not None
+        box = self.place()
         return (x - box["x"]) / box["width"], (y - box["y"]) / box["height"]
 
     def scale(self) -> float:
         """Pixels of the page per pixel of the photograph."""
-        box = self.photo.bounding_box()
-        assert box is not None
+        box = self.place()
         assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.02)
         return box["width"] / WIDTH
 
@@ -94,29 +74,17 @@ class Zoomed(Tab):
         )
         assert places
         for source, left, top, width, height in places:
-            found = Image.open(io.BytesIO(self.page.request.get(urljoin(self.page.url, source)).body()))
-            pixels = torch.frombuffer(bytearray(found.tobytes()), dtype=torch.uint8)
-            pixels = pixels.view(found.height, found.width, 3).permute(2, 0, 1)[None] / 255
+            pixels = self.picture(source)
             x, y = round(left / 100 * WIDTH), round(top / 100 * HEIGHT)
-            assert (found.width, found.height) == (round(width / 100 * WIDTH), round(height / 100 * HEIGHT))
-            part = wanted[..., y : y + found.height, x : x + found.width]
+            assert pixels.shape[2:] == (round(height / 100 * HEIGHT), round(width / 100 * WIDTH))
+            part = wanted[..., y : y + pixels.shape[2], x : x + pixels.shape[3]]
             assert (pixels - part).abs().max() <= 1.001 / 255
-
-
-class Fingers:
-    """Two fingers on the screen."""
-
-    def __init__(self, tab: Tab) -> None:
-        self.session: CDPSession = tab.page.context.new_cdp_session(tab.page)
-
-    def to(self, kind: str, *places: tuple[float, float]) -> None:
-        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
-        self.session.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
 
 
 @pytest.mark.parametrize(("width", "height"), SCREENS)
 def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor, width: int, height: int) -> None:
-    tab = Zoomed(browser, editor, width, height, touch=False)
+    tab = Zoomed.at(browser, editor.url, width, height)
+    tab.wait_until_ready()
     page, fit = tab.page, tab.scale()
     page.keyboard.press("1")
     expect(tab.level).to_have_text("100 %")
@@ -150,12 +118,13 @@ def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor
     page.get_by_role("button", name="Fit", exact=True).click()
     assert tab.scale() == pytest.approx(fit, rel=0.01)
     expect(page.locator("path.stroke")).to_have_count(0)  # none of this drew
-    tab.context.close()
+    tab.close()
 
 
 @pytest.mark.parametrize(("width", "height"), SCREENS)
 def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, height: int) -> None:
-    tab = Zoomed(browser, editor, width, height, touch=True)
+    tab = Zoomed.at(browser, editor.url, width, height, touch=True)
+    tab.wait_until_ready()
     page, fit, fingers = tab.page, tab.scale(), Fingers(tab)
     x, y = tab.middle()
     under = tab.share(x, y)
@@ -190,12 +159,13 @@ def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, h
     page.get_by_role("button", name="Fit", exact=True).tap()
     assert tab.scale() == pytest.approx(fit, rel=0.01)
     expect(page.locator("path.stroke")).to_have_count(0)
-    tab.context.close()
+    tab.close()
 
 
 def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: Editor) -> None:
     """A scribble stays where it was drawn, its edit is shown as it is saved, and the wipe shows the original."""
-    tab, folder = Zoomed(browser, editor, 1280, 800, touch=False), editor.log.parent
+    tab, folder = Zoomed.at(browser, editor.url, 1280, 800), editor.log.parent
+    tab.wait_until_ready()
     page = tab.page
     tab.enlarge("400 %")
     x, y = tab.middle()
@@ -228,9 +198,7 @@ def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: E
     source = page.locator(".originals img").get_attribute("src")
     assert source is not None
     left, top, right, bottom = (int(number) for number in source.partition("at=")[2].split(","))
-    found = Image.open(io.BytesIO(page.request.get(urljoin(page.url, source)).body()))
-    pixels = torch.frombuffer(bytearray(found.tobytes()), dtype=torch.uint8).view(found.height, found.width, 3)
-    assert torch.equal(pixels.permute(2, 0, 1)[None] / 255, cat(1)[..., top:bottom, left:right])
+    assert torch.equal(tab.picture(source), cat(1)[..., top:bottom, left:right])
     page.get_by_role("button", name="Reset").click()
     expect(page.locator("path.stroke")).to_have_count(0)
-    tab.context.close()
+    tab.close()

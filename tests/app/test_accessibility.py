@@ -6,34 +6,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page
 
 from nlfilter_torch.io.photographs import Photograph, write_photograph
-from tests.browser import CHROMIUM, SCREENS, Editor, Tab, chromium
+from tests.app.browser import SCREENS, Editor, Tab, running
 from tests.pages import ROOT
 from tests.problems import cat
 
 AXE = Path(os.environ.get("AXE_CORE", ROOT / "node_modules" / "axe-core" / "axe.min.js"))
 
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; install it: apt-get install chromium"),
-    pytest.mark.skipif(not AXE.exists(), reason="no axe-core here; install it: npm install --no-save axe-core@4"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as browser:
-        yield browser
+pytestmark = pytest.mark.skipif(
+    not AXE.exists(), reason="no axe-core here; install it: npm install --no-save axe-core@4"
+)
 
 
 @pytest.fixture(scope="module")
 def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
     folder = tmp_path_factory.mktemp("editor")
     write_photograph(Photograph(cat()), folder / "cat.png")
-    editor = Editor(folder, "cat.png")
-    yield editor
-    editor.stop()
+    with running(folder, "cat.png") as editor:
+        yield editor
 
 
 def defects(page: Page) -> list[tuple[str, str]]:
@@ -48,13 +40,9 @@ def defects(page: Page) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("width", "height"), SCREENS)
 def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height: int) -> None:
-    phone = width < 500
-    context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
-    tab = Tab(context.new_page())
+    tab = Tab.at(browser, editor.url, width, height, touch=width < 500)
     page = tab.page
-    page.goto(editor.url)
-    tab.wait_for_picture()
-    expect(page.locator(".response circle")).not_to_have_count(0)
+    tab.wait_until_ready()
     found = {"Detail": defects(page)}
     page.get_by_role("tab", name="Recolor").click()
     page.get_by_role("button", name="#8a46c8").first.wait_for()
@@ -62,5 +50,5 @@ def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height:
     page.get_by_role("button", name="Save photo").click()
     page.get_by_label("Name").wait_for()
     found["saving"] = defects(page)
-    context.close()
+    tab.close()
     assert {place: rules for place, rules in found.items() if rules} == {}

@@ -1,5 +1,6 @@
 """A headless Chromium and a separate editor process, for tests of the editor in a browser."""
 
+import io
 import os
 import re
 import shutil
@@ -8,8 +9,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
+from urllib.parse import urljoin
 
-from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+import numpy as np
+import torch
+from PIL import Image
+from playwright.sync_api import Browser, CDPSession, FloatRect, Locator, Page, expect, sync_playwright
 from playwright.sync_api import TimeoutError as Expired
 
 CHROMIUM = next(
@@ -61,8 +67,27 @@ class Editor:
         self.process.stdout.close()
 
 
+@contextmanager
+def running(folder: Path, *arguments: str) -> Iterator[Editor]:
+    """An editor that is stopped at the end, and has logged no traceback and no warning by then."""
+    editor = Editor(folder, *arguments)
+    yield editor
+    editor.stop()
+    assert editor.log.read_text() == ""
+
+
 class Tab:
     """A page of the editor, and the actions of its user."""
+
+    @classmethod
+    def at(cls, browser: Browser, url: str, width: int = 1280, height: int = 900, *, touch: bool = False) -> Self:
+        """Open an address in a window, or on the screen of a phone or tablet."""
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch and width < 500
+        )
+        tab = cls(context.new_page())
+        tab.page.goto(url)
+        return tab
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -86,6 +111,29 @@ class Tab:
             && image.naturalWidth > 0; }""",
             arg=other_than,
         )
+
+    def wait_until_ready(self) -> None:
+        """Wait until a photograph and its sliders are shown and the page has its final layout."""
+        self.wait_for_picture()
+        expect(self.page.locator(".response circle")).not_to_have_count(0)
+        self.place()
+
+    def place(self) -> FloatRect:
+        """Position and size of the photograph on the page, once they are the same in several frames."""
+        left, top, width, height = self.page.evaluate(
+            """async () => { const frame = () => new Promise(requestAnimationFrame); let old = '', same = 0;
+            for (;;) { await frame(); const b = document.querySelector('.photo > img').getBoundingClientRect();
+              const now = [b.x, b.y, b.width, b.height];
+              same = b.width * b.height > 0 && now.join() == old ? same + 1 : 0; old = now.join();
+              if (same == 5) return now; } }"""
+        )
+        return {"x": left, "y": top, "width": width, "height": height}
+
+    def picture(self, address: str = "") -> torch.Tensor:
+        """The picture shown, or that at another address of the editor; (1, 3, H, W) in [0, 1]."""
+        answer = self.page.request.get(urljoin(self.page.url, address or self.source()))
+        pixels = np.array(Image.open(io.BytesIO(answer.body())))
+        return torch.from_numpy(pixels).permute(2, 0, 1)[None] / 255
 
     def open(self, path: Path) -> None:
         """Choose a photograph."""
@@ -128,9 +176,7 @@ class Tab:
 
     def paint(self, *points: tuple[float, float], release: bool = True) -> None:
         """Draw a line through points given as fractions of the picture's size."""
-        expect(self.photo).to_be_visible()
-        box = self.photo.bounding_box()
-        assert box is not None
+        box = self.place()
         at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
         self.page.mouse.move(*at[0])
         self.page.mouse.down()
@@ -145,3 +191,32 @@ class Tab:
         self.page.get_by_label("Name").fill(name)
         self.page.get_by_role("button", name="Save", exact=True).click()
         self.page.get_by_text("Saved ").and_(self.page.get_by_text(name)).wait_for()
+
+    def close(self) -> None:
+        self.page.context.close()
+
+
+class Fingers:
+    """Two fingers on the screen."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.session: CDPSession = tab.page.context.new_cdp_session(tab.page)
+
+    def to(self, kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+        self.session.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+
+
+def by_finger(tab: Tab, *points: tuple[float, float]) -> None:
+    """Draw a line with a finger through points given as fractions of the picture's size."""
+    fingers, box = Fingers(tab), tab.place()
+    kind = "Start"
+    for x, y in points:
+        fingers.to(kind, (box["x"] + x * box["width"], box["y"] + y * box["height"]))
+        kind = "Move"
+    fingers.to("End")
+
+
+def difference(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Root mean square difference in grey levels of 255."""
+    return float((a.clamp(0, 1) - b.clamp(0, 1)).square().mean().sqrt()) * 255

@@ -1,0 +1,157 @@
+"""The editor in a real browser: tests perform the actions of a user."""
+
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from nlfilter_torch.cli import main
+from nlfilter_torch.edits.presets import find_recipe
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.io.photographs import read_photograph
+from tests.app.browser import Tab, difference
+from tests.problems import cat
+
+
+def test_photograph_is_shown(opened: Tab, folder: Path) -> None:
+    assert difference(opened.picture(), cat()) < 4  # JPEG
+    expect(opened.page.get_by_text("cat.png")).to_be_visible()
+    assert sorted(file.name for file in folder.iterdir()) == ["cat.png", "log.txt"]  # nothing is left behind
+
+
+def test_picture_follows_a_slider_and_undo(opened: Tab) -> None:
+    before = opened.source()
+    opened.drag(opened.slider("Texture"), 0.2, 0.8, release=False)
+    opened.wait_for_picture(before)  # while the button is held
+    opened.page.mouse.up()
+    expect(opened.page.get_by_text("4.00 ×")).to_be_visible()
+    wanted = Recipe().apply(cat())
+    opened.page.wait_for_timeout(300)
+    assert difference(opened.picture(), wanted) > 8
+    before = opened.source()
+    opened.page.keyboard.press("Control+z")
+    opened.wait_for_picture(before)
+    expect(opened.page.get_by_text("4.00 ×")).not_to_be_visible()
+    assert difference(opened.picture(), wanted) < 4
+    before = opened.source()
+    opened.page.get_by_role("button", name="Redo").click()
+    opened.wait_for_picture(before)
+    expect(opened.page.get_by_text("4.00 ×")).to_be_visible()
+
+
+def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
+    """The mask is shown for a second, or while its box is checked, but never while a slider moves."""
+    page = opened.page
+    expect(opened.mask).not_to_be_visible()
+    opened.paint((0.2, 0.9), (0.3, 0.9), release=False)
+    expect(page.locator("path.stroke")).to_have_count(1)  # while the button is held
+    page.mouse.up()
+    expect(opened.mask).to_be_visible()
+    expect(page.get_by_text("In the region")).to_be_visible()
+    expect(opened.mask).not_to_be_visible()  # after a second, by itself
+    page.get_by_role("checkbox", name="Mask").click()
+    expect(opened.mask).to_be_visible()
+    before = opened.source()
+    opened.drag(opened.slider("Texture in the region"), 0.2, 0.9, release=False)
+    opened.wait_for_picture(before)
+    expect(opened.mask).not_to_be_visible()  # not while a slider moves
+    page.mouse.up()
+    expect(opened.mask).to_be_visible()
+    page.get_by_role("checkbox", name="Mask").click()
+    expect(opened.mask).not_to_be_visible()
+    page.get_by_role("button", name="Clear strokes").first.click()
+    expect(page.get_by_text("In the region")).not_to_be_visible()
+    expect(page.locator("path.stroke")).to_have_count(0)
+
+
+def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab, folder: Path) -> None:
+    """Sliders, a region and a new colour; then the same edit from its file."""
+    page = opened.page
+    opened.drag(opened.slider("Fine detail"), 0.2, 0.6)
+    opened.paint((0.2, 0.9), (0.3, 0.9))
+    expect(opened.mask).to_be_visible()
+    before = opened.source()
+    page.get_by_role("tab", name="Recolor").click()
+    page.get_by_role("button", name="#8a46c8").first.click()
+    opened.paint((0.37, 0.35), (0.4, 0.37))
+    opened.wait_for_picture(before)
+    opened.save("Save photo", "out.png")
+    opened.save("Save edit", "edit.json")
+
+    recipe = find_recipe(str(folder / "edit.json"))
+    assert recipe.last("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
+    assert recipe.last("recolor").strokes[0].paint == "#8a46c8"
+    saved = read_photograph(folder / "out.png").pixels
+    assert (saved - recipe.apply(cat()).clamp(0, 1)).abs().max() <= 1 / 255
+    assert main(["apply", str(folder / "cat.png"), str(folder / "cli.png"), "--preset", str(folder / "edit.json")]) == 0
+    assert (saved - read_photograph(folder / "cli.png").pixels).abs().max() <= 1 / 255
+    assert difference(opened.picture(), saved) < 5
+
+    page.get_by_role("button", name="Reset").click()
+    expect(opened.mask).not_to_be_visible()
+    before = opened.source()
+    opened.load_edit(folder / "edit.json")
+    opened.wait_for_picture(before)
+    page.get_by_role("tab", name="Detail").click()
+    expect(opened.mask).to_be_visible()
+    page.wait_for_timeout(500)
+    assert difference(opened.picture(), saved) < 5
+
+    page.get_by_role("button", name="Save photo").click()
+    page.get_by_label("Name").fill("out.png")
+    page.get_by_role("button", name="Save", exact=True).click()
+    expect(page.get_by_text("A file of that name is there already.")).to_be_visible()
+    page.get_by_role("button", name="Replace").click()
+    expect(page.get_by_text("out.png").first).to_be_visible()
+
+
+@pytest.mark.parametrize(("step", "control"), [("Defocus", "Blur"), ("Abstract", "Flatten"), ("Colorize", "Fill")])
+def test_other_steps_change_the_picture(opened: Tab, step: str, control: str) -> None:
+    page = opened.page
+    page.get_by_role("tab", name=step).click()
+    before = opened.source()
+    if step != "Abstract":
+        opened.paint((0.4, 0.4), (0.45, 0.4))
+        opened.wait_for_picture(before)
+        before = opened.source()
+    opened.drag(opened.slider(control), 0.5, 0.7, release=False)
+    opened.wait_for_picture(before)  # while the button is held
+    page.mouse.up()
+    page.wait_for_timeout(500)
+    assert difference(opened.picture(), cat()) > 5
+
+
+def test_preset_and_response(opened: Tab) -> None:
+    curve = opened.page.locator(".response polyline")
+    flat = curve.get_attribute("points")
+    before = opened.source()
+    opened.choose("Start from", "crisp")
+    opened.wait_for_picture(before)
+    expect(opened.page.get_by_text("2.20 ×").first).to_be_visible()
+    assert curve.get_attribute("points") != flat
+    expect(opened.page.get_by_text("crisp:").first).to_be_visible()  # the name stays
+    before = opened.source()
+    opened.drag(opened.slider("Bandwidth"), 0.3, 0.6)
+    opened.wait_for_picture(before)
+    expect(opened.page.get_by_text("Started from crisp, then changed")).to_be_visible()
+
+
+def test_histogram_and_clipping(opened: Tab) -> None:
+    page = opened.page
+    expect(page.get_by_role("img", name="histogram")).to_be_visible()
+    clipped = page.get_by_alt_text("clipped")
+    expect(clipped).not_to_be_visible()
+    page.get_by_role("checkbox", name="Clipped").click()
+    expect(clipped).to_be_visible()
+    page.get_by_role("tab", name="Tone").click()
+    before = opened.source()
+    opened.drag(opened.slider("Contrast"), 0.5, 1.0)
+    opened.wait_for_picture(before)
+    expect(page.get_by_text("Clipped: ")).to_be_visible()
+
+
+def test_wipe_shows_what_was_before(opened: Tab) -> None:
+    opened.drag(opened.slider("Before and after"), 0.0, 0.5)
+    clip = opened.page.get_by_alt_text("before").evaluate("element => getComputedStyle(element).clipPath")
+    assert clip.startswith(("inset(0px calc(50%", "inset(0px 50%")), clip
+    expect(opened.page.get_by_text("before", exact=True)).to_be_visible()

@@ -1,0 +1,221 @@
+"""The editor in a real browser: unusable files, several tabs, other sites, and a process that is killed."""
+
+import http.client
+import resource
+import signal
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import pytest
+import skimage.data
+import torch
+from playwright.sync_api import Browser, expect
+
+from nlfilter_torch.edits.presets import find_recipe
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from tests.app.browser import Editor, Tab, difference
+from tests.problems import cat
+
+
+def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None:
+    (folder / "notes.png").write_text("dear diary")
+    opened.open(folder / "notes.png")
+    error = opened.page.get_by_text("notes.png is not a PNG")
+    expect(error).to_be_visible()
+    before = opened.source()
+    opened.drag(opened.slider("Texture"), 0.2, 0.8)
+    opened.wait_for_picture(before)
+    expect(error).not_to_be_visible(timeout=5000)  # before it would disappear by itself
+
+
+def test_a_stroke_before_a_photograph(tab: Tab) -> None:
+    tab.page.get_by_text("Open a photograph to begin").click()
+    expect(tab.page.get_by_text("open a photograph first; there is nothing to paint on")).to_be_visible()
+    tab.page.get_by_role("button", name="Save photo").click()
+    expect(tab.page.get_by_text("open a photograph first; there is nothing to save")).to_be_visible()
+
+
+def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
+    page = opened.page
+    (folder / "notes.png").write_text("dear diary")
+    opened.open(folder / "notes.png")
+    expect(page.get_by_text("notes.png is not a PNG, JPEG, TIFF, WebP or AVIF image")).to_be_visible()
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    # 1,000 megapixels in a few bytes: refused by its header.
+    header = struct.pack(">IIBBBBB", 20_000, 50_000, 8, 0, 0, 0, 0)
+    (folder / "huge.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"") + chunk(b"IEND", b"")
+    )
+    opened.open(folder / "huge.png")
+    expect(
+        page.get_by_text("huge.png is too large").or_(page.get_by_text("huge.png has 20000x50000 pixels"))
+    ).to_be_visible()
+
+    (folder / "edit.json").write_text('{"detail": {"sharpness": 11}}')
+    opened.load_edit(folder / "edit.json")
+    expect(page.get_by_text("detail in edit.json must have no entries other than")).to_be_visible()
+
+    page.get_by_role("button", name="Save photo").click()
+    for name, sentence in (("../out.png", "the name must be one of a file"), ("out.gif", "out.gif must end in .png")):
+        page.get_by_label("Name").fill(name)
+        page.get_by_role("button", name="Save", exact=True).click()
+        expect(page.get_by_text(sentence)).to_be_visible()
+    page.get_by_role("button", name="Cancel").click()
+
+    assert "Traceback" not in page.content()
+    before = opened.source()
+    opened.drag(opened.slider("Texture"), 0.2, 0.8)  # and the editor still works
+    opened.wait_for_picture(before)
+
+
+def test_recolouring_a_grey_photograph_says_what_to_do(tab: Tab, folder: Path) -> None:
+    write_photograph(Photograph(cat()[:, :1]), folder / "grey.png")
+    tab.open(folder / "grey.png")
+    tab.wait_for_picture()
+    tab.page.get_by_role("tab", name="Recolor").click()
+    tab.paint((0.4, 0.4), (0.5, 0.4))
+    expect(tab.page.get_by_text("recolor needs a colour photograph, got a grey one; use colorize")).to_be_visible()
+
+
+def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Editor, folder: Path) -> None:
+    coffee = torch.from_numpy(skimage.data.coffee()[::4, ::4].copy()).permute(2, 0, 1)[None].float() / 255
+    write_photograph(Photograph(coffee), folder / "coffee.png")
+    other = Tab.at(browser, editor.url)
+    other.open(folder / "coffee.png")
+    other.wait_for_picture()
+    before, others = opened.source(), other.source()
+    opened.drag(opened.slider("Texture"), 0.2, 0.6, release=False)
+    other.drag(other.slider("Texture"), 0.2, 0.9)
+    opened.page.mouse.up()
+    opened.wait_for_picture(before)
+    other.wait_for_picture(others)
+    opened.save("Save photo", "a.png")
+    other.save("Save photo", "b.png")
+    other.close()
+    for name, alpha, image in (("a.png", 3.0, cat()), ("b.png", 4.5, coffee)):
+        wanted = Recipe().apply(image)
+        recipe = find_recipe("crisp")
+        recipe = Recipe((Step("detail", alpha=(alpha, 1.0, 1.0, 1.0)),))
+        assert (read_photograph(folder / name).pixels - recipe.apply(image).clamp(0, 1)).abs().max() <= 1 / 255
+        assert difference(recipe.apply(image), wanted) > 5
+
+
+def test_foreign_names_of_this_machine_are_refused(editor: Editor) -> None:
+    host, port = editor.url.removeprefix("http://").rstrip("/").split(":")
+    for name, status in ((f"{host}:{port}", 200), ("evil.example", 400)):
+        connection = http.client.HTTPConnection(host, int(port))
+        connection.request("GET", "/", headers={"Host": name})
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_other_sites_reach_nothing(tab: Tab, editor: Editor, browser: Browser) -> None:
+    """A page of another site opens a websocket and sends a file to the editor: both are refused."""
+    address = editor.url.removeprefix("http://").rstrip("/")
+    opens = """address => new Promise(done => {
+        const socket = new WebSocket(`ws://${address}/_nicegui_ws/socket.io/?EIO=4&transport=websocket`);
+        socket.onopen = () => done("open"); socket.onerror = () => done("refused"); })"""
+    assert tab.page.evaluate(opens, address) == "open"
+    foreign = browser.new_page()
+    foreign.route("http://evil.example/", lambda route: route.fulfill(body="<p>hello</p>", content_type="text/html"))
+    foreign.goto("http://evil.example/")
+    assert foreign.evaluate(opens, address) == "refused"
+    foreign.close()
+    host, port = address.split(":")
+    for headers, status in (
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": f"http://{address}", "Content-Length": "5000000000"}, 413),
+    ):
+        connection = http.client.HTTPConnection(host, int(port))
+        connection.request("POST", "/", headers=headers)
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, editor: Editor, folder: Path) -> None:
+    """The log stays empty, which the fixture of the editor checks."""
+    other = Tab.at(browser, editor.url)
+    other.open(folder / "cat.png")
+    other.wait_for_picture()
+    other.page.get_by_role("button", name="Save photo").click()
+    expect(other.page.get_by_label("Name")).to_be_visible()
+    other.close()
+    opened.page.wait_for_timeout(5000)  # after three seconds a page is considered closed
+    assert editor.log.read_text() == ""
+
+
+def test_pictures_are_for_those_who_know_their_address(opened: Tab, editor: Editor) -> None:
+    request = opened.page.request
+    assert request.get(editor.url.rstrip("/") + opened.source()).status == 200
+    for address in ("picture/another/after", opened.source().removeprefix("/").replace("after", "mask")):
+        assert request.get(editor.url + address).status == 404
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the files of another process")
+def test_a_full_disk(opened: Tab, editor: Editor, folder: Path) -> None:
+    """No scribble is lost: what was kept stays, the page has the rest, and keeps it as soon as there is room."""
+    page, kept = opened.page, folder / "cat.png.edit.json"
+    strokes, room = page.locator("path.stroke"), resource.prlimit(editor.process.pid, resource.RLIMIT_FSIZE)
+    opened.paint((0.2, 0.9), (0.3, 0.9))
+    expect(page.get_by_text("In the region")).to_be_visible()
+    before = kept.read_bytes()
+    resource.prlimit(editor.process.pid, resource.RLIMIT_FSIZE, (0, room[1]))  # no file may have more than 0 bytes
+    opened.paint((0.6, 0.2), (0.7, 0.2))
+    expect(page.get_by_text("the edit cannot be kept")).to_be_visible()
+    page.get_by_role("button", name="Save photo").click()
+    page.get_by_label("Name").fill("full.png")
+    page.get_by_role("button", name="Save", exact=True).click()
+    expect(page.get_by_text("full.png cannot be written: File too large; free some space there")).to_be_visible()
+    assert kept.read_bytes() == before
+    assert {path.name for path in folder.iterdir()} == {"cat.png", kept.name, "log.txt"}
+    page.reload()
+    expect(strokes).to_have_count(2)
+    resource.prlimit(editor.process.pid, resource.RLIMIT_FSIZE, room)
+    opened.wait_until_ready()
+    opened.paint((0.6, 0.6), (0.7, 0.6))
+    expect(strokes).to_have_count(3)
+    opened.save("Save photo", "full.png")
+    assert len(Recipe.from_json(kept.read_text(), "").last("detail").strokes) == 3
+
+
+def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> None:
+    """The process is killed: the old file is unchanged, and after a new start the page has the edit and saves it."""
+    large = torch.nn.functional.interpolate(cat(), size=(900, 1350), mode="bicubic").clamp(0, 1)
+    write_photograph(Photograph(large), tmp_path / "large.png")
+    (tmp_path / "out.png").write_bytes(b"what was there")
+    editor = Editor(tmp_path, "large.png")
+    try:
+        tab = Tab.at(browser, editor.url)
+        tab.wait_until_ready()
+        tab.paint((0.2, 0.9), (0.3, 0.9))
+        expect(tab.page.get_by_text("In the region")).to_be_visible()
+        tab.drag(tab.slider("Texture in the region"), 0.2, 0.8)
+        expect(tab.page.get_by_text("4.00 ×")).to_be_visible()
+        tab.page.get_by_role("button", name="Save photo").click()
+        tab.page.get_by_label("Name").fill("out.png")
+        tab.page.get_by_role("button", name="Save", exact=True).click()
+        tab.page.get_by_role("button", name="Replace").click()
+        expect(tab.page.get_by_text("Saving…")).to_be_visible()
+        editor.process.send_signal(signal.SIGKILL)
+        editor.process.wait(30)
+        assert (tmp_path / "out.png").read_bytes() == b"what was there"
+        expect(tab.page.get_by_text("Connection lost")).to_be_visible(timeout=60_000)
+        editor.stop()
+        editor = Editor(tmp_path, "large.png", "--port", editor.url.rstrip("/").rsplit(":", 1)[1])
+        address = tab.page.url
+        tab.close()
+        tab = Tab.at(browser, address)
+        expect(tab.page.locator("path.stroke")).to_have_count(1)
+        expect(tab.page.get_by_text("4.00 ×")).to_be_visible()
+        tab.save("Save photo", "again.png")
+        tab.close()
+        assert {path.name for path in tmp_path.iterdir()} >= {"again.png", "large.png.edit.json"}
+    finally:
+        editor.stop()
