@@ -270,6 +270,9 @@ def test_regions_are_filtered_each_by_its_own_sliders(residual: float | None) ->
     torch.testing.assert_close(called(single, mask=masks.float(), alpha=sliders.float()), found)
     one_for_all = called(single, mask=masks.float(), alpha=sliders[0].float())
     torch.testing.assert_close(one_for_all[:, :, :8], found[:, :, :8])
+    for wrong in (-masks, 2 * masks):
+        with pytest.raises(ValueError, match=r"masks must be in \[0, 1\]"):
+            filter_regions(operator, image, wrong, sliders)
     with pytest.raises(ValueError, match="mask must have 2 channels, one for each row of sliders, got None"):
         layer(single)
     with pytest.raises(ValueError, match=r"alpha must have shape \(1, k\+1\)"):

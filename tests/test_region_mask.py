@@ -11,12 +11,13 @@ from nlfilter_torch import nonlocal_operator, region_mask
 from nlfilter_torch.edits import mask as masks
 from nlfilter_torch.edits import matting
 from nlfilter_torch.edits.resizing import enlarged
+from nlfilter_torch.edits.scribbled_colours import density, every_nth
 from nlfilter_torch.edits.source import InMemory, InMemoryOperator
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import Passes
-from tests.problems import box, colour, noise
+from tests.problems import box, colour, noise, seeded
 from tests.test_strokes import kriging
 
 SIZE = (40, 48)
@@ -255,3 +256,42 @@ def test_no_spatial_term_finds_what_is_alike_anywhere() -> None:
     scribble = box(18, 40, 3, 6, size=(40, 192))
     far = box(14, 130, 12, 30, size=(40, 192)) > 0
     assert region_mask(image, scribble, spatial_bandwidth=math.inf)[far].min() > 0.9
+
+
+def test_thin_parts_of_the_same_colour_belong_to_an_object() -> None:
+    """The regression alone leaves out hair and fades away from the scribble."""
+    texture = torch.rand(1, 3, 64, 96, generator=seeded(0)) * torch.tensor([0.1, 0.4, 0.1]).view(1, 3, 1, 1)
+    inside = torch.zeros(1, 1, 64, 96)
+    inside[..., 16:48, 20:76] = 1
+    inside[..., 4:60, 22:74:6] = 1  # hair, one pixel wide
+    image = torch.where(inside > 0, 0.62, texture)
+    scribble = torch.zeros_like(inside)
+    scribble[..., 30:33, 22:30] = 1
+    mask = region_mask(image, scribble)
+    hair = inside.clone()
+    hair[..., 14:50, :] = 0
+    assert mask[hair > 0].mean() > 0.75
+    assert mask[..., 18:46, 22:74].min() > 0.7
+    assert mask[inside == 0].mean() < 0.1
+
+
+def test_densities_are_sums_of_gaussians() -> None:
+    places, points = noise(2, 3, 1, 700).squeeze(2), noise(2, 3, 1, 5, seed=1).squeeze(2)
+    weights = torch.tensor([[1.0, 0.0, 0.5, 2.0, 0.0], [0.0] * 5], dtype=torch.float64)
+    found = density(places, points, weights, torch.full((1, 1, 1), 0.3, dtype=torch.float64))
+    squares = (places[:, :, :, None] - points[:, :, None]).square().mean(1)
+    wanted = (torch.exp(-squares[0] / 0.09) * weights[0]).sum(1) / weights[0].sum()
+    torch.testing.assert_close(found[0, 0], wanted, atol=1e-12, rtol=0)
+    assert (found[1] == 0).all()  # without weights there is nothing
+
+
+def test_pixels_to_compare_do_not_depend_on_other_images() -> None:
+    colours = noise(2, 3, 1, 50).squeeze(2)
+    weights = torch.zeros(2, 50, dtype=torch.float64)
+    weights[0, ::2], weights[1, 7:40] = 1.0, 0.5
+    together, kept = every_nth(colours, weights, 8)
+    for k in range(2):
+        alone, own = every_nth(colours[k : k + 1], weights[k : k + 1], 8)
+        assert 8 <= own.shape[1] <= 16
+        assert torch.equal(together[k][:, kept[k] > 0], alone[0])
+        assert torch.equal(kept[k][kept[k] > 0], own[0])

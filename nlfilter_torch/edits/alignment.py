@@ -13,13 +13,15 @@ SAME_SHAPE = 0.02  # largest difference of log aspect ratios at which an edited 
 MIN_CORRELATION = 0.6  # correlation required between a crop and its position
 SEARCH_SIDE = 400  # short side in pixels of the reduced picture in which a crop is searched for first
 MAX_SHIFT = 0.1  # largest shift, as a share of the short side
+PLAIN = 2.5 / 255  # by which the colours of a frame differ at most, in files of any kind
 
 
 def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:
     """Return the common part of two photographs (1, C, H, W), before and after an edit, at the same size.
 
     An edited picture of another size is resized if it has the same aspect ratio, or searched for as a crop of the
-    original; a shift of a few pixels is undone.
+    original; a shift of a few pixels is undone. A frame of one colour around it is cut off if the photograph is
+    complete without it.
 
     Returns:
         Both pictures, and a description of the changes for the user, empty if there are none.
@@ -29,12 +31,23 @@ def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor
             in the message.
     """
     size, other = before.shape[-2:], after.shape[-2:]
+    edges = frame(before[0], after[0])
+    framed = f"{edited} has a frame of one colour, which is left out" if any(edges) else ""
+    inside = _inside(after, edges)
     if size == other:
-        down, right = _shift(before, after)
+        if min(edges) > 0:
+            enlarged = resize(inside, (size[0], size[1])).clamp(0, 1)
+            kept = _inside(before, edges)
+            if _correlation(_grey(before), _grey(enlarged)) > _correlation(_grey(kept), _grey(inside)):
+                return before, enlarged, f"{framed}; the picture in it is enlarged to {size[1]}x{size[0]}"
+        down, right = (0, 0) if framed else _shift(before, after)
         if (down, right) == (0, 0):
-            return before, after, ""
+            return before, after, framed
         done = f"{edited} is shifted by {down} pixels down and {right} to the right"
         return *_overlap(before, after, down, right), done
+    if min(edges) > 0:
+        first, second, done = align(before, inside, name, edited)
+        return first, second, f"{framed}; {done}" if done else framed
     ratio = (other[1] / other[0]) / (size[1] / size[0])
     resized = resize(after, (size[0], size[1])).clamp(0, 1) if abs(math.log(ratio)) < SAME_SHAPE else None
     place, likeness = (0, 0), -1.0
@@ -49,6 +62,42 @@ def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor
         )
     part = before[..., place[0] : place[0] + other[0], place[1] : place[1] + other[1]]
     return part, after, f"{edited} is a crop of {name} from row {place[0]}, column {place[1]}"
+
+
+def frame(before: Tensor, after: Tensor) -> tuple[int, int, int, int]:
+    """Widths in pixels of a frame of one colour around an edited picture (C, H, W): above, below, left and right.
+
+    0 along edges where the photograph before the edit is of one colour as well.
+    """
+    edges, old = _plain_edges(after), _plain_edges(before)
+    if edges[0] + edges[1] >= after.shape[-2] or edges[2] + edges[3] >= after.shape[-1]:
+        return 0, 0, 0, 0
+    above, below, left, right = (width if other < width else 0 for width, other in zip(edges, old, strict=True))
+    return above, below, left, right
+
+
+def inside_frame(before: Tensor, after: Tensor) -> Tensor:
+    """Which pixels (H, W) of an edited picture (C, H, W) are not in a :func:`frame` around it."""
+    found = torch.ones(after.shape[-2:], dtype=torch.bool, device=after.device)
+    height, width = found.shape
+    above, below, left, right = frame(before, after)
+    found[:above], found[height - below :], found[:, :left], found[:, width - right :] = False, False, False, False
+    return found
+
+
+def _plain_edges(image: Tensor) -> tuple[int, int, int, int]:
+    """How many lines along each edge of a picture (C, H, W) have the colour of its first pixel."""
+    plain = ((image - image[:, :1, :1]).abs() <= PLAIN).all(0)
+    rows, columns = plain.all(1), plain.all(0)
+    lines = (rows, rows.flip(0), columns, columns.flip(0))
+    above, below, left, right = (int(line.long().cumprod(0).sum()) for line in lines)
+    return above, below, left, right
+
+
+def _inside(image: Tensor, edges: tuple[int, int, int, int]) -> Tensor:
+    """A picture (..., H, W) without a frame of these widths."""
+    above, below, left, right = edges
+    return image[..., above : image.shape[-2] - below, left : image.shape[-1] - right]
 
 
 def _grey(image: Tensor) -> Tensor:

@@ -323,3 +323,9 @@ def colour_guide(image: Tensor) -> Tensor:
         parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
     lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
     return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
+
+
+def hundredths_of_lab(image: Tensor) -> Tensor:
+    """CIE Lab in hundredths, (B, 3, H, W), of a colour or grey image."""
+    weighted = colour_guide(image.expand(-1, 3, -1, -1) if image.shape[1] == 1 else image)
+    return torch.cat([weighted[:, :1] / LIGHTNESS, weighted[:, 1:]], dim=1)

@@ -1,7 +1,8 @@
 """Soft object masks from foreground and background scribbles. Goes beyond the paper's Sec. IV.
 
 A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
-texture separates foreground from background. Two local solves (:mod:`nlfilter_torch.edits.matting`) then align the
+texture separates foreground from background, together with the colours of single pixels
+(:mod:`nlfilter_torch.edits.scribbled_colours`). Two local solves (:mod:`nlfilter_torch.edits.matting`) then align the
 borders of the mask with those of the picture. Both run on a copy reduced to about :data:`SOLVED` pixels, so the cost
 hardly grows with the size of the picture. The result is a linear function of the colour for each place, which gives the
 mask of any pixel from its own colour; results in tiles are therefore exact.
@@ -17,11 +18,12 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import LIGHTNESS, colour_guide, nearby
+from nlfilter_torch.edits.colour import LIGHTNESS, hundredths_of_lab, nearby
 from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
-from nlfilter_torch.edits.resizing import enlarged
+from nlfilter_torch.edits.resizing import block_means, enlarged
+from nlfilter_torch.edits.scribbled_colours import colour_likelihood, frame_places, likeness
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source, edited
@@ -38,26 +40,21 @@ TEXTURE_WEIGHT = 1.5
 NUM_CHANNELS = 9  # channels of the guide
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 SMOOTHNESS = 0.25  # of the regression
-FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
-NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
-SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
+COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask; the rest is the regression
+# Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
+# of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
+AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
 EPSILON = 1e-6
 
 
 MARGIN = max(blur_margin(SURROUND_SIGMA), blur_margin(GRAIN_SIGMA) + blur_margin(TEXTURE_SIGMA))
 
 
-def lab_of(image: Tensor) -> Tensor:
-    """CIE Lab in hundredths, (B, 3, H, W), of a colour or grey image."""
-    weighted = colour_guide(image.expand(-1, 3, -1, -1) if image.shape[1] == 1 else image)
-    return torch.cat([weighted[:, :1] / LIGHTNESS, weighted[:, 1:]], dim=1)
-
-
 def region_guide(image: Tensor) -> Tensor:
     """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of grain and of both gradients."""
-    lab = lab_of(image)
+    lab = hundredths_of_lab(image)
     lightness = lab[:, :1]
     colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
     padded = pad_border(lightness, 1)
@@ -250,7 +247,9 @@ def fit_regions(
     rough = []
     for marked in marks:
         alike = likeness(marked.image, marked.weights[:, 0], colours, options["photometric_bandwidth"])
-        rough.append(_regression(small, operator, marked, frame, 1 - alike, reach)(small))
+        likely = sharpened(_regression(small, operator, marked, frame, 1 - alike, reach)(small))
+        by_colour = colour_likelihood(small.image, marked, colours, 1 - alike, options["photometric_bandwidth"])
+        rough.append(likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0))
     front, back = (torch.cat([marked.planes(small)[:, k : k + 1] for marked in marks], dim=1) for k in (0, 1))
     return Regions(small.image, step, fit_borders(small.image, torch.cat(rough, dim=1), front, back), both)
 
@@ -296,42 +295,6 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
     return own.joined(around)
 
 
-def frame_places(size: tuple[int, int]) -> Tensor:
-    """Indices (n,), ascending, of pixels spaced along the borders of a picture, one pixel inside where possible."""
-    height, width = size
-    spacing = max(1, (height + width) // FRAME_POINTS)
-    top, left = min(1, height - 1), min(1, width - 1)
-    rows, columns = torch.arange(top, height, spacing), torch.arange(left, width, spacing)
-    lines = [(top + 0 * columns, columns), (height - 1 - top + 0 * columns, columns)]
-    lines += [(rows, left + 0 * rows), (rows, width - 1 - left + 0 * rows)]
-    return torch.cat([down * width + along for down, along in lines]).unique()
-
-
-def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
-    """Similarity, in [0, 1], of the colours of other pixels to those of scribbled pixels, (B, 1, k).
-
-    Position does not matter: the far end of a sky still counts as the same sky.
-
-    Args:
-        scribbled: colours (B, C, n) of scribbled pixels.
-        weights: their weights (B, n); pixels of weight 0 do not count.
-        others: colours (B, C, k) of the other pixels.
-        bandwidth: photometric bandwidth of the regression.
-    """
-    # Every n-th pixel of each image's own scribbles, whatever other pixels are given.
-    counted = weights.detach() > 0
-    number = counted.cumsum(1) - 1
-    counted = counted & (number % (counted.sum(1, keepdim=True) // NUM_COMPARED).clamp(min=1) == 0)
-    chosen = counted.any(0)
-    some, counted = scribbled[:, :, chosen], counted[:, chosen]
-    scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
-    left, right = (lab_of(t.unsqueeze(2)).squeeze(2) for t in (others, some))
-    squares = (left.unsqueeze(3) - right.unsqueeze(2)).square().mean(1) / scale.square()  # (B, k, n)
-    counted = counted.to(others).unsqueeze(1)
-    share = (torch.exp(-squares) * counted).sum(2) / counted.sum(2).clamp(min=1.0)
-    return (share / SIMILAR_SHARE).clamp(max=1.0).unsqueeze(1)
-
-
 def _regression(
     source: Source, operator: Operator, marked: Scribbles, frame: Blocks, unlike: Tensor, reach: float | Tensor
 ) -> Planes:
@@ -359,17 +322,29 @@ def _regression(
     return operator.each(lambda found: fitted(found.factor))
 
 
-def fit_borders(image: Tensor, likely: Tensor, front: Tensor, back: Tensor) -> Tensor:
+def sharpened(likely: Tensor) -> Tensor:
+    """Rough mask of a likelihood: a steep curve on which 0 and 1 stay as they are."""
+    bound = math.tanh(CONTRAST / 2)
+    return (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)
+
+
+def around(likely: Tensor) -> Tensor:
+    """Average of planes (B, 1, H, W) over a wide Gaussian, approximately."""
+    size = (likely.shape[-2], likely.shape[-1])
+    step = max(1, min(size) // AROUND_GRID)
+    coarse = block_means(likely, step)
+    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), step, (0, 0), size)
+
+
+def fit_borders(image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
     """Linear functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
 
     Args:
         image: (B, C, H, W).
-        likely: likelihood of the regions, (B, K, H, W).
+        rough: rough masks of the regions, (B, K, H, W).
         front: weights of the scribbles on the regions, (B, K, H, W).
         back: weights of the scribbles on their background, (B, K, H, W).
     """
-    bound = math.tanh(CONTRAST / 2)
-    rough = (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)  # 0 and 1 stay as they are
     painted = front + back
     target = (rough * ROUGH_CONFIDENCE + front * SCRIBBLE_CONFIDENCE) / (
         ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE

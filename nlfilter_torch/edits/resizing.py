@@ -1,4 +1,4 @@
-"""Resizing of pictures, a few rows at a time."""
+"""Resizing of pictures: interpolation a few rows at a time, means over blocks, and enlarging of blocks."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -85,11 +85,34 @@ def cubic(distance: Tensor) -> Tensor:
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
 
 
+def block_means(planes: Tensor, step: float) -> Tensor:
+    """Means over blocks of ``step`` x ``step`` pixels; blocks at the lower and right borders may be smaller.
+
+    With a fractional step, a pixel on the border of two blocks counts in both, weighted by the part in each.
+    """
+    if step == round(step):
+        step = round(step)
+        return planes if step == 1 else F.avg_pool2d(planes, step, ceil_mode=True, count_include_pad=False)
+    rows, columns = (_shares(length, step).to(planes) for length in planes.shape[-2:])
+    return rows @ planes @ columns.mT
+
+
+def _shares(length: int, step: float) -> Tensor:
+    """Weights (n, length) of the pixels along an axis in n blocks of a fractional step."""
+    count = math.ceil(length / step - 0.01)  # avoids a very thin last block
+    ends = torch.arange(count + 1, dtype=torch.float64) * step
+    ends[-1] = length
+    first = torch.arange(length, dtype=torch.float64)
+    inside = torch.minimum(ends[1:, None], first + 1) - torch.maximum(ends[:-1, None], first)
+    inside = inside.clamp(min=0.0)
+    return inside / inside.sum(1, keepdim=True)
+
+
 def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
     """Interpolate a part (B, C, h, w) of a picture bilinearly between the centres of blocks (B, C, n, m).
 
     Args:
-        blocks: values of blocks as those of :func:`nlfilter_torch.edits.source.block_means`.
+        blocks: values of blocks as those of :func:`block_means`.
         step: side of a block in pixels.
         corner: row and column of the first pixel of the part.
         size: (h, w) of the part.

@@ -5,14 +5,12 @@ given these statistics. A :class:`Source` computes the sums: here for an image o
 :mod:`nlfilter_torch.tiled.source` for a picture that is read a few rows at a time.
 """
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol, cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
@@ -21,7 +19,7 @@ from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.pixels import Fitted as Fitted
 from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
-from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.resizing import block_means, resize
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
 from nlfilter_torch.filtering.scribbles import check_painted
@@ -365,29 +363,6 @@ def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> 
     """Compute ``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
     total = coefficients @ operator.pairs.gain(response).mT
     return operator.each(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
-
-
-def block_means(planes: Tensor, step: float) -> Tensor:
-    """Means over blocks of ``step`` x ``step`` pixels; blocks at the lower and right borders may be smaller.
-
-    With a fractional step, a pixel on the border of two blocks counts in both, weighted by the part in each.
-    """
-    if step == round(step):
-        step = round(step)
-        return planes if step == 1 else F.avg_pool2d(planes, step, ceil_mode=True, count_include_pad=False)
-    rows, columns = (_shares(length, step).to(planes) for length in planes.shape[-2:])
-    return rows @ planes @ columns.mT
-
-
-def _shares(length: int, step: float) -> Tensor:
-    """Weights (n, length) of the pixels along an axis in n blocks of a fractional step."""
-    count = math.ceil(length / step - 0.01)  # avoids a very thin last block
-    ends = torch.arange(count + 1, dtype=torch.float64) * step
-    ends[-1] = length
-    first = torch.arange(length, dtype=torch.float64)
-    inside = torch.minimum(ends[1:, None], first + 1) - torch.maximum(ends[:-1, None], first)
-    inside = inside.clamp(min=0.0)
-    return inside / inside.sum(1, keepdim=True)
 
 
 def luminance(pixels: Pixels) -> Tensor:

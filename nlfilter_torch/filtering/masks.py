@@ -155,7 +155,7 @@ def squared_distances(coordinates: Tensor, centres: Tensor) -> Tensor:
 def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") -> Tensor:
     """Check regions (B, K, H, W) and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
     check_image(region, name, batch=spectrum.factor.shape[0])
-    check_same_size(region, spectrum.size, name, "spectrum")
+    check_same_size(region, spectrum.size, name, "spectrum", spectrum.factor)
     flat = region.to(spectrum.factor).flatten(2)
     if not is_hidden(flat) and bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")

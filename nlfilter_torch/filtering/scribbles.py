@@ -86,7 +86,7 @@ def propagate_strokes(
     images = batch if batch > 1 else max(strokes.shape[0], stroke_mask.shape[0])
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
-        check_same_size(tensor, spectrum.size, name, "spectrum")
+        check_same_size(tensor, spectrum.size, name, "spectrum", spectrum.factor)
     check_painted(stroke_mask, among=among)
     check_values(strength, "strength", "share", images)
     check_values(reach, "reach", "below 1", batch)

@@ -1,0 +1,120 @@
+"""Comparison of colours with those of scribbled pixels, for masks.
+
+Regressions blur: their features include the surroundings of a pixel. Densities of colours on both sides of a border
+separate hair and thin parts, too, where their colours differ.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.blocks import pixel_blocks
+from nlfilter_torch.edits.colour import hundredths_of_lab
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
+
+FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
+NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
+SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
+NUM_COLOURS = 32  # approximate number of scribbled pixels on each side that the colours of all pixels are compared with
+BANDWIDTH_SHARE = 0.4  # bandwidth of that comparison as a share of the photometric bandwidth
+MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
+SMALLEST_EXPONENT = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
+EPSILON = 1e-6
+
+
+def frame_places(size: tuple[int, int]) -> Tensor:
+    """Indices (n,), ascending, of pixels spaced along the borders of a picture, one pixel inside where possible."""
+    height, width = size
+    spacing = max(1, (height + width) // FRAME_POINTS)
+    top, left = min(1, height - 1), min(1, width - 1)
+    rows, columns = torch.arange(top, height, spacing), torch.arange(left, width, spacing)
+    lines = [(top + 0 * columns, columns), (height - 1 - top + 0 * columns, columns)]
+    lines += [(rows, left + 0 * rows), (rows, width - 1 - left + 0 * rows)]
+    return torch.cat([down * width + along for down, along in lines]).unique()
+
+
+def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
+    """Similarity, in [0, 1], of the colours of other pixels to those of scribbled pixels, (B, 1, k).
+
+    Position does not matter: the far end of a sky still counts as the same sky.
+
+    Args:
+        scribbled: colours (B, C, n) of scribbled pixels.
+        weights: their weights (B, n); pixels of weight 0 do not count.
+        others: colours (B, C, k) of the other pixels.
+        bandwidth: photometric bandwidth of the regression.
+    """
+    some, counted = every_nth(scribbled, (weights.detach() > 0).to(others), NUM_COMPARED)
+    scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
+    return (density(colours_in_lab(others), colours_in_lab(some), counted, scale) / SIMILAR_SHARE).clamp(max=1.0)
+
+
+def colour_likelihood(
+    image: Tensor, marked: Scribbles, frame: Tensor, unlike: Tensor, bandwidth: float | Tensor
+) -> Tensor:
+    """Likelihood (B, 1, h, w), in [0, 1], that a pixel belongs to a region, by its own colour alone.
+
+    Where colours separate the sides, it follows hair and borders more closely than the regression, whose features
+    include the surroundings of a pixel. 0.5 for colours that neither side has.
+
+    Args:
+        image: the reduced picture.
+        marked: scribbles on the region and on its background.
+        frame: colours (B, C, n) of the pixels along the borders of the picture.
+        unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
+        bandwidth: photometric bandwidth of the regression.
+    """
+    places = hundredths_of_lab(image).flatten(2)
+    scribbled = (every_nth(marked.image, weights, NUM_COLOURS) for weights in marked.weights.unbind(1))
+    chosen = [*scribbled, (frame, unlike.squeeze(1))]
+    scale = BANDWIDTH_SHARE * torch.as_tensor(bandwidth).to(image).reshape(-1, 1, 1)
+    inside, outside, around = (density(places, colours_in_lab(some), counted, scale) for some, counted in chosen)
+    opposed = (marked.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
+    outside = torch.where(opposed, (outside + around) / 2, around)
+    return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
+
+
+def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    """Every n-th pixel of positive weight, about ``number`` for each image, whatever the others in the batch have.
+
+    Args:
+        colours: (B, C, n).
+        weights: (B, n).
+        number: of pixels.
+
+    Returns:
+        Colours (B, C, m) of the pixels chosen for any image, and their weights (B, m), 0 for those of other images.
+    """
+    counted = weights.detach() > 0
+    place = counted.cumsum(1) - 1
+    counted = counted & (place % (counted.sum(1, keepdim=True) // number).clamp(min=1) == 0)
+    chosen = counted.any(0)
+    return colours[:, :, chosen], weights[:, chosen] * counted[:, chosen]
+
+
+def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) -> Tensor:
+    """Weighted mean (B, 1, k) of Gaussians around points, at other places; 0 if all weights are 0.
+
+    Args:
+        places: (B, C, k).
+        points: (B, C, m).
+        weights: (B, m).
+        bandwidth: (B or 1, 1, 1); the Gaussian is ``exp(-d / bandwidth^2)``, with d the mean square over the channels.
+    """
+    places, points = (t / (bandwidth * math.sqrt(t.shape[1])) for t in (places, points))
+    squares = points.square().sum(1, keepdim=True)
+    left = torch.cat([2 * points, -torch.ones_like(squares), -squares], dim=1)  # (B, C+2, m)
+    shares = (weights / weights.sum(1, keepdim=True).clamp(min=EPSILON)).unsqueeze(2)
+    found = []
+    for block in pixel_blocks(places.shape[2], len(places), places.device):
+        some = places[:, :, block]
+        right = torch.cat([some, some.square().sum(1, keepdim=True), torch.ones_like(some[:, :1])], dim=1)
+        exponents = right.mT @ left  # (B, k, m), minus the squared distances
+        found.append(exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ shares)
+    return torch.cat(found, dim=1).mT
+
+
+def colours_in_lab(colours: Tensor) -> Tensor:
+    """:func:`hundredths_of_lab` of colours (B, C, n)."""
+    return hundredths_of_lab(colours.unsqueeze(2)).squeeze(2)
