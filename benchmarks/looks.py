@@ -225,7 +225,6 @@ METHODS: dict[str, Callable[[Pairs], Predict]] = {
     "17^3 table": table_of,
     "histograms": histograms_of,
 }
-PEERS = [name for name in METHODS if name != "look"]
 
 
 def explained(before: Tensor, after: Tensor, found: Tensor) -> float:
@@ -267,6 +266,8 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=SIDE, help="pixels of the short side")
     parser.add_argument("--seed", type=int, default=0, help="of the order of the photographs")
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5], help="of pairs that are fitted at once")
+    parser.add_argument("--edits", nargs="+", default=[""], help="words of the names of the edits; all by default")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="all by default")
     parser.add_argument(
         "--quick", action="store_true", help="four small photographs that parameters were chosen on, and three edits"
     )
@@ -276,6 +277,7 @@ def main() -> None:
     order = torch.randperm(len(found), generator=torch.Generator().manual_seed(arguments.seed)).tolist()
     chosen = [list(found)[i] for i in order][: 4 if arguments.quick else 10]
     edits = EDITS | (MAGICK if magick_program() else {})
+    edits = {name: edit for name, edit in edits.items() if any(word in name for word in arguments.edits)}
     if arguments.quick:
         edits = dict(list(edits.items())[::5])
     magic = "installed" if magick_program() else "not installed, so that its edits are left out"
@@ -288,25 +290,30 @@ def main() -> None:
         if count > half:
             print(f"\n{count} pairs are left out: of {len(chosen)} photographs, {half} are fitted")
             continue
-        report(pairs, {name: kind for name, (kind, _) in edits.items()}, count)
+        report(pairs, {name: METHODS[name] for name in ("look", *arguments.methods)}, count)
 
 
-def report(pairs: dict[str, list[tuple[Tensor, Tensor]]], kinds: dict[str, str], count: int) -> None:
+def report(
+    pairs: dict[str, list[tuple[Tensor, Tensor]]], methods: dict[str, Callable[[Pairs], Predict]], count: int
+) -> None:
     """A table for a number of pairs that are fitted at once."""
     print(f"\nafter {count} pair{'s' * (count > 1)}: fitted mean, held out mean (lowest), in percent")
-    print(f"{'':34}" + "".join(f"{name:>21}" for name in METHODS))
+    print(f"{'':34}" + "".join(f"{name:>21}" for name in methods))
     best, tied, ended = 0, 0, time.perf_counter()
     for edit, some in pairs.items():
         cells, means = [], {}
-        for method, fit in METHODS.items():
+        for method, fit in methods.items():
             fitted, held = judge(fit, some, count)
             means[method] = statistics.mean(held)
             cells.append(f"{statistics.mean(fitted):6.1f} {means[method]:6.1f} ({min(held):4.0f})")
-        own, other = (round(value, 1) for value in (means["look"], max(means[name] for name in PEERS)))
+        others = [value for name, value in means.items() if name != "look"]
+        own, other = (round(value, 1) for value in (means["look"], max(others, default=-float("inf"))))
         best, tied = best + (own > other), tied + (own == other)
         verdict = "" if own > other else "  tied" if own == other else "  lost"
         print(f"{edit:34}" + "".join(f"{cell:>21}" for cell in cells) + verdict, flush=True)
-    print(f"best of all on {best} of {len(pairs)}, held out, and tied on {tied}; {time.perf_counter() - ended:.0f} s")
+    if len(methods) > 1:
+        print(f"best of all on {best} of {len(pairs)}, held out, and tied on {tied}")
+    print(f"{time.perf_counter() - ended:.0f} s")
 
 
 if __name__ == "__main__":

@@ -4,23 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
-import skimage.data
 import torch
 
+from nlfilter_torch import apply_look
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.presets import Preset
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-
-ALPHA = (2.2, 1.6, 1.3, 1.02)
-
-
-def photograph(rows: slice, columns: slice) -> torch.Tensor:
-    return torch.from_numpy(skimage.data.chelsea()[rows, columns].copy()).permute(2, 0, 1)[None].float() / 255
+from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb
 
 
 @pytest.fixture
 def before(tmp_path: Path) -> Path:
-    write_photograph(Photograph(photograph(slice(60, 140), slice(100, 200))), tmp_path / "before.png")
+    write_photograph(Photograph(CAT), tmp_path / "before.png")
     return tmp_path / "before.png"
 
 
@@ -75,7 +70,7 @@ def test_a_preset_is_the_edit(before: Path) -> None:
     assert difference.abs().max() <= 1.01 / 255
     assert (difference != 0).float().mean() < 0.01
 
-    write_photograph(Photograph(photograph(slice(150, 200), slice(200, 260))), other)
+    write_photograph(Photograph(rgb("chelsea", slice(150, 200), slice(200, 260))), other)
     by_preset = before.with_name("by-preset.png")
     assert main(["detail", str(other), str(by_preset), "--preset", str(preset)]) == 0
     by_options = edit(other, "by-options.png")
@@ -154,3 +149,127 @@ def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixtu
     assert main(["detail", str(before), str(small), "--preset", str(before.with_name("none.json"))]) == 2
     assert "none.json is neither a file nor one of the presets" in capsys.readouterr().err
     assert not preset.exists()
+
+
+def test_it_fits_folders_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, edit in (("before", lambda x: x), ("after", lambda x: x**0.6)):
+        (tmp_path / folder).mkdir()
+        for name, image in (("cat", CAT), ("cup", CUP)):
+            write_photograph(Photograph(edit(image)), tmp_path / folder / f"{name}.png")
+    look, seen, rest = (tmp_path / name for name in ("look.json", "seen.png", "rest.png"))
+    folders = [str(tmp_path / name) for name in ("before", "after")]
+    drawn = ["--preview", str(seen), "--map", str(rest)]
+    assert main(["fit", *folders, str(look), "--landmarks", "40", *drawn]) == 0
+    printed = capsys.readouterr().out
+    assert "in other photographs" in printed
+    assert float(printed.split("explained: ")[1].split(" %")[0]) > 98
+    assert read_photograph(seen).size == (80, 400)
+    assert read_photograph(rest).size == (80, 100)
+    before, out = tmp_path / "before" / "cup.png", tmp_path / "out.png"
+    for command in ("detail", "apply"):
+        assert main([command, str(before), str(out), "--preset", str(look)]) == 0
+        assert (read_photograph(out).pixels - in_bytes(CUP**0.6)).abs().mean() < 2 / 255
+    assert main(["detail", str(before), str(out), "--preset", str(look), "--alpha", "1,2"]) == 2
+    assert "must not be combined with other options of detail" in capsys.readouterr().err
+
+
+def test_it_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, mask, look = (str(tmp_path / name) for name in ("a.png", "b.png", "m.png", "look.json"))
+    local = CAT.clone()
+    local[..., 32:48, 48:64] = (CAT[..., 32:48, 48:64] + 0.3).clamp(0, 0.99)
+    region = torch.zeros_like(CAT[:, :1])
+    region[..., 32:48, 48:64] = 1
+    for path, image in ((before, CAT), (after, local), (mask, region)):
+        write_photograph(Photograph(image), Path(path))
+    assert main(["fit", before, after, look, "--landmarks", "40"]) == 0
+    told = capsys.readouterr().err
+    assert "explains less than 80 %" in told
+    assert "around row 32, column 48" in told
+    drawn = ["--preview", str(tmp_path / "seen.png")]
+    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", mask, *drawn]) == 0
+    assert float(capsys.readouterr().out.split("explained: ")[1].split(" %")[0]) > 95
+    assert (tmp_path / "look-1.json").exists()
+    seen = read_photograph(tmp_path / "seen.png").pixels.split(100, dim=3)  # before, after, the looks, what is left
+    assert torch.equal(seen[2][..., :32, :], seen[0][..., :32, :])
+    assert explained(seen[0], seen[1], seen[2]) > 0.95
+
+
+def test_looks_of_regions_are_put_where_their_masks_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, out, rows, look, one, other, odd = (
+        str(tmp_path / f"{name}.png") for name in ("a", "b", "out", "rows", "look", "left", "right", "odd")
+    )
+    left = (torch.arange(100) < 50).float().expand(1, 1, 80, 100)
+    edited = torch.where(left > 0, CAT**0.6, apply_look(CAT, matrix=SEPIA))
+    for path, image in ((before, CAT), (after, edited), (one, left), (other, 1 - left), (odd, left[..., :70])):
+        write_photograph(Photograph(image), Path(path))
+    look = look.replace(".png", ".json")
+    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", one, "--mask", other]) == 0
+    first, second = (look.replace(".json", f"-{i}.json") for i in (1, 2))
+    regions = ["--preset", first, "--mask", one, "--preset", second, "--mask", other]
+    assert main(["apply", before, out, *regions]) == 0
+    found, target = read_photograph(Path(out)).pixels, read_photograph(Path(after)).pixels
+    assert explained(CAT, target, found) > 0.98
+    assert main(["apply", before, rows, *regions, "--memory", "0.001"]) == 0
+    assert (read_photograph(Path(rows)).pixels - found).abs().max() <= 1.01 / 255
+    assert main(["apply", before, out, "--preset", first, "--mask", one]) == 0
+    found = read_photograph(Path(out)).pixels
+    assert torch.equal(found[..., 50:], read_photograph(Path(before)).pixels[..., 50:])
+    assert main(["apply", before, out, "--preset", first, "--preset", second, "--mask", one]) == 2
+    assert "--mask must come once for each --preset, got 1 for 2" in capsys.readouterr().err
+    for memory in ([], ["--memory", "0.001"]):
+        assert main(["apply", before, out, "--preset", first, "--mask", odd, *memory]) == 2
+        assert "must have the size of" in capsys.readouterr().err
+
+
+def test_folders_of_masks_belong_to_folders_of_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left = (torch.arange(100) < 50).float().expand(1, 1, 80, 100)
+    folders = {name: tmp_path / name for name in ("before", "after", "left", "right")}
+    for name, image in (("cat", CAT), ("cup", CUP)):
+        edited = torch.where(left > 0, image**0.6, apply_look(image, matrix=SEPIA))
+        for folder, picture in zip(folders.values(), (image, edited, left, 1 - left), strict=True):
+            folder.mkdir(exist_ok=True)
+            write_photograph(Photograph(picture), folder / f"{name}.png")
+    before, after, one, other = map(str, folders.values())
+    look, out = tmp_path / "look.json", tmp_path / "out.png"
+    assert main(["fit", before, after, str(look), "--landmarks", "40", "--mask", one, "--mask", other]) == 0
+    assert "in other photographs" in capsys.readouterr().out
+    for number, part, curve in ((1, slice(50), True), (2, slice(50, 100), False)):
+        preset = str(tmp_path / f"look-{number}.json")
+        assert main(["apply", f"{before}/cup.png", str(out), "--preset", preset]) == 0
+        wanted = in_bytes(CUP**0.6 if curve else apply_look(CUP, matrix=SEPIA))[..., part]
+        assert explained(CUP[..., part], wanted, read_photograph(out).pixels[..., part]) > 0.98
+    (folders["right"] / "cat.png").unlink()
+    for masks, message in {
+        (one, other): "right must hold a mask for every photograph, got none for cat.png; add one",
+        (f"{one}/cat.png",): "--mask must name folders of masks, as BEFORE and AFTER are folders, got",
+    }.items():
+        named = [word for mask in masks for word in ("--mask", mask)]
+        assert main(["fit", before, after, str(look), *named]) == 2
+        complaint = capsys.readouterr().err
+        assert message in complaint
+        assert complaint.count("\n") == 1
+    assert main(["fit", f"{before}/cat.png", f"{after}/cat.png", str(look), "--mask", one]) == 2
+    assert "--mask must name pictures, as BEFORE and AFTER are, got" in capsys.readouterr().err
+
+
+def test_a_frame_is_told_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, look = (str(tmp_path / name) for name in ("a.png", "b.png", "look.json"))
+    framed = torch.full_like(CAT, 0.9)
+    framed[..., 8:-8, 8:-8] = (CAT**0.6)[..., 8:-8, 8:-8]
+    write_photograph(Photograph(CAT), Path(before))
+    write_photograph(Photograph(framed), Path(after))
+    assert main(["fit", before, after, look, "--landmarks", "40"]) == 0
+    printed = capsys.readouterr()
+    assert "b.png has a frame of one colour, which is left out" in printed.err
+    assert float(printed.out.split("explained: ")[1].split(" %")[0]) > 98
+
+
+def test_it_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, look = (tmp_path / name for name in ("a.png", "b.png", "look.json"))
+    write_photograph(Photograph(CAT), before)
+    write_photograph(Photograph(CUP.flip(2, 3)), after)
+    assert main(["fit", str(before), str(after), str(look), "--landmarks", "40"]) == 2
+    assert "check that they show the same picture" in capsys.readouterr().err
+    assert main(["fit", str(tmp_path), str(after), str(look)]) == 2
+    assert "two photographs or two folders" in capsys.readouterr().err
+    assert not look.exists()

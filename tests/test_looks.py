@@ -1,9 +1,5 @@
-"""Looks: applying them in memory and in tiles, fitting them to pairs, and their files."""
+"""Looks as functions and layers: what their parts do, tiles, gradients and learning."""
 
-import gc
-import json
-import weakref
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,48 +10,20 @@ import skimage.exposure
 import torch
 from torch import Tensor
 
-from nlfilter_torch import FittedLook, Look, apply_look, enhance, fit_look
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.alignment import align
+from nlfilter_torch import Look, apply_look, enhance, fit_look
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.look_pixels import EditedPhotograph
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.look import bands_of, tone_curve
-from nlfilter_torch.filtering.look_fit import MOST, nonnegative, sample
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.tiles import Passes
+from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, in_bytes, one
 
-ALPHA = (2.2, 1.6, 1.3, 1.02)
-SEPIA = (0.393, 0.769, 0.189, 0.349, 0.686, 0.168, 0.272, 0.534, 0.131)
 BENT = tuple((i / 16) ** 0.7 for i in range(17))
-FEW = Step("look", landmarks=40)
 VIVID = (1.3, 1.2, 1.1, 1.05, 1.0)
 BANDS = (1.5, 1.0, 1.3, 1.0, 1.0, 0.8, 1.1)
-LOCAL = (0.2, 0.3, -0.1, 0.2)
-
-
-def rgb(name: str, rows: slice, columns: slice) -> Tensor:
-    return torch.from_numpy(getattr(skimage.data, name)()[rows, columns].copy()).permute(2, 0, 1)[None].float() / 255
-
-
-CAT = rgb("chelsea", slice(60, 140), slice(100, 200))
-CUP = rgb("coffee", slice(100, 180), slice(150, 250))
-SUIT = rgb("astronaut", slice(60, 140), slice(150, 250))
-
-
-def in_bytes(image: Tensor) -> Tensor:
-    return (image.clamp(0, 1) * 255).round() / 255
-
-
-def one(found: FittedLook | tuple[FittedLook, ...]) -> FittedLook:
-    assert isinstance(found, FittedLook)
-    return found
-
-
-def explained(before: Tensor, after: Tensor, found: Tensor) -> float:
-    return 1 - float((after - found.clamp(0, 1)).square().sum() / (after - before).square().sum())
+TEXTURE = (1.4, 0.8, 1.2, 1.0, 1.1, 0.9)
+LOCAL = (0.2, 0.3, -0.1, 0.2, 0.1, -0.1, 0.2, 0.1)
 
 
 def test_a_look_that_changes_nothing_is_the_image() -> None:
@@ -92,54 +60,64 @@ def test_the_parts_are_what_they_say() -> None:
     )
 
 
-def test_local_contrast_is_the_clipped_histogram_of_the_blocks_around() -> None:
-    image = CAT[:, :, :77, :90].double()  # blocks of 5 pixels, 16 by 18, the last of 2 rows
-    found = apply_look(image, local=(0.0, 1.0, 0.0, 0.0)) - image
-    light = (image * torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(1, 3, 1, 1)).sum(1)[0].numpy()
-    hats = np.maximum(1 - np.abs(light * 16 - np.arange(17)[:, None, None]), 0)
+def test_texture_is_the_fine_band_where_luminance_varies_little() -> None:
+    image = CAT.double()
+    light = (image * torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(3, 1, 1)).sum(1)[0].numpy()
+    weights = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]) / 256
 
-    def curve(row: int, column: int) -> np.ndarray:  # of the block with that number
-        total, count = np.zeros(17), 0.0
-        for i, weight in ((-1, 1), (0, 2), (1, 1)):
-            for j, other in ((-1, 1), (0, 2), (1, 1)):
-                if row + i >= 0 and column + j >= 0:
-                    block = hats[:, 5 * (row + i) : 5 * (row + i + 1), 5 * (column + j) : 5 * (column + j + 1)]
-                    total += weight * other * block.sum((1, 2))
-                    count += weight * other * block[0].size
-        clipped = np.minimum(total / count, 2 / 17)
-        clipped += (1 - clipped.sum()) / 17
-        return clipped.cumsum() - clipped / 2 - np.linspace(0, 1, 17)
+    def blurred(row: int, column: int, values: np.ndarray) -> float:
+        return float((values[row - 2 : row + 3, column - 2 : column + 3] * weights).sum())
+
+    found = apply_look(image, texture=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0)) - image
+    for row, column in ((2, 2), (30, 41), (60, 80)):
+        mean = blurred(row, column, light)
+        variance = blurred(row, column, light**2) - mean**2
+        change = (light[row, column] - mean) * 0.15**2 / (0.15**2 + variance)
+        assert found[0, :, row, column].tolist() == pytest.approx([change] * 3, abs=1e-9)
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_local_contrast_is_the_clipped_histogram_of_the_tiles_around(scaled: bool) -> None:
+    image = CAT[:, :, :77, :90].double()  # tiles of 9.6 by 11.3 pixels
+    strengths = [0.0] * 8
+    strengths[4 * scaled + 1] = 1.0  # a limit of 2
+    found = apply_look(image, local=strengths) - image
+    weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(3, 1, 1)
+    light = (image[0].amax(0) if scaled else (image[0] * weights).sum(0)).numpy()
+    hats = np.maximum(1 - np.abs(light * 32 - np.arange(33)[:, None, None]), 0)
+
+    def inside(tile: int, length: int) -> np.ndarray:  # how much of each pixel is in it
+        edges = np.array([tile, tile + 1]) * length / 8
+        starts = np.arange(length)
+        return np.clip(np.minimum(starts + 1, edges[1]) - np.maximum(starts, edges[0]), 0, None)
+
+    def curve(row: int, column: int) -> np.ndarray:  # of the tile with that number
+        shares = np.outer(inside(row, 77), inside(column, 90))
+        clipped = np.minimum((hats * shares).sum((1, 2)) / shares.sum(), 2 / 33)
+        clipped += (1 - clipped.sum()) / 33
+        return clipped.cumsum() - clipped / 2 - np.linspace(0, 1, 33)
 
     for row, column in ((0, 0), (2, 2), (40, 33), (76, 89), (74, 12)):
-        down, right = min(max((row + 0.5) / 5 - 0.5, 0), 15), min(max((column + 0.5) / 5 - 0.5, 0), 17)
-        near = [(int(down) + i, int(right) + j) for i in (0, 1) for j in (0, 1)]
-        shares = [(1 - abs(down - i)) * (1 - abs(right - j)) for i, j in near]
-        blended = sum(share * curve(i, j) for share, (i, j) in zip(shares, near, strict=True) if share > 0)
-        change = np.interp(light[row, column], np.linspace(0, 1, 17), blended)
-        assert found[0, :, row, column].tolist() == pytest.approx([change] * 3, abs=1e-6)
-    even = torch.full((1, 3, 5, 40), 0.5)  # a short side of fewer pixels than blocks
+        place = [
+            min(max((i + 0.5) * 8 / length - 0.5, 0), 7) for i, length in ((row, 77), (column, 90))
+        ]  # in numbers of tiles
+        blended = np.zeros(33)
+        for i in {int(place[0]), min(int(place[0]) + 1, 7)}:
+            for j in {int(place[1]), min(int(place[1]) + 1, 7)}:
+                blended += (1 - abs(place[0] - i)) * (1 - abs(place[1] - j)) * curve(i, j)
+        change = np.interp(light[row, column], np.linspace(0, 1, 33), blended)
+        colours = image[0, :, row, column] / light[row, column] if scaled else torch.ones(3)
+        assert found[0, :, row, column].tolist() == pytest.approx((change * colours).tolist(), abs=1e-6)
+    even = torch.full((1, 3, 5, 40), 0.5)  # tiles of less than a pixel
     assert torch.isfinite(apply_look(even, local=LOCAL)).all()
-
-
-def test_adaptive_equalisation_is_explained_on_another_photograph() -> None:
-    def equalized(image: Tensor) -> Tensor:
-        found = skimage.exposure.equalize_adapthist(image[0].permute(1, 2, 0).numpy(), clip_limit=0.1)
-        return in_bytes(torch.from_numpy(found).permute(2, 0, 1)[None].float())
-
-    pairs = [(image, equalized(image)) for image in (CAT, CUP, SUIT)]
-    shares = []
-    for parts in (("curves", "bands", "local"), ("curves", "bands")):
-        found = one(fit_look(pairs[:2], parts=parts, step=FEW))
-        shares.append(explained(*pairs[2], found.apply(SUIT)))
-    assert shares[0] > 0.7 > 0.4 > shares[1]
 
 
 @pytest.mark.parametrize("viewing", [0.0, 0.004])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_tiles_are_the_image_in_memory(viewing: float, channels: int, tmp_path: Path) -> None:
     step = Step(
-        "look", alpha=ALPHA, bands=BANDS, red=BENT, green=BENT, blue=BENT, matrix=SEPIA, saturation=VIVID, local=LOCAL,
-        amount=0.8, landmarks=30, viewing_size=viewing,
+        "look", alpha=ALPHA, bands=BANDS, texture=TEXTURE, red=BENT, green=BENT, blue=BENT, matrix=SEPIA,
+        saturation=VIVID, local=LOCAL, amount=0.8, landmarks=30, viewing_size=viewing,
     )  # fmt: skip
     image = CAT[:, :channels]
     whole = apply_step(step, image)
@@ -160,13 +138,24 @@ def test_gradients_reach_image_and_look() -> None:
 
     local = torch.tensor(LOCAL, dtype=torch.float64, requires_grad=True)
 
-    def look(image: Tensor, bands: Tensor, curve: Tensor, matrix: Tensor, vivid: Tensor, local: Tensor) -> Tensor:
-        parts = {"red": curve, "green": curve, "blue": BENT, "matrix": matrix, "saturation": vivid, "local": local}
+    texture = torch.tensor(TEXTURE, dtype=torch.float64, requires_grad=True)
+
+    def look(image: Tensor, bands: Tensor, curve: Tensor, matrix: Tensor, vivid: Tensor, *rest: Tensor) -> Tensor:
+        local, texture = rest
+        parts = {
+            "texture": texture,
+            "red": curve,
+            "green": curve,
+            "blue": BENT,
+            "matrix": matrix,
+            "saturation": vivid,
+            "local": local,
+        }
         return apply_look(image, bands=bands, **parts).sum(1)
 
     with torch.no_grad():
         image.add_(1e-3)  # away from the knots of the curve, where it has no derivative
-    assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid, local), fast_mode=True)
+    assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid, local, texture), fast_mode=True)
     apply_look(image, alpha=alpha, num_landmarks=20).square().mean().backward()
     assert alpha.grad is not None
     assert bool((alpha.grad != 0).all())
@@ -203,188 +192,13 @@ def test_the_layer_takes_what_was_found() -> None:
     assert torch.allclose(Look(found.tensors, learn=())(CAT), found.apply(CAT), atol=1e-5)
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_sliders_are_found_through_eight_bits(count: int) -> None:
-    images = (rgb("chelsea", slice(0, 300, 2), slice(0, 450, 2)), rgb("coffee", slice(0, 300, 2), slice(0, 450, 2)))
-    step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=150)
-    pairs = [(image, in_bytes(apply_step(step, image))) for image in images[:count]]
-    found = one(fit_look(iter(pairs), step=Step("look", landmarks=150)))
-    assert found.parts == ("alpha",)
-    assert found.step.edit == "detail"
-    assert found.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
-    assert found.fitted > 0.99
-    assert torch.allclose(found.apply(images[0]).clamp(0, 1), pairs[0][1], atol=1.01 / 255)
-
-
-@pytest.mark.parametrize(
-    "edit",
-    [
-        lambda x: x**0.6,
-        lambda x: 1 / (1 + torch.exp(8 * (0.5 - x))),
-        lambda x: torch.einsum("cd,bdhw->bchw", torch.tensor(SEPIA).view(3, 3), x),
-        lambda x: x * torch.tensor([1.15, 1.0, 0.85]).view(1, 3, 1, 1),
-        lambda x: x.mean((2, 3), keepdim=True).mean() + 1.3 * (x - x.mean((2, 3), keepdim=True).mean()),
-    ],
-    ids=["gamma", "sigmoid", "sepia", "warmth", "contrast"],
-)
-def test_edits_of_others_are_explained_on_other_photographs(edit: object) -> None:
-    assert callable(edit)
-    pairs = [(image, in_bytes(edit(image))) for image in (CAT, CUP, SUIT)]
-    found = one(fit_look(pairs[:2], step=FEW))
-    assert all(explained(*pair, found.apply(pair[0])) > 0.95 for pair in pairs)
-
-
-def test_saturation_in_hsv_is_explained_on_other_photographs() -> None:
-    def saturated(image: Tensor) -> Tensor:
-        hsv = skimage.color.rgb2hsv(image[0].permute(1, 2, 0).numpy())
-        hsv[..., 1] = (1.4 * hsv[..., 1]).clip(0, 1)
-        return in_bytes(torch.from_numpy(skimage.color.hsv2rgb(hsv)).permute(2, 0, 1)[None].float())
-
-    every = slice(0, 512, 5)  # small pictures with colours of all kinds
-    pairs = [
-        (image, saturated(image)) for image in (rgb(name, every, every) for name in ("astronaut", "coffee", "chelsea"))
-    ]
-    found = one(fit_look(pairs[:2], step=FEW))
-    assert found.parts == ("saturation",)
-    assert all(explained(*pair, found.apply(pair[0])) > 0.99 for pair in pairs)
-
-
-def test_sums_of_samples_are_those_of_all_pixels() -> None:
-    generator = torch.Generator().manual_seed(0)
-    whole = torch.rand(300, 400, generator=generator) + 0.1
-    whole[:, :50] = 0
-    places = sample(whole)
-    assert len(places) == MOST
-    assert len(set(places.tolist())) > 0.9 * MOST
-    assert bool((whole.flatten()[places] > 0).all())
-    assert torch.equal(places, places.sort().values)
-    assert float(whole.flatten()[places].mean()) == pytest.approx(float(whole[:, 50:].mean()), abs=2e-3)
-    assert torch.equal(sample(whole[:50]), whole[:50].flatten().nonzero().squeeze(1))
-
-
-def test_a_sampled_pair_and_a_whole_one_have_the_same_look() -> None:
-    large = torch.nn.functional.interpolate(CAT, (320, 400), mode="bicubic").clamp(0, 1)  # 128,000 pixels
-    step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=40, viewing_size=0.0)
-    sliders = one(fit_look([(large, in_bytes(apply_step(step, large)))], step=FEW.changed(viewing_size=0.0)))
-    assert sliders.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
-    curve = one(fit_look([(large, in_bytes(large**0.7))], step=FEW))
-    assert explained(large, large**0.7, curve.apply(large)) > 0.99
-
-
-def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.filtering.look_fit.MOST", 2000)
-    monkeypatch.setattr("nlfilter_torch.edits.look_pixels.MOST", 2000)
-    photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
-    found = photograph.regions_of_sample()
-    assert found is not None
-    (some,) = found
-    assert some.layers.shape == (4, 2000)
-    assert float(some.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
-    exact = photograph.layers[:, some.places]
-    assert torch.allclose(some.layers.sum(0), exact.sum(0), atol=1e-5)
-    assert bool(((some.layers - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
-    masks = torch.ones(1, *CAT.shape[-2:])
-    assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
-
-
-def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
-    dark = in_bytes(0.1 + 0.25 * CAT)
-    found = one(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
-    curves = found.tensors["curves"]
-    assert found.fitted > 0.9
-    assert float((curves[:, 12:] - torch.linspace(0, 1, 17)[12:]).abs().max()) < 0.08
-
-
-def test_curves_never_fall() -> None:
-    after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # a curve that rises and falls
-    found = one(fit_look([(CAT, after)], parts=("curves",), step=FEW))
-    curves = found.tensors["curves"]
-    assert float(curves.diff(dim=1).min()) >= -1e-5
-    assert float(curves.diff(dim=1).max()) > 0.01
-
-
-def test_nonnegative_least_squares_meets_its_conditions() -> None:
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(20):
-        root = torch.rand(12, 8, generator=generator, dtype=torch.float64) - 0.3
-        matrix, vector = root.mT @ root, torch.rand(8, generator=generator, dtype=torch.float64) - 0.5
-        found = nonnegative(matrix, vector)
-        slope = vector - matrix @ found
-        assert float(found.min()) >= 0
-        assert float(slope.max()) < 1e-8
-        assert float((slope * found).abs().max()) < 1e-8
-
-
-def test_pairs_are_read_once_and_not_kept() -> None:
-    alive: list[bool] = []
-    yielded: list[weakref.ref[Tensor]] = []
-
-    def pairs() -> Iterator[tuple[Tensor, Tensor]]:
-        for number in range(6):
-            image = CAT.roll(number, 2)
-            yielded.append(weakref.ref(image))
-            yield image, in_bytes(image**0.7)
-            del image
-            gc.collect()
-            alive.extend(reference() is not None for reference in yielded[:-1])
-
-    found = one(fit_look(pairs(), step=FEW))
-    assert len(yielded) == 6
-    assert len(alive) == 15
-    assert not any(alive)
-    assert found.left_out > 0.95
-
-
-def test_regions_have_looks_of_their_own() -> None:
-    masks = torch.zeros(1, 2, *CAT.shape[-2:])
-    masks[:, 0, :, :50], masks[:, 1, :, 50:] = 1, 1
-    bright, sepia = in_bytes(CAT**0.6), in_bytes(apply_look(CAT, matrix=SEPIA))
-    found = fit_look([(CAT, torch.where(masks[:, :1] > 0, bright, sepia), masks)], step=FEW)
-    assert isinstance(found, tuple)
-    left, right = (look.apply(CAT) for look in found)
-    assert explained(CAT[..., :50], bright[..., :50], left[..., :50]) > 0.98
-    assert explained(CAT[..., 50:], sepia[..., 50:], right[..., 50:]) > 0.98
-
-
-def test_a_watermark_lowers_what_is_explained_and_little_else() -> None:
-    after = in_bytes(CAT**0.6)
-    after[..., 60:75, 60:95] = 0.9
-    found = one(fit_look([(CAT, after)], step=FEW))
-    assert 0 < found.fitted < 0.95
-    assert explained(CAT[..., :55, :], after[..., :55, :], found.apply(CAT)[..., :55, :]) > 0.8
-
-
-def test_more_parameters_than_pixels_are_told_by_what_is_left_out() -> None:
-    noise = torch.rand(1, 3, 5, 5, generator=torch.Generator().manual_seed(0))
-    found = one(fit_look([(CAT[..., :5, :5], noise)], step=Step("look", landmarks=20)))
-    assert found.left_out < 0.5
-    assert all(abs(value) < 1e3 for value in found.tensors["alpha"].tolist())
-
-
-@pytest.mark.parametrize(
-    ("pairs", "message"),
-    [
-        ([], "pairs must hold a pair"),
-        ([(CAT, CAT)], "each is the same before and after"),
-        ([(CAT, torch.zeros_like(CAT))], "not clipped to black or white"),
-        ([(CAT, CUP.flip(2, 3))], "must be an edit of before of pair 1"),
-        ([(CAT, CAT[..., :50])], "after of pair 1"),
-        ([CAT], "pairs must hold tuples"),
-        ([(CAT, CAT**0.5, torch.zeros_like(CAT))], "masks must hold a pixel"),
-    ],
-)
-def test_bad_pairs_are_refused_in_a_sentence(pairs: list[object], message: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=message) as error:
-        fit_look(pairs, step=FEW)  # type: ignore[arg-type]
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"matrix": (1.0, 0.0)}, "matrix must be 9 numbers"),
         ({"red": (0.0, 1.0)}, "red, green and blue must be equally many"),
         ({"bands": (1.0, 1.0)}, "bands must have the shape"),
+        ({"texture": (1.0,)}, "texture must have the shape"),
         ({"alpha": (1.0,)}, "alpha must have the shape"),
         ({"local": (1.0,)}, "local must have the shape"),
     ],
@@ -392,115 +206,3 @@ def test_bad_pairs_are_refused_in_a_sentence(pairs: list[object], message: str) 
 def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         apply_look(CAT, **options)  # type: ignore[arg-type]
-
-
-def test_files_keep_looks(tmp_path: Path) -> None:
-    found = one(fit_look([(CAT, in_bytes(CAT**0.6))], step=FEW))
-    text = found.to_json()
-    assert json.loads(text)["steps"][0]["edit"] == "look"
-    assert Recipe.from_json(text, "it").steps == (found.step,)
-    with pytest.raises(ValueError, match="matrix of look, step 1 in it must be a list of 9 numbers"):
-        Recipe.from_json('{"version": 1, "steps": [{"edit": "look", "matrix": [1, 2]}]}', "it")
-
-
-@pytest.mark.parametrize(
-    ("cut", "row", "column"), [((slice(7, 67), slice(12, 92)), 7, 12), ((slice(0, 60), slice(20, 100)), 0, 20)]
-)
-def test_crops_are_found(cut: tuple[slice, slice], row: int, column: int) -> None:
-    after = (CAT**0.6)[(..., *cut)]
-    part, edited, done = align(CAT, after, "before", "after")
-    assert torch.equal(part, CAT[(..., *cut)])
-    assert torch.equal(edited, after)
-    assert f"row {row}, column {column}" in done
-
-
-def test_shifts_and_sizes_are_found() -> None:
-    before, after = CAT[..., 5:, :-3], (CAT**0.6)[..., :-5, 3:]
-    first, second, done = align(before, after, "before", "after")
-    assert "5 pixels down and -3" in done
-    assert torch.allclose(first**0.6, second, atol=1e-6)
-    small = torch.nn.functional.interpolate(CAT**0.6, (40, 50), mode="area")
-    _, resized, done = align(CAT, small, "before", "after")
-    assert resized.shape == CAT.shape
-    assert "resized from 50x40 to 100x80" in done
-    with pytest.raises(ValueError, match="after must have the size of before"):
-        align(CAT, CUP[..., :30, :70], "before", "after")
-
-
-def test_the_command_fits_folders_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for folder, edit in (("before", lambda x: x), ("after", lambda x: x**0.6)):
-        (tmp_path / folder).mkdir()
-        for name, image in (("cat", CAT), ("cup", CUP)):
-            write_photograph(Photograph(edit(image)), tmp_path / folder / f"{name}.png")
-    look, seen, rest = (tmp_path / name for name in ("look.json", "seen.png", "rest.png"))
-    folders = [str(tmp_path / name) for name in ("before", "after")]
-    drawn = ["--preview", str(seen), "--map", str(rest)]
-    assert main(["fit", *folders, str(look), "--landmarks", "40", *drawn]) == 0
-    printed = capsys.readouterr().out
-    assert "in other photographs" in printed
-    assert float(printed.split("explained: ")[1].split(" %")[0]) > 98
-    assert read_photograph(seen).size == (80, 400)
-    assert read_photograph(rest).size == (80, 100)
-    before, out = tmp_path / "before" / "cup.png", tmp_path / "out.png"
-    for command in ("detail", "apply"):
-        assert main([command, str(before), str(out), "--preset", str(look)]) == 0
-        assert (read_photograph(out).pixels - in_bytes(CUP**0.6)).abs().mean() < 2 / 255
-    assert main(["detail", str(before), str(out), "--preset", str(look), "--alpha", "1,2"]) == 2
-    assert "must not be combined with other options of detail" in capsys.readouterr().err
-
-
-def test_the_command_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, after, mask, look = (str(tmp_path / name) for name in ("a.png", "b.png", "m.png", "look.json"))
-    local = CAT.clone()
-    local[..., 32:48, 48:64] = (CAT[..., 32:48, 48:64] + 0.3).clamp(0, 0.99)
-    region = torch.zeros_like(CAT[:, :1])
-    region[..., 32:48, 48:64] = 1
-    for path, image in ((before, CAT), (after, local), (mask, region)):
-        write_photograph(Photograph(image), Path(path))
-    assert main(["fit", before, after, look, "--landmarks", "40"]) == 0
-    told = capsys.readouterr().err
-    assert "explains less than 80 %" in told
-    assert "around row 32, column 48" in told
-    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", mask]) == 0
-    assert float(capsys.readouterr().out.split("explained: ")[1].split(" %")[0]) > 95
-    assert (tmp_path / "look-1.json").exists()
-    assert main(["fit", before, after, look, "--mask", mask, "--preview", str(tmp_path / "seen.png")]) == 2
-    assert "--preview shows a single look, but --mask asks for 1" in capsys.readouterr().err
-
-
-def test_looks_of_regions_are_put_where_their_masks_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, after, out, rows, look, one, other, odd = (
-        str(tmp_path / f"{name}.png") for name in ("a", "b", "out", "rows", "look", "left", "right", "odd")
-    )
-    left = (torch.arange(100) < 50).float().expand(1, 1, 80, 100)
-    edited = torch.where(left > 0, CAT**0.6, apply_look(CAT, matrix=SEPIA))
-    for path, image in ((before, CAT), (after, edited), (one, left), (other, 1 - left), (odd, left[..., :70])):
-        write_photograph(Photograph(image), Path(path))
-    look = look.replace(".png", ".json")
-    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", one, "--mask", other]) == 0
-    first, second = (look.replace(".json", f"-{i}.json") for i in (1, 2))
-    regions = ["--preset", first, "--mask", one, "--preset", second, "--mask", other]
-    assert main(["apply", before, out, *regions]) == 0
-    found, target = read_photograph(Path(out)).pixels, read_photograph(Path(after)).pixels
-    assert explained(CAT, target, found) > 0.98
-    assert main(["apply", before, rows, *regions, "--memory", "0.001"]) == 0
-    assert (read_photograph(Path(rows)).pixels - found).abs().max() <= 1.01 / 255
-    assert main(["apply", before, out, "--preset", first, "--mask", one]) == 0
-    found = read_photograph(Path(out)).pixels
-    assert torch.equal(found[..., 50:], read_photograph(Path(before)).pixels[..., 50:])
-    assert main(["apply", before, out, "--preset", first, "--preset", second, "--mask", one]) == 2
-    assert "--mask must come once for each --preset, got 1 for 2" in capsys.readouterr().err
-    for memory in ([], ["--memory", "0.001"]):
-        assert main(["apply", before, out, "--preset", first, "--mask", odd, *memory]) == 2
-        assert "must have the size of" in capsys.readouterr().err
-
-
-def test_the_command_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, after, look = (tmp_path / name for name in ("a.png", "b.png", "look.json"))
-    write_photograph(Photograph(CAT), before)
-    write_photograph(Photograph(CUP.flip(2, 3)), after)
-    assert main(["fit", str(before), str(after), str(look), "--landmarks", "40"]) == 2
-    assert "check that they show the same picture" in capsys.readouterr().err
-    assert main(["fit", str(tmp_path), str(after), str(look)]) == 2
-    assert "two photographs or two folders" in capsys.readouterr().err
-    assert not look.exists()

@@ -1,11 +1,12 @@
 """``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import step_of, with_options
 from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS
@@ -23,15 +24,6 @@ Result = Annotated[Path, typer.Argument(metavar="PRESET", help="The JSON file in
 Order = Annotated[
     int,
     typer.Option("--layers", min=2, max=10, metavar="N", help="Number of sliders, from the finest to the coarsest."),
-]
-Masks = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--mask",
-        metavar="FILE",
-        help="A grey picture, white in a region that has a look of its own; as often as there are regions. The files "
-        "are numbered then, and `nlfilter-torch apply` takes them, each with its --mask. For one pair.",
-    ),
 ]
 Preview = Annotated[
     Path | None,
@@ -52,6 +44,7 @@ PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff")
 CALLED = {
     "alpha": "sliders",
     "bands": "gains of blurs",
+    "texture": "texture",
     "tone": "a tone curve",
     "curves": "a tone curve for each channel",
     "matrix": "colours",
@@ -66,7 +59,7 @@ def fit(
     after: After,
     preset: Result = Path("preset.json"),
     layers: Order = 4,
-    mask: Masks = None,
+    mask: options.MasksOfPairs = None,
     preview: Preview = None,
     left: Map = None,
     **given: Any,
@@ -79,6 +72,10 @@ def fit(
     `nlfilter-torch fit before.jpg after.jpg look.json --preview seen.png`
 
     `nlfilter-torch apply other.jpg out.jpg --preset look.json`
+
+    Each --mask is a region that has a look of its own, in numbered files:
+
+    `nlfilter-torch fit before.jpg after.jpg look.json --mask sky.png --mask ground.png`
     """
     step = step_of(EDITS["look"], given)
 
@@ -88,41 +85,38 @@ def fit(
     from nlfilter_torch.io.photographs import check_file, open_beside
 
     paths = _paths(before, after)
-    if mask and len(paths) > 1:
-        raise ValueError(f"--mask is for one pair of photographs, got {len(paths)}; fit them one by one")
-    if mask and (preview is not None or left is not None):
-        unused = "--map" if preview is None else "--preview"
-        raise ValueError(f"{unused} shows a single look, but --mask asks for {len(mask)}; leave one of them out")
+    regions = _regions(mask or [], paths, Path(before).is_dir())
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
     for path in (*results, *(path for path in (preview, left) if path is not None)):
         check_file(path)
     memory = working_bytes(step["landmarks"], step["patch_size"])
-    judged = not mask and (len(paths) == 1 or preview is not None or left is not None)
-    first: list[tuple[Tensor, Tensor]] = []  # images that are judged
+    alone = len(paths) == 1
+    judged = (alone and not mask) or preview is not None or left is not None
+    first: list[tuple[Tensor, ...]] = []  # images that are judged, and masks
     with steps(len(paths) + 1) as begin:
 
         def pairs() -> "Iterator[tuple[Tensor, ...]]":
-            for pair in paths:
+            for pair, masks in zip(paths, regions, strict=True):
                 begin(f"Comparing {pair[1].name}")
-                images = _read(*pair, memory)
+                images = (*_read(*pair, memory), *([read_masks(masks, pair[0])] if masks else []))
                 if judged and not first:
                     first.append(images)
-                yield (*images, *([] if not mask else [read_masks(mask, pair[0])]))
+                yield images
 
         found = fit_look(pairs(), order=layers - 1, step=step)
         begin("Judging")
         looks = found if isinstance(found, tuple) else (found,)
-        seen = [(*images, looks[0].apply(images[0]).clamp(0, 1)) for images in first]  # of the first pair, if judged
-        for images in seen:
-            _draw(*images, preview, left)
+        seen = [_judged(looks, *images) for images in first]  # of the first pair, if judged
+        for before_and_after in seen:
+            _draw(*before_and_after, preview, left)
         for look, path in zip(looks, results, strict=True):
             with open_beside(path) as stream:
                 stream.write(look.to_json().encode())
+    whole = seen[0] if alone and not mask else None
     for look, path in zip(looks, results, strict=True):
-        alone = len(paths) == 1
-        _report(look, _explained(*seen[0]) if alone and seen else look.fitted, path, alone=alone)
-    if len(paths) == 1 and seen:
-        _tell_where(*seen[0])
+        _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
+    if whole is not None:
+        _tell_where(*whole)
 
 
 def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
@@ -134,15 +128,36 @@ def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
         raise ValueError(
             f"BEFORE and AFTER must be two photographs or two folders, got {before} and {after}; pass both"
         )
-    edited = {path.stem: path for path in sorted(second.iterdir()) if path.suffix.lower() in PHOTOGRAPHS}
-    found = [(path, edited[path.stem]) for path in sorted(first.iterdir()) if _is_of(path, edited)]
+    edited = {path.stem: path for path in sorted(second.iterdir()) if _is_picture(path)}
+    found = [(path, edited[path.stem]) for path in sorted(first.iterdir()) if _is_picture(path) and path.stem in edited]
     if not found:
         raise ValueError(f"{after} must hold photographs of the names of those in {before}, got none; rename them")
     return found
 
 
-def _is_of(path: Path, edited: dict[str, Path]) -> bool:
-    return path.suffix.lower() in PHOTOGRAPHS and path.stem in edited
+def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -> list[list[Path]]:
+    """The files of the masks of every pair: these, or those in these folders under the names of the photographs."""
+    found: list[list[Path]] = [[] for _ in paths]
+    for mask in masks:
+        if mask.is_dir() != folders:
+            wanted = (
+                "folders of masks, as BEFORE and AFTER are folders" if folders else "pictures, as BEFORE and AFTER are"
+            )
+            remedy = "put the masks in a folder under the names of the photographs" if folders else "name a file in it"
+            raise ValueError(f"--mask must name {wanted}, got {mask}; {remedy}")
+        named = {path.stem: path for path in sorted(mask.iterdir()) if _is_picture(path)} if folders else {}
+        for files, (photograph, _) in zip(found, paths, strict=True):
+            if folders and photograph.stem not in named:
+                raise ValueError(
+                    f"{mask} must hold a mask for every photograph, got none for {photograph.name}; add one, black all "
+                    "over if the region is not in the photograph"
+                )
+            files.append(named[photograph.stem] if folders else mask)
+    return found
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in PHOTOGRAPHS
 
 
 def _read(before: Path, after: Path, memory: int) -> "tuple[Tensor, Tensor]":
@@ -163,8 +178,22 @@ def _read(before: Path, after: Path, memory: int) -> "tuple[Tensor, Tensor]":
     return image, edited
 
 
+def _judged(
+    looks: "Sequence[FittedLook]", image: "Tensor", edited: "Tensor", masks: "Tensor | None" = None
+) -> "tuple[Tensor, Tensor, Tensor]":
+    """A pair, and what the looks make of the photograph, each in its region."""
+    from nlfilter_torch.edits.detail import blend_edited
+
+    found = [look.apply(image).clamp(0, 1) for look in looks]
+    return image, edited, found[0] if masks is None else blend_edited(image, found, masks)
+
+
 def _explained(before: "Tensor", after: "Tensor", found: "Tensor") -> float:
-    """Share of the change's energy, 1 at best."""
+    """Share of the change's energy, 1 at best, without a frame around the picture."""
+    from nlfilter_torch.edits.alignment import inside_frame
+
+    shown = inside_frame(before[0], after[0])
+    before, after, found = (image[..., shown] for image in (before, after, found))
     rest, change = ((after.double() - image.double()).square().sum() for image in (found, before))
     return 1.0 - float(rest / change)
 
@@ -190,7 +219,10 @@ def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor") -> None:
     """Say where what is left is, if it is in a few places."""
     from torch.nn.functional import avg_pool2d
 
-    rest = avg_pool2d((after - found).square().mean(1, keepdim=True), SQUARE, ceil_mode=True)[0, 0]
+    from nlfilter_torch.edits.alignment import inside_frame
+
+    rest = (after - found).square().mean(1, keepdim=True) * inside_frame(before[0], after[0])
+    rest = avg_pool2d(rest, SQUARE, ceil_mode=True)[0, 0]
     if _explained(before, after, found) > ENOUGH or rest.numel() < 1 / FEW:
         return
     some = max(1, int(FEW * rest.numel()))

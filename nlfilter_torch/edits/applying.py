@@ -122,7 +122,7 @@ def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None =
 
 
 def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step], Tensor]:
-    """Return a function that applies steps with equal :func:`shared` to an image (1, C, H, W) in [0, 1].
+    """Return a function that applies steps with equal :func:`filter_key` to an image (1, C, H, W) in [0, 1].
 
     The filter is computed once, for the first of them. ``stride`` is the sampling step of the image relative to the
     photograph.
@@ -150,6 +150,6 @@ def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
     return stride * viewed_size(photograph, step["viewing_size"])[0] / photograph[0]
 
 
-def shared(step: Step) -> tuple[object, ...]:
-    """Return the values that steps of one kind must have in common to share the filter of :func:`prepare`."""
+def filter_key(step: Step) -> tuple[object, ...]:
+    """Values that the filter of a step depends on; steps of one kind with equal values share it in :func:`prepare`."""
     return tuple(step[p.name] for p in step.declared if p.keyword in FILTER)

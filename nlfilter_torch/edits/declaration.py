@@ -22,6 +22,8 @@ Kind = Literal["number", "count", "odd", "choice", "sliders"]
 Unit = Literal["", "levels", "lab", "px", "%", "gain"]
 Domain = Literal["positive", "not negative", "share", "below 1", "finite", "count", "choice"]
 
+#: Section in the help of a command for settings of the filter, which few users need.
+FILTER_PANEL = "Filter"
 #: For each unit: its name in errors, and the placeholder of a value in the help of a command.
 UNITS: dict[Unit, tuple[str, str | None]] = {
     "": ("", None),
@@ -85,6 +87,7 @@ class Parameter:
         slider: the editor's slider.
         is_option: whether the command has an option for it.
         length: length of a list; 0 is any.
+        panel: title of its section in the help of the command; without one it is among the edit's main options.
     """
 
     name: str
@@ -108,6 +111,7 @@ class Parameter:
     slider: Slider | None = None
     is_option: bool = True
     length: int = 0
+    panel: str | None = None
 
     @property
     def keyword(self) -> str:

@@ -180,7 +180,7 @@ def fit_detail(
             return torch.cat([changed(pixels, half, weight) for half, weight in halves], dim=1)
 
         def limited(image: Tensor, found: Tensor) -> Tensor:
-            return held_back(found, activity(image), threshold)
+            return limit_by_activity(found, activity(image), threshold)
 
         if regions is None:
             if not isinstance(threshold, Tensor) and threshold == 0:
@@ -254,7 +254,7 @@ def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tens
     return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)
 
 
-def held_back(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
+def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
     """Sum added detail and the rest of the change, (B, 2 C, H, W), with less added detail where the image is flat.
 
     Added detail is multiplied by ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).

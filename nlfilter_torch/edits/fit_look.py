@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_order, check_photograph, check_same_size
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.alignment import inside_frame
 from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.look_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.look_pixels import EditedPhotograph, SomePixels
@@ -24,6 +25,7 @@ from nlfilter_torch.filtering.look_fit import (
     Parts,
     Sums,
     choose,
+    choose_from_one,
     fit_parts,
     simplest,
 )
@@ -46,7 +48,7 @@ class FittedLook:
 
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
-        parts: what it consists of: ``alpha``, ``bands``, ``tone`` (one curve) or ``curves``, ``matrix``,
+        parts: what it consists of: ``alpha``, ``bands``, ``texture``, ``tone`` (one curve) or ``curves``, ``matrix``,
             ``saturation`` and ``local``.
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
@@ -70,7 +72,7 @@ class FittedLook:
             return {"alpha": torch.tensor(self.step["alpha"])}
         curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
-        named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands")}
+        named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands", "texture")}
         rest = {name: torch.tensor(self.step[name]) for name in ("saturation", "local")}
         return {**named, "curves": curves, "matrix": matrix, **rest}
 
@@ -93,12 +95,14 @@ def fit_look(
 
     In closed form, from small sums over 65,536 pixels of each pair or all of a smaller one; one pair is in memory at a
     time. Parts and ridge are chosen by leaving out pairs, or ninths of the picture if there is one pair only, which
-    says nothing of other pictures: curves are kept closer to the identity then.
+    says nothing of other pictures: the look is kept closer to the identity then, the more it leaves of the edit.
 
     Args:
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
-            or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own. Read once.
-        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``curves``,
+            or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own, which may be missing
+            in some pairs. Read once. A frame of one colour around an edited photograph is left out.
+        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs),
+            ``texture`` (these without edges), ``curves``,
             ``matrix``, ``saturation`` and ``local`` (local contrast).
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
@@ -139,6 +143,11 @@ def fit_look(
             number += 1
     if number == 0:
         raise ValueError("pairs must hold a pair of photographs, got none; pass (before, after)")
+    for i, region in enumerate(regions):
+        if not region.folds:
+            raise ValueError(
+                f"masks must hold a pixel that is not clipped in every region, got none in region {i + 1}; select some"
+            )
     if not any(bool((sums.power > 0).any()) for region in regions for sums in region.folds):
         raise ValueError("pairs must hold an edited photograph, but each is the same before and after; edit one")
     found = tuple(region.look(step, choices) for region in regions)
@@ -164,10 +173,10 @@ class _Region:
     def look(self, step: Step, choices: Sequence[Parts]) -> FittedLook:
         """The look, of one of these choices of parts."""
         if len(self.folds) == 1 and self.squares:
-            found = choose(self.squares, self.layout, choices, STIFF_ALONE)
+            best, found = choose_from_one(self.squares, self.layout, choices, STIFF_ALONE)
         else:
             found = choose(self.folds, self.layout, choices, STIFF)
-        best = simplest(found)
+            best = simplest(found)
         return FittedLook(
             self._step(best, step),
             best.parts,
@@ -191,6 +200,7 @@ class _Region:
         return step.changed(
             alpha=_rounded(alpha),
             bands=_rounded(1 + values["bands"][0]),
+            texture=_rounded(1 + values["texture"][0]),
             red=red,
             green=green,
             blue=blue,
@@ -239,9 +249,10 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
     """
     if bool((before == after).all()):
         return  # says that the look leaves it as it is
-    if not bool(((after > 0) & (after < 1)).any()):
+    shown = inside_frame(before, after) & ((after > 0) & (after < 1)).any(0)
+    if not bool(shown.any()):
         raise ValueError(f"{second} must have pixels that are not clipped to black or white, got none; edit it less")
-    grey, edited = (reduce_channels(image[None], "luminance").flatten().double() for image in (before, after))
+    grey, edited = (reduce_channels(image[None], "luminance")[0, 0, shown].double() for image in (before, after))
     if min(float(grey.std()), float(edited.std())) < 1 / 255:
         return  # nothing to compare
     shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
@@ -267,21 +278,23 @@ def _add(
     """Add the sums of an image (3, H, W) before and after an edit."""
     layout = regions[0].layout
     photograph = EditedPhotograph(before, after, masks, step, layout.sliders - 1, generator)
-    divided = number == 0
+    width = photograph.size[1]
 
-    def sums(pixels: SomePixels) -> list[Sums]:
-        square = _squares(pixels.places, photograph.size[1]) if divided else torch.zeros_like(pixels.places)
+    def sums(pixels: SomePixels, region: _Region) -> list[Sums]:
+        """Sums over the pixels, or over parts of the first pair that has some."""
+        square = torch.zeros_like(pixels.places) if region.folds else _squares(pixels.places, width)
         return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
 
     found = photograph.regions_of_sample()
-    known = None if found is None else [sums(pixels) for pixels in found]
+    known = None if found is None else [sums(*each) for each in zip(found, regions, strict=True)]
     if found is None or known is None or _of_sliders(reduce(Sums.__add__, known[0]), layout, LIKELY):
         found = photograph.regions()
-        known = [sums(pixels) for pixels in found]
+        known = [sums(*each) for each in zip(found, regions, strict=True)]
     for region, pixels, parts in zip(regions, found, known, strict=True):
+        if not parts:
+            continue  # the region is not in this photograph
         whole = reduce(Sums.__add__, parts)
-        if divided:
-            region.squares = parts
+        region.squares = region.squares or parts
         if len(region.folds) < FOLDS:
             region.folds.append(whole)
         else:
@@ -291,6 +304,8 @@ def _add(
 
 def _squares(places: Tensor, width: int) -> Tensor:
     """Whole numbers of pixels (P,) of a picture, by the part of the rectangle around them."""
+    if len(places) == 0:
+        return places
     rows, columns = (
         (found - found.min()) * SQUARES // (found.max() - found.min() + 1)
         for found in (places // width, places % width)

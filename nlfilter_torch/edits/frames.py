@@ -9,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.colour import Limits
-from nlfilter_torch.edits.detail import activity, held_back, split_sliders
+from nlfilter_torch.edits.detail import activity, limit_by_activity, split_sliders
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.source import Fitted, InMemory, Pixels, Source, luminance
 from nlfilter_torch.edits.viewing import fit_change, viewed_size
@@ -100,7 +100,7 @@ def filter_frames(
                 return torch.cat([changed(added, None), changed(rest, None)], dim=1)
             return torch.cat([changed(added, 0.0), changed(rest, residual - 1)], dim=1)
 
-        return Fitted(of, lambda image, found: held_back(found, activity(image), threshold))
+        return Fitted(of, lambda image, found: limit_by_activity(found, activity(image), threshold))
 
     brighter = alpha[-1] - 1
 

@@ -14,8 +14,8 @@ from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.filtering.local_tone import LocalCurves, shades
-from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise
+from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
+from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
 from nlfilter_torch.operator.features import reduce_channels
 
 Numbers = Tensor | Sequence[float]
@@ -27,6 +27,7 @@ def apply_look(
     *,
     alpha: Numbers = LOOK.defaults["alpha"],
     bands: Numbers = LOOK.defaults["bands"],
+    texture: Numbers = LOOK.defaults["texture"],
     red: Numbers = LOOK.defaults["red"],
     green: Numbers = LOOK.defaults["green"],
     blue: Numbers = LOOK.defaults["blue"],
@@ -47,14 +48,16 @@ def apply_look(
         alpha: sliders of the detail layers of luminance, (k+1,) or (B, k+1).
         bands: gains of six bands of detail that blurs find, each twice as wide, and of the rest around its mean, (7,)
             or (B, 7).
+        texture: gains of the six bands of luminance where it varies little, not at edges, (6,) or (B, 6).
         red: what red becomes at equal steps from 0 to 1, (K,) or (B, K), in straight lines between.
         green: likewise, as many.
         blue: likewise.
         matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
         saturation: how many times as far each channel is to be from the largest one of its pixel, (K,) or (B, K), for
             colours whose saturation in HSV is at equal steps from 0 to 1.
-        local: how much of the change of luminance that equalises the histogram around each pixel is added, under limits
-            of contrast of 1.5, 2, 3 and 5, (4,) or (B, 4); 0 is none. Blocks are a sixteenth of the short side.
+        local: how much of the change that equalises the histogram around each pixel is added, under limits of contrast
+            of 1.5, 2, 3 and 5: four strengths for luminance, and four for the largest channel, whose change scales
+            colours, (8,) or (B, 8); 0 is none. Histograms are those of 8 x 8 tiles of the picture.
         amount: a number or a tensor of shape () or (B,); 1 is the look, 0 the image.
         viewing_size: in megapixels; the details of a larger image are those of its reduction to this size; 0 is the
             size of the image.
@@ -82,6 +85,7 @@ def apply_look(
         fit_look_edit,
         alpha=alpha,
         bands=bands,
+        texture=texture,
         red=red,
         green=green,
         blue=blue,
@@ -102,6 +106,7 @@ def fit_look_edit(
     *,
     alpha: Numbers,
     bands: Numbers,
+    texture: Numbers,
     red: Numbers,
     green: Numbers,
     blue: Numbers,
@@ -120,9 +125,11 @@ def fit_look_edit(
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
     LOOK["amount"].check_argument(amount, source.batch)
     LOOK["viewing_size"].check_argument(viewing_size)
-    given = {"alpha": alpha, "bands": bands, "saturation": saturation, "local": local}
+    given = {"alpha": alpha, "bands": bands, "texture": texture, "saturation": saturation, "local": local}
     given |= {"red": red, "green": green, "blue": blue}
-    sliders, gains, factors, strengths, *channels = (_numbers(value, name, source) for name, value in given.items())
+    sliders, gains, textured, factors, strengths, *channels = (
+        _numbers(value, name, source) for name, value in given.items()
+    )
     if len({channel.shape[-1] for channel in channels}) > 1:
         lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
         raise ValueError(f"red, green and blue must be equally many numbers, got {lengths}; add or drop some")
@@ -132,8 +139,8 @@ def fit_look_edit(
     if colours.shape[-1] != 9:
         raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
     colours = colours.unflatten(-1, (3, 3))
-    parts = {"alpha": sliders, "bands": gains, "curves": curves, "matrix": colours, "saturation": factors}
-    parts["local"] = strengths
+    parts = {"alpha": sliders, "bands": gains, "texture": textured, "curves": curves, "matrix": colours}
+    parts |= {"saturation": factors, "local": strengths}
     for name, value in parts.items():
         check_part(value, name, source.batch)
     strength = torch.as_tensor(amount).to(source.dtype).reshape(-1, 1, 1, 1)
@@ -153,10 +160,15 @@ def fit_look_edit(
         def pixels(some: Pixels) -> Tensor:
             return torch.zeros_like(some.image) if moved is None else moved(some).expand_as(some.image)
 
-        if not acts(gains):
+        if not acts(gains) and not acts(textured):
             return Fitted(pixels)
-        mean = viewed.mean(luminance)
-        return Fitted(pixels, lambda image, found: found + band_change(image, gains, mean), BAND_MARGIN)
+        mean = viewed.mean(luminance) if acts(gains) else None
+
+        def around(image: Tensor, found: Tensor) -> Tensor:
+            found = found if mean is None else found + band_change(image, gains, mean)
+            return found + texture_change(image, textured) if acts(textured) else found
+
+        return Fitted(pixels, around, BAND_MARGIN)
 
     fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
 
@@ -169,14 +181,14 @@ def fit_look_edit(
         return image + strength * (moved - image + shown)
 
     def planes(pixels: Pixels) -> Tensor:
-        """The change of some pixels, and that of local contrast as a plane more."""
+        """The change of some pixels, and that of local contrast as further planes."""
         moved = fitted.pixels(pixels)
         return moved if equalized is None else torch.cat([moved, equalized(pixels)], dim=1)
 
     def finished(image: Tensor, found: Tensor) -> Tensor:
-        moved = found if equalized is None else found[:, :-1]
+        moved, local = (found, None) if equalized is None else found.tensor_split([-image.shape[1]], dim=1)
         shown = result(image, moved if fitted.finish is None else fitted.finish(image, moved))
-        return shown if equalized is None else shown + strength * found[:, -1:]
+        return shown if local is None else shown + strength * local
 
     if fitted.finish is None:
         return Fitted(lambda pixels: finished(pixels.image, planes(pixels)))
@@ -184,10 +196,10 @@ def fit_look_edit(
 
 
 def _local_change(source: Source, strengths: Tensor) -> Planes:
-    """The change of luminance (B, 1, h, W) by local tone curves."""
-    curves = LocalCurves.of(source.size, lambda step: source.reduced(lambda pixels: shades(luminance(pixels)), step))
+    """The change (B, C, h, W) by local tone curves."""
+    curves = LocalCurves.of(source.size, lambda step: source.reduced(lambda pixels: ramps(pixels.image), step))
     weighed = curves.weighed(strengths)
-    return lambda pixels: weighed.rectangle(luminance(pixels), corner(pixels))
+    return lambda pixels: weighed.rectangle(pixels.image, corner(pixels)).sum(1)
 
 
 def _numbers(value: Numbers, name: str, source: Source) -> Tensor:

@@ -38,6 +38,15 @@ LOOK = Edit(
             metavar="A,B,...,G",
             length=7,
         ),
+        sliders(
+            "texture",
+            (1.0,) * 6,
+            "Strength of what is finer than 1, 2, 5, 9, 18 and 37 pixels where brightness varies little: surfaces, not "
+            "edges. 1 leaves it as it is.",
+            idle=(1.0,) * 6,
+            metavar="A,B,...,F",
+            length=6,
+        ),
         _curve("red"),
         _curve("green"),
         _curve("blue"),
@@ -60,13 +69,14 @@ LOOK = Edit(
         ),
         sliders(
             "local",
-            (0.0,) * 4,
-            "Local contrast: how much of the change of brightness that equalises the histogram around each pixel is "
-            "added, under limits of contrast of 1.5, 2, 3 and 5. 0 is none.",
+            (0.0,) * 8,
+            "Local contrast: how much of the change that equalises the histogram around each pixel is added, under "
+            "limits of contrast of 1.5, 2, 3 and 5: four numbers for luminance, four for colours in proportion. 0 is "
+            "none.",
             unit="",
-            idle=(0.0,) * 4,
-            metavar="A,B,C,D",
-            length=4,
+            idle=(0.0,) * 8,
+            metavar="A,B,...,H",
+            length=8,
         ),
         gain(
             "amount",

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.edits.alignment import inside_frame
 from nlfilter_torch.edits.applying import seeded
 from nlfilter_torch.edits.detail import options_of
 from nlfilter_torch.edits.resizing import resize
@@ -15,7 +16,7 @@ from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
 from nlfilter_torch.filtering.local_tone import LocalCurves
-from nlfilter_torch.filtering.look import bands_of, local_curves
+from nlfilter_torch.filtering.look import bands_of, local_curves, textures_of
 from nlfilter_torch.filtering.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
 from nlfilter_torch.operator.build import nonlocal_operator, sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -32,7 +33,8 @@ class SomePixels:
         before: (3, P).
         after: (3, P).
         bands: of the photograph before the edit, (3, 7, P).
-        local: changes of its luminance by local tone curves, (4, P).
+        texture: of it, (6, P).
+        local: changes by local tone curves, (3, 8, P).
         layers: of its luminance, (k+1, P).
         weights: (3, P).
     """
@@ -41,13 +43,14 @@ class SomePixels:
     before: Tensor
     after: Tensor
     bands: Tensor
+    texture: Tensor
     local: Tensor
     layers: Tensor
     weights: Tensor
 
     def sums(self, layout: Layout, parts: list[Tensor]) -> list[Sums]:
         """Sums over parts (P',) of them."""
-        columns = columns_of(self.before, self.bands, self.local, self.layers, layout)
+        columns = columns_of(self.before, self.bands, self.texture, self.local, self.layers, layout)
         change = self.after - self.before
         return [sums_of(columns[..., some], change[:, some], self.weights[:, some]) for some in parts]
 
@@ -75,7 +78,7 @@ class EditedPhotograph:
     ) -> None:
         dtype = working_dtype(before)
         before, after = before.to(dtype), after.to(dtype)
-        free = ((after > 0) & (after < 1)).to(dtype)
+        free = ((after > 0) & (after < 1)).to(dtype) * inside_frame(before, after).to(dtype)
         size = (before.shape[-2], before.shape[-1])
         self.size = viewed_size(size, step["viewing_size"])
         levels = after * 255
@@ -103,9 +106,14 @@ class EditedPhotograph:
         return [*bands[:-1], bands[-1] - self.luminance.mean()]
 
     @cached_property
+    def texture(self) -> list[Tensor]:
+        """Of the photograph before the edit, (N,) each."""
+        return [texture.flatten() for texture in textures_of(self.image)]
+
+    @cached_property
     def local(self) -> LocalCurves:
         """Local tone curves before the edit."""
-        return local_curves(self.luminance)
+        return local_curves(self.image)
 
     @cached_property
     def layers(self) -> Tensor:
@@ -114,11 +122,7 @@ class EditedPhotograph:
         return detail_layers(operator, self.luminance, order=self.order)[0, :, 0].flatten(1)
 
     def regions(self) -> list[SomePixels]:
-        """Pixels of each region that are not clipped.
-
-        Raises:
-            ValueError: if a region has none.
-        """
+        """Pixels of each region that are not clipped; none of a region that the photograph does not show."""
         return [self._pixels(weights, self.layers) for weights in self._weights()]
 
     def regions_of_sample(self) -> list[SomePixels] | None:
@@ -147,14 +151,13 @@ class EditedPhotograph:
 
     def _pixels(self, weights: Tensor, layers: Tensor) -> SomePixels:
         places = sample(weights.amax(0))
-        if len(places) == 0:
-            raise ValueError("masks must hold a pixel that is not clipped in every region, got none; select some")
         return self._at(places, layers[:, places], weights)
 
     def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> SomePixels:
-        share = float((weights.amax(0) > 0).sum()) / len(places)
+        share = float((weights.amax(0) > 0).sum()) / max(len(places), 1)
         bands = torch.stack([band[:, places] for band in self.bands], dim=1)
+        texture = torch.stack([texture[places] for texture in self.texture])
         rows, columns = places // self.size[1], places % self.size[1]
-        local = self.local.at(self.luminance.flatten(1)[:, places], rows, columns)[0]
         before, after = self.before[:, places], self.after[:, places]
-        return SomePixels(places, before, after, bands, local, layers, weights[:, places] * share)
+        local = self.local.at(before[None], rows, columns)[0].transpose(0, 1)
+        return SomePixels(places, before, after, bands, texture, local, layers, weights[:, places] * share)

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from nlfilter_torch.edits.declaration import Edit, Parameter, Slider
+from nlfilter_torch.edits.declaration import FILTER_PANEL, Edit, Parameter, Slider
 from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.shared_parameters import (
     LIMITS,
@@ -66,6 +66,7 @@ DETAIL = Edit(
             "down. Default: the first slider of --alpha.",
             optional=True,
             idle=None,
+            panel=FILTER_PANEL,
         ),
         choice(
             "channels",
@@ -222,6 +223,7 @@ RECOLOR = Edit(
             domain="below 1",
             metavar="0...1",
             slider=Slider("Reach", 0, 0.95, 0.05),
+            panel=FILTER_PANEL,
         ),
         replace(TOLERANCE, former_names=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
         *filter_parameters(share=1.2, patch_size=1)[1:],

@@ -5,6 +5,7 @@ from typing import Any
 from nlfilter_torch.edits.declaration import (
     BANDWIDTHS,
     DISTANCES,
+    FILTER_PANEL,
     GAINS,
     MAX_LANDMARKS,
     MAX_PATCH,
@@ -55,6 +56,7 @@ def filter_parameters(
         words=("auto",) if auto else (),
         optional=bandwidth is None,
         argument="photometric_bandwidth",
+        panel=FILTER_PANEL,
     )
     reach = "no limit" if share == 0 else f"{share:.2g} of the short side"
     if far:
@@ -71,6 +73,7 @@ def filter_parameters(
             words=("none",) if far else (),
             optional=True,
             share=share,
+            panel=FILTER_PANEL,
         ),
         Parameter(
             "patch_size",
@@ -80,6 +83,7 @@ def filter_parameters(
             1,
             MAX_PATCH,
             "px",
+            panel=FILTER_PANEL,
         ),
         Parameter(
             "landmarks",
@@ -91,6 +95,7 @@ def filter_parameters(
             MAX_LANDMARKS,
             argument="num_landmarks",
             metavar="N",
+            panel=FILTER_PANEL,
         ),
         Parameter(
             "sampling",
@@ -99,6 +104,7 @@ def filter_parameters(
             "How the typical patches are chosen: by grouping similar ones, on a regular grid, or at random.",
             choices=("kmeans", "uniform", "random"),
             argument="landmarks",
+            panel=FILTER_PANEL,
         ),
     )
 
@@ -123,6 +129,7 @@ VIEWING_SIZE = Parameter(
     domain="not negative",
     zero_meaning="pass 0 for the size of the image",
     metavar="MEGAPIXELS",
+    panel=FILTER_PANEL,
 )
 #: For all edits that select objects.
 TOLERANCE = Parameter(
@@ -134,6 +141,7 @@ TOLERANCE = Parameter(
     100,
     "lab",
     argument="photometric_bandwidth",
+    panel=FILTER_PANEL,
 )
 #: For all edits that select regions.
 REACH = Parameter(
@@ -145,6 +153,7 @@ REACH = Parameter(
     0.999,
     domain="below 1",
     metavar="0...1",
+    panel=FILTER_PANEL,
 )
 REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 

@@ -206,14 +206,14 @@ def spectral_filter(
     check_tensor(image, "image", "convert it with torch.as_tensor")
     if image.ndim == 4 and len(image) == 0:
         check_image(image, "image", empty=True)
-        check_same_size(image, spectrum.size, "image", "spectrum")
+        check_same_size(image, spectrum.size, "image", "spectrum", spectrum.factor)
         fold_batch(image, spectrum.factor.shape[0])  # checks the batch
         return image.clone()
     if coefficients is None:
         coefficients = spectrum.coefficients(image)
     else:
         check_image(image, "image")
-        check_same_size(image, spectrum.size, "image", "spectrum")
+        check_same_size(image, spectrum.size, "image", "spectrum", spectrum.factor)
         batch, landmarks, _ = spectrum.factor.shape
         shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
         check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
@@ -243,7 +243,7 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
-    captured = spectral_filter(spectrum, image.to(spectrum.factor), torch.ones_like)
+    captured = spectral_filter(spectrum, image.to(spectrum.factor.dtype), torch.ones_like)
     energy = spectrum.among.sum(image.to(spectrum.factor).square().sum((1, 2, 3)))
     inner = spectrum.among.sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)))  # y^T V V^T y
     return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))
@@ -311,8 +311,8 @@ def filter_regions(
         (B, C, H, W) in the image's dtype, equal to the image where all masks are 0. Differentiable in all tensors.
 
     Raises:
-        TypeError, ValueError: if ``image`` does not fit the operator, or ``masks`` and ``alpha`` do not fit the image
-            or each other.
+        TypeError, ValueError: if ``image`` does not fit the operator, ``masks`` exceed [0, 1], or ``masks`` and
+            ``alpha`` do not fit the image or each other.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator
@@ -326,7 +326,8 @@ def filter_regions(
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     check_image(image, "image")
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
-    check_same_size(masks, operator.size, "masks", "operator")
+    check_unit_range(masks, "masks")
+    check_same_size(masks, operator.size, "masks", "operator", operator.factor)
     alpha = operator.among.copy_to_group(alpha)
     return blend_regions(
         image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)

@@ -101,8 +101,8 @@ def fit_alpha(
     check_order(order)
     check_image(image, "image")
     check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
-    check_same_size(image, operator.size, "image", "operator")
-    check_same_size(target, operator.size, "target", "image")
+    check_same_size(image, operator.size, "image", "operator", operator.factor)
+    check_same_size(target, operator.size, "target", "image", image)
     _check_not_negative(ridge, "ridge")
     if rounding is None:
         rounding = HALF_LEVEL if _is_rounded(target, operator.among) else 0.0

@@ -111,6 +111,7 @@ class FittedFilter:
         channels = self.moments.shape[3]
         check_image(image, "image", channels=channels)
         size = (image.shape[-2], image.shape[-1])
+        check_same_size(image, size, "image", "filter", self.moments)
         check_pair(origin, "origin")
         check_pair(halo, "halo")
         if sum(halo) >= size[0]:
@@ -120,7 +121,7 @@ class FittedFilter:
         if guide is not None:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
-            check_same_size(guide, size, "guide", "image")
+            check_same_size(guide, size, "guide", "image", image)
         batch = (image.shape[0], -1, -1)
         landmarks, inverse = (matrix.expand(batch) for matrix in (self.kernel.landmarks, self.kernel.inverse_cholesky))
         kernel = replace(self.kernel, landmarks=landmarks, inverse_cholesky=inverse)

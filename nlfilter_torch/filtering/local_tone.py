@@ -1,8 +1,9 @@
 """Tone curves of every part of a picture, which equalise the histogram around it as far as limits of contrast allow.
 
-After Zuiderveld, "Contrast Limited Adaptive Histogram Equalization" (1994): histograms of blocks, clipped, give curves,
-and a pixel takes its value from the curves of the four nearest blocks. Here histograms are of hat functions, so that
-curves are continuous in the picture, and those of neighbouring blocks are blended.
+After Zuiderveld, "Contrast Limited Adaptive Histogram Equalization" (1994): clipped histograms of 8 x 8 tiles give
+curves, and a pixel takes its value from the curves of the four nearest tiles. Here histograms are of hat functions, so
+that curves are continuous in the picture. What curves of luminance change is added to every channel; curves of the
+largest channel (value in HSV) scale colours.
 """
 
 from collections.abc import Callable
@@ -13,103 +14,119 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.operator.features import reduce_channels
+
 LIMITS = (1.5, 2.0, 3.0, 5.0)  # times as much of a shade as in an even histogram that counts at most: slopes of curves
-SHADES = 17
-BLOCKS = 16  # along the short side
-FINE = 32  # pixels along a block that histograms are first taken of, at most
+STRENGTHS = 2 * len(LIMITS)  # of luminance, and of the largest channel
+SHADES = 33
+TILES = 8  # along both sides
+FINE = 16  # blocks along the short side of a tile that histograms are first taken of
+DARKEST = 1 / 255  # largest channel that colours are divided by
 
 
-def shades(light: Tensor) -> Tensor:
-    """How much of each of :data:`SHADES` equal steps from 0 to 1 there is in values (B, 1, H, W): (B, K, H, W)."""
-    steps = torch.arange(SHADES).to(light).view(-1, 1, 1)
-    return (1 - (light.clamp(0, 1) * (SHADES - 1) - steps).abs()).clamp(min=0)
+def brightness(image: Tensor) -> Tensor:
+    """Luminance and largest channel (B, 2, H, W) of an image (B, C, H, W)."""
+    return torch.cat([reduce_channels(image, "luminance").mean(1, keepdim=True), image.amax(1, keepdim=True)], dim=1)
+
+
+def ramps(image: Tensor) -> Tensor:
+    """How far both kinds of :func:`brightness` are from each shade to the next, 0 to 1: (B, 2 (K - 1), H, W)."""
+    light = brightness(image) * (SHADES - 1)
+    return torch.stack([light.clamp(k, k + 1) - k for k in range(SHADES - 1)], dim=2).flatten(1, 2)
+
+
+def mean_ramps(image: Tensor, step: int) -> Tensor:
+    """Means of :func:`ramps` over blocks of ``step`` x ``step`` pixels, with one shade in memory at a time."""
+    light = brightness(image) * (SHADES - 1)
+    means = [
+        F.avg_pool2d(light.clamp(k, k + 1), step, ceil_mode=True, count_include_pad=False) - k
+        for k in range(SHADES - 1)
+    ]
+    return torch.stack(means, dim=2).flatten(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class LocalCurves:
-    """Changes of brightness by tone curves around the middles of blocks.
+    """Changes of brightness by tone curves around the middles of tiles.
 
     Attributes:
-        changes: of :data:`SHADES` shades, by S kinds of curves, (B, S, K, h, w).
-        step: pixels along a block.
+        changes: of K shades of luminance and of the largest channel, by S curves, (B, 2, S, K, TILES, TILES).
+        size: (H, W) of the picture.
     """
 
     changes: Tensor
-    step: int
+    size: tuple[int, int]
 
     @staticmethod
     def of(size: tuple[int, int], reduced: Callable[[int], Tensor]) -> "LocalCurves":
-        """The curves of a picture of a size (H, W), one kind for each of :data:`LIMITS`.
+        """The curves of a picture of a size (H, W), one for each of :data:`LIMITS`.
 
         Args:
             size: of the picture.
-            reduced: means of :func:`shades` of its luminance over blocks of so many pixels, (B, K, h, w).
+            reduced: means of its :func:`ramps` over blocks of so many pixels, (B, 2 (K - 1), h, w).
         """
-        length = max(1, round(min(size) / BLOCKS))
-        many = -(-length // FINE)
-        fine = max(1, round(length / many))
-        means = reduced(fine)
-        counts = [torch.full((n,), float(fine)) for n in means.shape[-2:]]
-        for count, whole in zip(counts, size, strict=True):
-            count[-1] = whole - fine * (len(count) - 1)
-        pixels = torch.outer(*counts).to(means)[None, None]
-        sums = _blend(_pooled(means * pixels, many))
-        histogram = sums / _blend(_pooled(pixels, many))
+        step = max(1, min(size) // (TILES * FINE))
+        means = reduced(step).unflatten(1, (2, SHADES - 1))
+        rows, columns = (_shares(length, step).to(means) for length in size)
+        # A hat function rises with one ramp and falls with the next.
+        passed = F.pad(rows @ means @ columns.mT, (0, 0, 0, 0, 1, 0), value=1.0)
+        histogram = passed - F.pad(passed[:, :, 1:], (0, 0, 0, 0, 0, 1))
         straight = torch.linspace(0, 1, SHADES).to(means).view(-1, 1, 1)
         changes = []
         for limit in LIMITS:
             most = histogram.clamp(max=limit / SHADES)
-            shared = most + (1 - most.sum(1, keepdim=True)) / SHADES
-            changes.append(shared.cumsum(1) - shared / 2 - straight)
-        return LocalCurves(torch.stack(changes, dim=1), fine * many)
+            shared = most + (1 - most.sum(2, keepdim=True)) / SHADES
+            changes.append(shared.cumsum(2) - shared / 2 - straight)
+        return LocalCurves(torch.stack(changes, dim=2), size)
 
     def weighed(self, strength: Tensor) -> "LocalCurves":
-        """One kind of curves: the sum of all, each as strong as (S,) or (B, S) says."""
-        weights = strength.to(self.changes).reshape(-1, len(LIMITS), 1, 1, 1)
-        return LocalCurves((weights * self.changes).sum(1, keepdim=True), self.step)
+        """One curve: the sum of all, each as strong as (2 S,) or (B, 2 S) says."""
+        weights = strength.to(self.changes).reshape(-1, 2, len(LIMITS), 1, 1, 1)
+        return LocalCurves((weights * self.changes).sum(2, keepdim=True), self.size)
 
-    def rectangle(self, light: Tensor, corner: tuple[int, int]) -> Tensor:
-        """Changes (B, S, h, w) of luminance (B, 1, h, w), whose first pixel is in that row and column."""
-        height, width = light.shape[-2:]
+    def rectangle(self, image: Tensor, corner: tuple[int, int]) -> Tensor:
+        """Changes (B, 2 S, C, h, w) of an image (B, C, h, w), whose first pixel is in that row and column."""
+        height, width = image.shape[-2:]
         rows, columns = (
-            torch.arange(start, start + length, device=light.device)
+            torch.arange(start, start + length, device=image.device)
             for start, length in zip(corner, (height, width), strict=True)
         )
-        found = self.at(light.flatten(1), rows.repeat_interleave(width), columns.repeat(height))
-        return found.unflatten(2, (height, width))
+        found = self.at(image.flatten(2), rows.repeat_interleave(width), columns.repeat(height))
+        return found.unflatten(3, (height, width))
 
-    def at(self, light: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Changes (B, S, P) of the luminance (B, P) of some pixels, in rows and columns (P,)."""
-        shape = self.changes.shape[-3:]
-        places = [
-            light.clamp(0, 1) * (SHADES - 1),
-            ((rows + 0.5) / self.step - 0.5).to(light).expand_as(light),
-            ((columns + 0.5) / self.step - 0.5).to(light).expand_as(light),
-        ]
+    def at(self, image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Changes (B, 2 S, C, P) of some pixels (B, C, P), in rows and columns (P,)."""
+        light = brightness(image.unsqueeze(2)).squeeze(2)
+        added, scaled = self._changes_of(light, rows, columns).unbind(1)
+        colours = (image / light[:, 1:].clamp(min=DARKEST)).unsqueeze(1)
+        added = added.unsqueeze(2).expand(-1, -1, image.shape[1], -1)
+        return torch.cat([added, scaled.unsqueeze(2) * colours], dim=1)
+
+    def _changes_of(self, light: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Changes (B, 2, S, P) of both kinds of brightness (B, 2, P)."""
+        shape = (SHADES, TILES, TILES)
+        places = [light.clamp(0, 1) * (SHADES - 1)]
+        for numbers, length in zip((rows, columns), self.size, strict=True):
+            places.append(((numbers + 0.5) * (TILES / length) - 0.5).to(light))
         places = [place.clamp(0, length - 1) for place, length in zip(places, shape, strict=True)]
-        below = [
-            place.detach().floor().clamp(max=max(length - 2, 0)) for place, length in zip(places, shape, strict=True)
-        ]
-        changes = self.changes.flatten(2).expand(len(light), -1, -1)
-        found = torch.zeros_like(light).unsqueeze(1)
+        below = [place.detach().floor().clamp(max=length - 2) for place, length in zip(places, shape, strict=True)]
+        changes = self.changes.flatten(3).expand(len(light), -1, -1, -1)
+        found = torch.zeros_like(light).unsqueeze(2)
         for corner in product((0, 1), repeat=3):
             index, share = torch.zeros_like(light, dtype=torch.long), torch.ones_like(light)
             for place, low, one, length in zip(places, below, corner, shape, strict=True):
-                index = index * length + (low.long() + one).clamp(max=length - 1)
+                index = index * length + low.long() + one
                 part = place - low
                 share = share * (part if one else 1 - part)
-            taken = changes.gather(2, index.unsqueeze(1).expand(-1, changes.shape[1], -1))
-            found = found + share.unsqueeze(1) * taken
+            taken = changes.gather(3, index.unsqueeze(2).expand(-1, -1, changes.shape[2], -1))
+            found = found + share.unsqueeze(2) * taken
         return found
 
 
-def _pooled(planes: Tensor, step: int) -> Tensor:
-    """Sums over blocks."""
-    return F.avg_pool2d(planes, step, ceil_mode=True, divisor_override=1)
-
-
-def _blend(planes: Tensor) -> Tensor:
-    """Sums over neighbouring blocks, with the weights 1, 2, 1 along both axes."""
-    padded = F.pad(planes, (1, 1, 1, 1))
-    rows = padded[..., :-2, :] + 2 * padded[..., 1:-1, :] + padded[..., 2:, :]
-    return rows[..., :-2] + 2 * rows[..., 1:-1] + rows[..., 2:]
+def _shares(length: int, step: int) -> Tensor:
+    """Weights (TILES, n) of blocks of ``step`` pixels in the means over tiles, along a side of a picture."""
+    starts = torch.arange(0, length, step, dtype=torch.float64)
+    ends = (starts + step).clamp(max=length)
+    edges = torch.arange(TILES + 1, dtype=torch.float64).view(-1, 1) * (length / TILES)
+    shared = torch.minimum(ends, edges[1:]) - torch.maximum(starts, edges[:-1])
+    return shared.clamp(min=0) * (TILES / length)

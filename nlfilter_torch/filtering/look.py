@@ -1,26 +1,28 @@
-"""A look: sliders of the filter and of blurs, tone curves, a colour matrix, saturation and local contrast, added up.
+"""A look: sliders of the filter, of blurs and of texture, tone curves, colours and local contrast, added up.
 
 Each part gives a change of the image, and the result is the image plus all changes, so that it is linear in every
 parameter but the image: looks are fitted to edits by least squares.
 """
 
 from collections.abc import Iterator
+from functools import partial
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_tensor
 from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.filtering.local_tone import LIMITS, LocalCurves, shades
+from nlfilter_torch.filtering.local_tone import STRENGTHS, LocalCurves, mean_ramps
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
+FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
 DARKEST = 1 / 255  # that has a saturation
-NAMES = ("alpha", "bands", "curves", "matrix", "saturation", "local")
-DIMENSIONS = {"alpha": 1, "bands": 1, "curves": 2, "matrix": 2, "saturation": 1, "local": 1}  # of one image
+NAMES = ("alpha", "bands", "texture", "curves", "matrix", "saturation", "local")
+#: Of one image.
+DIMENSIONS = {"alpha": 1, "bands": 1, "texture": 1, "curves": 2, "matrix": 2, "saturation": 1, "local": 1}
 
 
 def filter_look(
@@ -28,6 +30,7 @@ def filter_look(
     *,
     alpha: Tensor | None = None,
     bands: Tensor | None = None,
+    texture: Tensor | None = None,
     curves: Tensor | None = None,
     matrix: Tensor | None = None,
     saturation: Tensor | None = None,
@@ -41,13 +44,16 @@ def filter_look(
         alpha: sliders (k+1,) or (B, k+1) of the filter's layers of luminance. Paper: eq. (12).
         bands: gains (7,) or (B, 7) of what six blurs, each twice as wide, take away one after the other, fine to
             coarse, and last of what they leave, around the picture's mean luminance: 1 changes nothing.
+        texture: gains (6,) or (B, 6) of what the six blurs take away from luminance, the less of it the more luminance
+            varies around a pixel, so that edges have little: 1 changes nothing.
         curves: (3, K) or (B, 3, K), what red, green and blue become at K equal steps from 0 to 1.
         matrix: (3, 3) or (B, 3, 3) that colours are multiplied by; its change, like that of the curves, is that of the
             image itself.
         saturation: (K,) or (B, K), how many times as far each channel is to be from the largest one of its pixel, for
             colours whose saturation in HSV is at K equal steps from 0 to 1.
-        local: (4,) or (B, 4), how much of the change of luminance that equalises histograms of the surroundings is
-            added, under four limits of contrast, :data:`~nlfilter_torch.filtering.local_tone.LIMITS`.
+        local: (8,) or (B, 8), how much of the change that equalises histograms of the surroundings is added, under four
+            limits of contrast, :data:`~nlfilter_torch.filtering.local_tone.LIMITS`: of luminance, for all channels
+            alike, and then of the largest channel, for colours in proportion.
         operator: W, which ``alpha`` needs.
 
     Returns:
@@ -63,7 +69,7 @@ def filter_look(
         True
     """
     check_image(image, "image", channels=3)
-    parts = dict(zip(NAMES, (alpha, bands, curves, matrix, saturation, local), strict=True))
+    parts = dict(zip(NAMES, (alpha, bands, texture, curves, matrix, saturation, local), strict=True))
     given = {name: value for name, value in parts.items() if value is not None}
     for name, value in given.items():
         check_part(value, name, image.shape[0])
@@ -71,10 +77,10 @@ def filter_look(
     if bands is not None:
         mean = reduce_channels(image, "luminance").mean((2, 3), keepdim=True)
         result = result + band_change(image, bands, mean)
+    if texture is not None:
+        result = result + texture_change(image, texture)
     if local is not None:
-        light = reduce_channels(image, "luminance")
-        weighed = local_curves(light).weighed(local)
-        result = result + weighed.rectangle(light, (0, 0))
+        result = result + local_curves(image).weighed(local).rectangle(image, (0, 0)).sum(1)
     if alpha is not None:
         if operator is None:
             raise ValueError("operator must be given where alpha is, got None; make it with nonlocal_operator")
@@ -88,20 +94,22 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
     shapes = {
         "alpha": "(k+1,)",
         "bands": f"({BLURS + 1},)",
+        "texture": f"({BLURS},)",
         "curves": "(3, K)",
         "matrix": "(3, 3)",
         "saturation": "(K,)",
-        "local": f"({len(LIMITS)},)",
+        "local": f"({STRENGTHS},)",
     }
     shape, one = tuple(value.shape), DIMENSIONS[name]
     last = shape[-one:]
     fits = {
         "alpha": lambda: last[0] >= 2,
         "bands": lambda: last == (BLURS + 1,),
+        "texture": lambda: last == (BLURS,),
         "curves": lambda: last[0] == 3 and last[1] >= 2,
         "matrix": lambda: last == (3, 3),
         "saturation": lambda: last[0] >= 2,
-        "local": lambda: last == (len(LIMITS),),
+        "local": lambda: last == (STRENGTHS,),
     }
     if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
         raise ValueError(
@@ -114,10 +122,9 @@ def acts(gains: Tensor, idle: float = 1.0) -> bool:
     return gains.requires_grad or bool((gains != idle).any())
 
 
-def local_curves(light: Tensor) -> LocalCurves:
-    """Local tone curves of an image of luminance (B, 1, H, W)."""
-    size = (light.shape[-2], light.shape[-1])
-    return LocalCurves.of(size, lambda step: F.avg_pool2d(shades(light), step, ceil_mode=True, count_include_pad=False))
+def local_curves(image: Tensor) -> LocalCurves:
+    """Local tone curves of an image (B, 3, H, W)."""
+    return LocalCurves.of((image.shape[-2], image.shape[-1]), partial(mean_ramps, image))
 
 
 def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None, saturation: Tensor | None) -> Tensor:
@@ -182,4 +189,24 @@ def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:
     for number, band in enumerate(bands_of(image)):
         gain = (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1)
         change = change + gain * (band - mean if number == BLURS else band)
+    return change
+
+
+def textures_of(image: Tensor) -> Iterator[Tensor]:
+    """Six bands (B, 1, H, W) of an image's luminance, without edges: less, the more it varies around a pixel."""
+    light = reduce_channels(image, "luminance")
+    low = torch.cat([light, light.square()], dim=1)
+    for number, band in enumerate(bands_of(low)):
+        if number == BLURS:
+            return
+        low = low - band  # what this blur leaves, and of squares
+        variance = (low[:, 1:] - low[:, :1].square()).clamp(min=0)
+        yield band[:, :1] * (FLAT**2 / (variance + FLAT**2))
+
+
+def texture_change(image: Tensor, gains: Tensor) -> Tensor:
+    """What gains (6,) or (B, 6) of textures change of an image, (B, 1, H, W), for all channels."""
+    change = torch.zeros_like(image[:, :1])
+    for number, texture in enumerate(textures_of(image)):
+        change = change + (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1) * texture
     return change

@@ -8,13 +8,13 @@ curve is kept from falling by a least-squares problem with bounds.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.filtering.local_tone import LIMITS
+from nlfilter_torch.filtering.local_tone import STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, below_largest, saturation_hats
 
 Parts = tuple[str, ...]
@@ -26,17 +26,20 @@ CHOICES: tuple[Parts, ...] = (
     ("saturation",),
     ("tone",),
     ("bands",),
+    ("texture",),
     ("matrix", "saturation"),
     ("tone", "matrix"),
     ("bands", "matrix"),
     ("curves",),
     ("local",),
+    ("bands", "texture"),
     ("tone", "bands"),
     ("tone", "local"),
     ("alpha", "bands"),
     ("curves", "matrix", "saturation"),
     ("tone", "matrix", "bands"),
     ("tone", "bands", "local"),
+    ("alpha", "bands", "texture"),
     ("alpha", "bands", "local"),
     ("tone", "matrix", "bands", "local"),
     ("alpha", "tone", "matrix", "saturation"),
@@ -44,14 +47,20 @@ CHOICES: tuple[Parts, ...] = (
     ("curves", "matrix", "saturation", "bands"),
     ("alpha", "curves", "matrix", "saturation", "bands"),
     ("alpha", "tone", "matrix", "saturation", "bands", "local"),
-    ("alpha", "curves", "matrix", "saturation", "bands", "local"),
+    ("alpha", "tone", "matrix", "saturation", "bands", "texture"),
+    ("alpha", "curves", "matrix", "saturation", "bands", "texture", "local"),
 )
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Weight of a curve's bends beside that of its distance from the identity, all that counts for factors of saturation.
 ROUGHNESS = {"tone": 10.0, "curves": 10.0, "saturation": 0.0}
 SLACK, FAINT = 1.1, 0.0003  # a simpler look may leave so many times as much, and so much of the change more
 SMALL = 1.0  # weight of the mean change of pairs beside that of one, whose share it is divided by
-MILD = 10.0  # times a ridge is at least as large as the share that looks leave
+MILD = 30.0  # times the least ridge is below the share that looks leave, with several pairs
+STIFFEST = 0.03  # that this share makes tone curves and saturation at most, with several pairs
+UNEXPLAINED = 0.05  # share that is left, from where on curves of a single pair have to be worth it
+WORTH = 1.5  # times what a look without tone curves and saturation may leave beside the best of a single pair
+SHRINK = 0.5  # of the share that is left of parts of a single pair, by which a look is weaker
+CURVED = {"tone", "curves"}
 MOST = 1 << 16  # pixels of a pair that sums are taken over
 
 
@@ -77,7 +86,8 @@ class Layout:
             "matrix": 3,
             "saturation": self.factors,
             "bands": BLURS + 1,
-            "local": len(LIMITS),
+            "texture": BLURS,
+            "local": STRENGTHS,
             "alpha": self.sliders,
         }
 
@@ -148,23 +158,24 @@ def sample(weights: Tensor) -> Tensor:
     return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
 
 
-def columns_of(image: Tensor, bands: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
+def columns_of(image: Tensor, bands: Tensor, texture: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
     """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
         image: pixels (3, P) before the edit.
         bands: of them, (3, 7, P).
-        local: changes by local tone curves, (4, P).
+        texture: of them, (6, P).
+        local: changes by local tone curves, (3, 8, P).
         layers: of luminance, (k+1, P).
         layout: of the columns.
     """
     colours = image.double()  # the columns nearly depend on each other
     knots = torch.arange(layout.knots).to(colours).view(-1, 1)
     hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
-    spread = [values.double().expand(3, -1, -1) for values in (colours, local, layers)]
+    spread = [values.double().expand(3, -1, -1) for values in (colours, texture, layers)]
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    return torch.cat([hats, spread[0], below, bands.double(), *spread[1:]], dim=1)
+    return torch.cat([hats, spread[0], below, bands.double(), spread[1], local.double(), spread[2]], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
@@ -198,7 +209,9 @@ class Found:
     risk: float
 
 
-def choose(folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stiff: float) -> dict[Parts, Found]:
+def choose(
+    folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stiff: float, *, alone: bool = False
+) -> dict[Parts, Found]:
     """The best ridge for each choice of parts, by leaving out each of the folds in turn.
 
     What a look leaves of an edit depends on the picture, and so do parameters that were found beside it: the more is
@@ -209,13 +222,14 @@ def choose(folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stif
         layout: of the columns.
         choices: of parts.
         stiff: see :func:`fit_parts`.
+        alone: whether the folds are parts of one picture, for which ridges are stronger.
     """
     found = _choose(folds, layout, choices, stiff, RIDGES)
     left = min(look.risk for look in found.values())
     if left <= stiff:
         return found
-    ridges = tuple(ridge for ridge in RIDGES if ridge >= left / MILD) or RIDGES[-1:]
-    return _choose(folds, layout, choices, left, ridges)
+    ridges = tuple(ridge for ridge in RIDGES if ridge >= (left if alone else left / MILD)) or RIDGES[-1:]
+    return _choose(folds, layout, choices, left if alone else max(stiff, min(left, STIFFEST)), ridges)
 
 
 def _choose(
@@ -265,6 +279,25 @@ def simplest(found: dict[Parts, Found]) -> Found:
     """The first choice that leaves hardly more than the best one does."""
     least = min(look.risk for look in found.values())
     return next(look for look in found.values() if look.risk <= SLACK * least + FAINT)
+
+
+def choose_from_one(
+    folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stiff: float
+) -> tuple[Found, dict[Parts, Found]]:
+    """The look of a single pair, and the best one of each choice of parts.
+
+    Parts of a picture are more alike than pictures are, so that the look is to depend less on the picture where it does
+    not explain the edit: ridges are stronger, curves (which stand for whatever goes with brightness there) have to
+    explain much more than other parts do, and the look is weaker by some of the share that it leaves.
+    """
+    found = choose(folds, layout, choices, stiff, alone=True)
+    best, straight = simplest(found), {parts: look for parts, look in found.items() if not CURVED & set(parts)}
+    other = simplest(straight) if straight else best
+    best = other if UNEXPLAINED < other.risk <= WORTH * best.risk else best
+    strength = 1 - SHRINK * min(max(1 - best.left_out, 0.0), 1.0)
+    coefficients = strength * best.coefficients
+    fitted = reduce(Sums.__add__, folds).explained(coefficients)
+    return replace(best, coefficients=coefficients, fitted=fitted), found
 
 
 def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:

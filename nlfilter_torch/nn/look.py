@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_count, check_image
+from nlfilter_torch.filtering.local_tone import STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
 from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.nn.parameters import check_learn
@@ -21,9 +22,9 @@ class Look(nn.Module):
     Paper: eq. (12) for the sliders. Starts from the identity, or from the result of :func:`fit_look`.
 
     Args:
-        parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``curves`` (3, K), ``matrix`` (3, 3),
-            ``saturation`` (K,) and ``local`` (4,), as from :meth:`FittedLook.tensors`. Omitted parts start from the
-            identity.
+        parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``texture`` (6,), ``curves`` (3, K),
+            ``matrix`` (3, 3), ``saturation`` (K,) and ``local`` (8,), as from :meth:`FittedLook.tensors`. Omitted parts
+            start from the identity.
         learn: names of the parts to learn; the others are buffers.
         knots: K, for curves that start from the identity.
         **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
@@ -41,6 +42,7 @@ class Look(nn.Module):
 
     alpha: Tensor
     bands: Tensor
+    texture: Tensor
     curves: Tensor
     matrix: Tensor
     saturation: Tensor
@@ -62,10 +64,11 @@ class Look(nn.Module):
         start = {
             "alpha": torch.ones(4),
             "bands": torch.ones(BLURS + 1),
+            "texture": torch.ones(BLURS),
             "curves": torch.linspace(0, 1, knots).expand(3, -1),
             "matrix": torch.eye(3),
             "saturation": torch.ones(5),
-            "local": torch.zeros(4),
+            "local": torch.zeros(STRENGTHS),
         } | given
         for name, value in start.items():
             check_part(value, name, 1)
@@ -93,8 +96,9 @@ class Look(nn.Module):
         elif operator is None:
             near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
             operator = nonlocal_operator(reduce_channels(image, "luminance"), **near | self.options)
-        if not acts(used["bands"]):
-            del used["bands"]
+        for name in ("bands", "texture"):
+            if not acts(used[name]):
+                del used[name]
         if not acts(used["local"], 0.0):
             del used["local"]
         return filter_look(image, operator=operator, **used)

@@ -6,7 +6,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.core.checks import check_alpha, check_image, check_same_size, check_tensor, check_weight, described
+from nlfilter_torch.core.checks import (
+    check_alpha,
+    check_image,
+    check_same_size,
+    check_tensor,
+    check_unit_range,
+    check_weight,
+    described,
+)
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.parameters import as_vectors, check_learn
@@ -193,6 +201,7 @@ class NonlocalFilter(nn.Module):
         if mask is not None:
             check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]), empty=len(image) == 0)
             check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
+            check_unit_range(mask, "mask")
         rows = self.sliders.alpha if alpha is None else alpha
         own_rows = alpha is None and rows.ndim == 2
         if own_rows and mask is None:

@@ -1,0 +1,87 @@
+"""Time and memory of fitting looks: ``python -m benchmarks.look_costs [--megapixels 1] [--pairs 100]``.
+
+Processor and wall seconds of one pair edited by Pillow, and by sliders of this library, which are to be found to 1e-3
+through 8 bits; then the most memory that one pair needs, and that many pairs need, beyond what the process has at the
+start. The photograph is scikit-image's cat, enlarged, and shifted for each of many pairs. Linux only.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from benchmarks.looks import EDITS, applied
+from benchmarks.memory import forget_peak, resident
+from benchmarks.whole import photograph
+from nlfilter_torch import fit_look
+from nlfilter_torch.edits.applying import apply_step
+from nlfilter_torch.edits.steps import Step
+
+ALPHA = (2.2, 1.6, 1.3, 1.02)
+SLIDERS = "sliders of this library"
+NAMES = ("gamma (scikit-image)", "unsharp (Pillow)", "CLAHE (OpenCV)", SLIDERS)
+
+
+def edited(name: str, image: Tensor) -> Tensor:
+    """A photograph (1, 3, H, W) in 8 bits under an edit."""
+    if name != SLIDERS:
+        return applied(EDITS[name][1], image)
+    step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0)
+    return (apply_step(step, image).clamp(0, 1) * 255).round() / 255
+
+
+def told(name: str, image: Tensor, repeats: int) -> str:
+    """How long a look takes, the least of some times, and how exact sliders are."""
+    after, processor, wall = edited(name, image), [], []
+    for _ in range(repeats):
+        started, ran = time.perf_counter(), time.process_time()
+        found = fit_look([(image, after)])
+        processor.append(time.process_time() - ran)
+        wall.append(time.perf_counter() - started)
+    told = f"{name:26}{min(processor):6.2f} processor s {min(wall):6.2f} wall s"
+    if name != SLIDERS or isinstance(found, tuple):
+        return told
+    error = (torch.tensor(found.step["alpha"]) - torch.tensor(ALPHA)).abs().max()
+    return f"{told}, alpha off by {float(error):.1e} at most"
+
+
+def shifted(image: Tensor, count: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Pairs, one at a time."""
+    for number in range(count):
+        moved = image.roll(7 * number, 3)
+        yield moved, edited("gamma (scikit-image)", moved)
+
+
+def peak(image: Tensor, count: int) -> float:
+    """The most memory in MiB that the fit of so many pairs needs."""
+    forget_peak()
+    before = resident("VmRSS")
+    fit_look(shifted(image, count))
+    return resident("VmHWM") - before
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--megapixels", type=float, default=1.0, help="of the pair that is timed")
+    parser.add_argument("--pairs", type=int, default=100, help="that memory is measured with")
+    parser.add_argument("--small", type=float, default=0.1, help="megapixels of these")
+    parser.add_argument("--repeats", type=int, default=3, help="of each time, of which the least is printed")
+    parser.add_argument("--quick", action="store_true", help="small pictures, and few of them")
+    options = parser.parse_args()
+    if options.quick:
+        options.megapixels, options.pairs, options.small, options.repeats = 0.005, 2, 0.005, 1
+    image = (photograph(options.megapixels) * 255).round() / 255
+    fit_look([(image, image**0.9)])  # loads what is loaded once
+    for name in NAMES:
+        print(told(name, image, options.repeats), flush=True)
+    small = (photograph(options.small) * 255).round() / 255
+    peak(small, 1)
+    for count in (1, options.pairs):
+        print(f"{count:4d} pairs of {options.small:g} megapixels: {peak(small, count):7.1f} MiB", flush=True)
+
+
+if __name__ == "__main__":
+    main()

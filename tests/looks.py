@@ -1,0 +1,34 @@
+"""Pictures, edits and measurements for tests of looks."""
+
+import skimage.data
+import torch
+from torch import Tensor
+
+from nlfilter_torch import FittedLook
+from nlfilter_torch.edits.steps import Step
+
+ALPHA = (2.2, 1.6, 1.3, 1.02)
+SEPIA = (0.393, 0.769, 0.189, 0.349, 0.686, 0.168, 0.272, 0.534, 0.131)
+FEW = Step("look", landmarks=40)
+
+
+def rgb(name: str, rows: slice, columns: slice) -> Tensor:
+    return torch.from_numpy(getattr(skimage.data, name)()[rows, columns].copy()).permute(2, 0, 1)[None].float() / 255
+
+
+CAT = rgb("chelsea", slice(60, 140), slice(100, 200))
+CUP = rgb("coffee", slice(100, 180), slice(150, 250))
+SUIT = rgb("astronaut", slice(60, 140), slice(150, 250))
+
+
+def in_bytes(image: Tensor) -> Tensor:
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+def one(found: FittedLook | tuple[FittedLook, ...]) -> FittedLook:
+    assert isinstance(found, FittedLook)
+    return found
+
+
+def explained(before: Tensor, after: Tensor, found: Tensor) -> float:
+    return 1 - float((after - found.clamp(0, 1)).square().sum() / (after - before).square().sum())
