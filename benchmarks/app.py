@@ -129,7 +129,7 @@ def at_full_size(path: Path) -> None:
 
 def in_the_browser(path: Path) -> None:
     """From the pointer's move to the picture in the page."""
-    from tests.browser import Editor, Tab, chromium
+    from tests.app.browser import Editor, Tab, chromium
 
     editor = Editor(path.parent, path.name, threads=torch.get_num_threads())
     try:

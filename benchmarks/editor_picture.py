@@ -8,7 +8,7 @@ import skimage.data
 import torch
 
 from nlfilter_torch.io.photographs import Photograph, write_photograph
-from tests.browser import Editor, Tab, chromium
+from tests.app.browser import Editor, Tab, chromium
 
 
 def main() -> None:

@@ -5,6 +5,9 @@ grey levels between the picture on the screen, before it becomes a JPEG, and the
 each edit the mean over all photographs and strides and the largest, the mean of each stride, and by how much the edit
 changes the picture.
 
+G'MIC and darktable do the same if they are installed (``--peers``): G'MIC edits the photograph and its reduction, and
+darktable exports it in a smaller size from its fast pipeline, which its own preview uses, and from its full one.
+
 A photograph is resized to ``stride`` times the side of the preview, and the viewing size has the proportion to the
 preview that it has in the editor, 1, so that small previews show what large ones would; ``--pixels 1500000`` measures
 these.
@@ -13,15 +16,19 @@ these.
 import argparse
 import math
 import statistics
+import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
+import tifffile
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks import editors
 from benchmarks.photographs import pictures
 from nlfilter_torch.app.preview import PIXELS
 from nlfilter_torch.app.session import Session
@@ -35,6 +42,7 @@ from nlfilter_torch.io.photographs import Photograph, read_photograph, write_pho
 
 NAMES = ("chelsea", "coffee", "rocket", "motorcycle", "astronaut", "retina")
 HERE, THERE = ((0.45, 0.5), (0.52, 0.5)), ((0.1, 0.1), (0.16, 0.1))
+FILES = ("small.tif", "whole.tif")
 SOFTER = tuple((i / 16) ** 0.9 for i in range(17))
 EDITS = {
     "detail": Step("detail", alpha=(2.0, 2.0, 2.0, 1.0)),
@@ -89,6 +97,38 @@ def errors(picture: Tensor, pixels: int, stride: int, recipes: dict[str, Recipe]
             yield name, levels(shown - saved), levels(saved - session.preview.pixels.clamp(0, 1))
 
 
+def errors_of_peers(picture: Tensor, pixels: int, stride: int) -> Iterator[tuple[str, float, float]]:
+    """:func:`errors` of the other editors that are installed."""
+    photograph = sized(picture, pixels, stride)
+    height, width = (length // stride for length in photograph.shape[-2:])
+    small = resize(photograph, (height, width)).clamp(0, 1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, image in (("whole.tif", photograph), ("small.tif", small)):
+            write_photograph(Photograph(image, "uint16"), folder / file)
+        reduced = ("--width", str(width), "--height", str(height), "--hq")
+        for peer, command in editors.installed().items():
+            if peer == "gmic":
+                shown, saved = (edited(command(folder / file, folder / "out.tif", folder)) for file in FILES)
+                saved = resize(saved, (height, width)).clamp(0, 1)
+            else:
+                shown, saved = (
+                    edited(command(folder / "whole.tif", folder / "out.tif", folder, *reduced, quality)).clamp(0, 1)
+                    for quality in ("false", "true")
+                )
+            yield f"{peer}, nearest to detail", levels(shown - saved), levels(saved - small)
+
+
+def edited(command: list[str]) -> Tensor:
+    """The picture (1, 3, H, W) that a command writes to ``out.tif`` in the folder of its input."""
+    target = Path(command[1]).with_name("out.tif")
+    target.unlink(missing_ok=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if not target.exists():
+        raise SystemExit(f"{command[0]} wrote no file: {done.stdout}{done.stderr}")
+    return torch.from_numpy(tifffile.imread(target)).permute(2, 0, 1)[None]
+
+
 def levels(difference: Tensor) -> float:
     """Root mean square in grey levels of 255."""
     return float(255 * difference.square().mean().sqrt())
@@ -101,6 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--pixels", type=int, default=150_000, help="of the preview, at most")
     parser.add_argument("--strides", type=int, nargs="+", default=[2, 3, 5, 8])
     parser.add_argument("--edits", nargs="+", choices=RECIPES, default=list(RECIPES), metavar="EDIT")
+    parser.add_argument("--peers", action="store_true", help="G'MIC and darktable, too")
     parser.add_argument("--most", type=int, default=6, help="photographs")
     parser.add_argument("--quick", action="store_true", help="one photograph, a small preview of stride 2")
     options = parser.parse_args(arguments)
@@ -108,11 +149,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.pixels, options.strides, options.most = 6_000, [2], 1
     recipes = {name: RECIPES[name] for name in options.edits}
     found = list(pictures(options.pictures, 1 << 20, NAMES).items())[: options.most]
-    results: dict[str, dict[int, list[tuple[float, float]]]] = {name: {} for name in recipes}
+    results: dict[str, dict[int, list[tuple[float, float]]]] = {}
     for stride in options.strides:
         for title, picture in found:
-            for name, error, change in errors(picture, options.pixels, stride, recipes):
-                results[name].setdefault(stride, []).append((error, change))
+            peers = errors_of_peers(picture, options.pixels, stride) if options.peers else ()
+            for name, error, change in chain(errors(picture, options.pixels, stride, recipes), peers):
+                results.setdefault(name, {}).setdefault(stride, []).append((error, change))
                 print(f"{title}, stride {stride}, {name}: {error:.2f} of {change:.1f}", flush=True)
     print(f"\n{len(found)} photographs, previews of {options.pixels} pixels, {torch.get_num_threads()} threads")
     strides = "".join(f"{f'stride {stride}':>10}" for stride in options.strides)

@@ -1,7 +1,8 @@
 """Every command from the start of its process to its file: ``python -m benchmarks.whole [--megapixels 0.3 1 12 24]``.
 
 Prints processor and wall seconds and the most memory that the process had at once, as the kernel accounts for them.
-``--quick`` runs two of them on a picture of 4,000 pixels.
+Beside ``detail``, G'MIC and darktable do the task nearest to it, if they are installed. ``--quick`` runs two commands
+on a picture of 4,000 pixels.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import skimage.data
 import torch
 import torch.nn.functional as F
 
+from benchmarks import editors
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
@@ -69,8 +71,8 @@ def prepare(folder: Path, megapixels: float) -> None:
     (folder / "edit.json").write_text(recipe.to_json())
 
 
-def measure(command: str, folder: Path) -> tuple[float, float, float]:
-    """Processor and wall seconds of a command, and its peak memory in MB.
+def measure(command: str, call: list[str], folder: Path) -> tuple[float, float, float]:
+    """Processor and wall seconds of a call of a command, and its peak memory in MB.
 
     Raises:
         SystemExit: if it fails, with what it said.
@@ -78,11 +80,7 @@ def measure(command: str, folder: Path) -> tuple[float, float, float]:
     (folder / "out").mkdir()
     start = time.perf_counter()
     with (folder / "said.txt").open("w") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "nlfilter_torch", command, *arguments_of(command, folder)],
-            stdout=said,
-            stderr=subprocess.STDOUT,
-        )
+        process = subprocess.Popen(call, stdout=said, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
     wall = time.perf_counter() - start
@@ -104,14 +102,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.quick:
         options.megapixels = [0.004]
         options.commands = [command for command in options.commands if command in ("detail", "presets")]
-    print(f"{'':12}{'megapixels':>11}{'CPU s':>9}{'wall s':>9}{'peak MB':>10}")
+    peers = editors.installed() if "detail" in options.commands else {}
+    print(f"{'':14}{'megapixels':>11}{'CPU s':>9}{'wall s':>9}{'peak MB':>10}")
     for megapixels in options.megapixels:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
             prepare(folder, megapixels)
-            for command in options.commands:
-                cpu, wall, peak = measure(command, folder)
-                print(f"{command:12}{megapixels:11.3g}{cpu:9.1f}{wall:9.1f}{peak:10.0f}", flush=True)
+            calls = {
+                command: [sys.executable, "-m", "nlfilter_torch", command, *arguments_of(command, folder)]
+                for command in options.commands
+            }
+            files = folder / "photo.jpg", folder / "out" / "out.png"
+            calls |= {name: peer(*files, folder) for name, peer in peers.items()}
+            for command, call in calls.items():
+                cpu, wall, peak = measure(command, call, folder)
+                print(f"{command:14}{megapixels:11.3g}{cpu:9.1f}{wall:9.1f}{peak:10.0f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Editing a folder by several processes: each photograph once, broken ones reported, interrupted work resumed."""
 
+import contextlib
 import json
 import os
 import signal
@@ -14,8 +15,9 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from nlfilter_torch.cli import folders, main
-from nlfilter_torch.cli.folders import DEATHS, RECORD, Tally, edit_folder, pictures, prepare
+from nlfilter_torch.cli import folders, main, workers
+from nlfilter_torch.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
+from nlfilter_torch.cli.workers import DEATHS
 from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.io.photographs import open_beside
 
@@ -96,23 +98,30 @@ def test_two_hundred_killed_in_the_middle(tmp_path: Path) -> None:
     assert abs(np.asarray(Image.open(target / "008.png")) - alone).max() <= 1  # rounding depends on threads
 
 
-@pytest.mark.client("Dask", "edits folders: `nlfilter-torch batch --cluster`")
+@pytest.mark.client("Dask", "edits folders and zarr arrays: `--cluster`")
+@pytest.mark.client("Ray", "edits folders and zarr arrays: `--cluster ray://host:10001`")
 @pytest.mark.slow
-def test_a_cluster_of_which_a_worker_is_killed(tmp_path: Path) -> None:
-    """Dask gives the file of a dead worker to another one; broken files are named, and those there are left alone."""
-    distributed = pytest.importorskip("distributed")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:ray", "ignore::FutureWarning:ray", "ignore::ResourceWarning")
+@pytest.mark.parametrize("engine", ["distributed", "ray"])
+def test_a_cluster_of_which_a_worker_is_killed(engine: str, tmp_path: Path) -> None:
+    """The file of a dead worker is given to another one; broken files are named, and those there are left alone."""
+    package = pytest.importorskip(engine, reason=f"{engine} is not installed")
     paths = plain_files(tmp_path / "in", 6)
     prepare(paths, tmp_path / "out", {})
     (tmp_path / "out" / "5.png").write_text("before")
     tally, told = Tally(), list[str]()
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with contextlib.ExitStack() as stack:
+        address = "ray:local"
+        if engine == "distributed":
+            cluster = package.LocalCluster(2, threads_per_worker=1, dashboard_address=None)
+            address = stack.enter_context(cluster).scheduler_address
         edit_folder(
             paths,
             tmp_path / "out",
             die_once_in_a_cluster,
             workers=1,
             threads=1,
-            cluster=cluster.scheduler_address,
+            cluster=address,
             tell=told.append,
             begin=lambda name: None,
             tally=tally,
@@ -135,15 +144,15 @@ def die_once_in_a_cluster(source: str, target: str) -> None:
     Path(target).write_bytes(Path(source).read_bytes())
 
 
-@pytest.mark.parametrize("workers", [(), ("--workers", 2)])
+@pytest.mark.parametrize("more", [(), ("--workers", 2)])
 def test_a_cluster_that_does_not_answer(
-    workers: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    more: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
     fill(tmp_path / "in", 1)
-    monkeypatch.setattr(folders, "CONNECTING", 0.2)
-    sentence = refused(capsys, tmp_path / "in", tmp_path / "out", "--cluster", "tcp://127.0.0.1:9", *workers)
-    wanted = "--workers are those of the cluster" if workers else "--cluster must be the address of a Dask scheduler"
+    monkeypatch.setattr(workers, "CONNECTING", 0.2)
+    sentence = refused(capsys, tmp_path / "in", tmp_path / "out", "--cluster", "tcp://127.0.0.1:9", *more)
+    wanted = "--workers are those of the cluster" if more else "--cluster must be the address of a Dask scheduler"
     assert wanted in sentence
 
 
@@ -205,7 +214,7 @@ def run_for_ever(folder: str, target: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_workers_end_with_the_process_that_hired_them(number: signal.Signals, tmp_path: Path) -> None:
+def test_workers_end_with_the_process_that_started_them(number: signal.Signals, tmp_path: Path) -> None:
     """After an interrupt, which a terminal sends to all of them, no half file is left."""
     plain_files(tmp_path / "in", 2)
     script = "import sys; from tests.test_batch import run_for_ever; run_for_ever(*sys.argv[1:])"

@@ -47,6 +47,33 @@ def detail(*arguments: object) -> int:
     return main(["detail", *map(str, arguments), "--landmarks", "40"])
 
 
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "note"), [(tifffile.FILETYPE.REDUCEDIMAGE, False), (tifffile.FILETYPE.PAGE, True)], ids=["reduced", "page"]
+)
+def test_of_several_pages_the_first_is_edited(
+    tmp_path: Path,
+    kind: int,
+    note: bool,
+    tiled: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A reduced version of the photograph is no further page."""
+    if tiled:
+        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+    picture = cat(40, 60, 3)
+    with tifffile.TiffWriter(tmp_path / "in.tif") as file:
+        file.write(picture, photometric="rgb")
+        file.write(picture[::2, ::2], photometric="rgb", subfiletype=kind)
+    assert detail(tmp_path / "in.tif", tmp_path / "out.tif") == 0
+    said = capsys.readouterr().err
+    assert (f"note: {tmp_path / 'in.tif'} has 2 pages, of which only the first is read" in said) == note
+    assert said.count("note: ") == note
+    assert tifffile.imread(tmp_path / "out.tif").shape == picture.shape
+
+
 @pytest.mark.parametrize("suffix", [".tif", ".png"])
 @pytest.mark.parametrize("options", [(), ("--channels", "all", "--depth", "8"), ("--region", "40,60,20,20:0,1,1,1")])
 def test_detail_by_rows_is_detail(photo: Path, tmp_path: Path, suffix: str, options: tuple[str, ...]) -> None:
@@ -247,13 +274,12 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from nlfilter_torch.tiled import pictures, tiles\n"
-        "from nlfilter_torch.tiled.source import Tiled\n"
         "def slow(original):\n"
-        "    def edit(*arguments):\n"
-        "        time.sleep(0.2)\n"
-        "        return original(*arguments)\n"
-        "    return edit\n"
-        "Tiled.edited, tiles.TILE_PIXELS = slow(Tiled.edited), 300\n"
+        "    def edited(tiling, tile):\n"
+        "        time.sleep(0.2 * tiling.transparent)\n"  # in the last pass, which writes
+        "        return original(tiling, tile)\n"
+        "    return edited\n"
+        "tiles.Tiling._edited, tiles.TILE_PIXELS = slow(tiles.Tiling._edited), 300\n"
         "tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000\n"
         "from nlfilter_torch.cli import main\n"
         "sys.exit(main(sys.argv[1:]))\n"

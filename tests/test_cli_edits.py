@@ -10,11 +10,15 @@ from PIL import Image
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.cli.scribbles import Rectangle, selection
+from nlfilter_torch.edits.declaration import Edit
+from nlfilter_torch.edits.parameters import EDITS, MASK
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.io.rows import open_picture
 
 HEIGHT, WIDTH = 48, 64
 LANDMARKS = ("--landmarks", "40")
+TECHNICAL = ["--bandwidth", "--spatial-bandwidth", "--patch-size", "--landmarks", "--sampling"]
+TECHNICAL += ["--tolerance", "--reach", "--viewing-size", "--residual"]
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +82,9 @@ def test_recolor(photo: Path, strokes: Path, pixels: torch.Tensor) -> None:
     assert is_written(run("recolor", photo, "--strokes", strokes, "--keep", "40,30,8,8", "--reach", 0.5), held)
 
 
-def test_colorize(photo: Path, strokes: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
+def test_colorize(
+    photo: Path, strokes: Path, pixels: torch.Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Grey files become colour files; a photograph in colour is converted to grey first."""
     grey = (pixels * torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
     write_photograph(Photograph(grey, "uint16", icc=b"a profile for grey"), tmp_path / "grey.png")
@@ -87,7 +93,9 @@ def test_colorize(photo: Path, strokes: Path, pixels: torch.Tensor, tmp_path: Pa
         wanted = colorize(grey, GREEN * mask, mask, method=method, strength=0.7, num_landmarks=40, generator=seeded())
         arguments = ("--strokes", strokes, "--method", method, "--strength", 0.7)
         assert (run("colorize", tmp_path / "grey.png", *arguments) - wanted).abs().max() < 1e-3
+        assert "note" not in capsys.readouterr().err
         assert (run("colorize", photo, *arguments) - wanted).abs().max() < 1 / 255
+        assert f"note: {photo} is in colour: colorize replaces its colours everywhere" in capsys.readouterr().err
     assert main(["colorize", str(tmp_path / "grey.png"), str(tmp_path / "c.png"), "--strokes", str(strokes)]) == 0
     found = read_photograph(tmp_path / "c.png")
     assert (found.depth, found.icc) == ("uint16", None)
@@ -154,6 +162,30 @@ def test_depth_and_transparency_are_kept(tmp_path: Path, pixels: torch.Tensor) -
     assert torch.equal(found.alpha, stored.alpha)
     assert main(["tone", str(tmp_path / "deep.png"), str(tmp_path / "out.tif"), "--depth", "float", *LANDMARKS]) == 0
     assert read_photograph(tmp_path / "out.tif").depth == "float32"
+
+
+@pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
+def test_photographic_options_come_first_in_the_help(edit: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    """Settings of the filter, and those of files and memory, are in sections of their own."""
+    assert main([edit.name, "--help"]) == 0
+    shown = capsys.readouterr().out
+    names = (None, "Filter", "Files and memory")
+    starts = [shown.index(f"─ {name or 'Options'} ─") for name in names]
+    assert starts == sorted(starts)
+    sections = {name: shown[a:b] for name, a, b in zip(names, starts, [*starts[1:], len(shown)], strict=True)}
+    for parameter in edit:
+        option = f"--{parameter.name.replace('_', '-')}"
+        assert (option in sections[parameter.panel]) == parameter.is_option
+        assert (parameter.panel == "Filter") == (option in TECHNICAL)
+    assert "--seed" in sections["Filter"]
+    assert all(option in sections["Files and memory"] for option in ("--depth", "--memory", "--full"))
+
+
+def test_help_of_the_mask_says_what_is_written(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mask", "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "a grey picture of the photograph's size, white in the selected area" in shown
+    assert ".tif (16 bits), .png, .jpg, .webp, .avif (8 bits) or .pfm (floats)" in shown
 
 
 @pytest.mark.parametrize("verb", ["recolor", "colorize", "defocus", "abstract", "denoise", "sharpen", "tone"])

@@ -85,7 +85,9 @@ def test_colours_notes_and_a_picture(
 
 def test_a_scribble_over_unlike_things(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["recolor", str(photo), str(tmp_path / "out.png"), "--region", "40,28,18,8:blue"]) == 0
-    assert "note: --region 40,28,18,8 covers very different colours" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "note: --region 40,28,18,8 covers very different colours" in said
+    assert "mark each part separately, with a smaller --region on each, and check them with --show FILE" in said
 
 
 @pytest.mark.parametrize(

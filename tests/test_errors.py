@@ -108,6 +108,14 @@ def test_values_whose_sum_overflows_are_finite() -> None:
     check_finite(image, "image")
 
 
+@pytest.mark.parametrize(
+    "function", [name for name, (argument, _) in TAKE_AN_IMAGE.items() if argument not in ("guide", "mask")]
+)
+def test_images_on_another_device(function: str) -> None:
+    name, call = TAKE_AN_IMAGE[function]
+    raises(lambda: call(noise(2, 1, 8, 9).to("meta")), ValueError, f"{name} must be on the device of the ")
+
+
 @pytest.mark.parametrize("function", [name for name, (argument, _) in TAKE_AN_IMAGE.items() if argument != "guide"])
 def test_images_of_another_size_or_batch(function: str) -> None:
     name, call = TAKE_AN_IMAGE[function]

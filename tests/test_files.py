@@ -223,7 +223,8 @@ def test_stored_kinds_are_made_plain(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "big.tif", rgba, photometric="rgb", extrasamples=[2], bigtiff=True, **bare)
     same(read_photograph(tmp_path / "big.tif"), photograph(rgba))
     tifffile.imwrite(tmp_path / "pages.tif", np.stack([rgba, rgba // 2]), photometric="rgb", extrasamples=[2], **bare)
-    same(read_photograph(tmp_path / "pages.tif"), photograph(rgba))
+    with pytest.warns(UserWarning, match="pages.tif has 2 pages, of which only the first is read; save the others"):
+        same(read_photograph(tmp_path / "pages.tif"), photograph(rgba))
     rgb = Image.fromarray(np.full((16, 16, 3), 90, np.uint8))
     rgb.save(tmp_path / "jpeg.tif", compression="jpeg")
     torch.testing.assert_close(read_photograph(tmp_path / "jpeg.tif").pixels, torch.full((1, 3, 16, 16), 90 / 255))

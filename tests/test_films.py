@@ -327,8 +327,8 @@ def test_films_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "does not exist; check the name" in refused(capsys, tmp_path / "none.mp4", out)
     assert "holds no video stream that can be decoded" in refused(capsys, tmp_path / "sound.mp4", out)
     assert "must have an even width and height to be stored as yuv420p, got 63x49" in refused(capsys, odd, out)
-    assert "must end in .mp4 or .mov, got '.avi'" in refused(capsys, film, tmp_path / "out.avi")
-    assert "must be a film (.mp4 or .mov) or a folder" in refused(capsys, Path(__file__), out)
+    assert "must end in .mp4, .m4v or .mov, got '.avi'" in refused(capsys, film, tmp_path / "out.avi")
+    assert "must be a film (.mp4, .m4v or .mov) or a folder" in refused(capsys, Path(__file__), out)
     assert not out.exists()
     assert not list(tmp_path.glob(".*.part"))
 

@@ -90,7 +90,7 @@ def test_gradients_reach_frame_and_reference() -> None:
         operator = nonlocal_operator(reference, photometric_bandwidth=0.5, num_landmarks=8, landmarks="uniform")
         return fit_filter(operator, reference)(frame, alpha, residual=0.5)
 
-    assert torch.autograd.gradcheck(way, (reference, frame, ALPHA.clone().requires_grad_()))
+    assert torch.autograd.gradcheck(way, (reference, frame, ALPHA.clone().requires_grad_()), fast_mode=True)
 
 
 def pan(count: int, step: int, height: int = 100, width: int = 120) -> list[torch.Tensor]:
@@ -165,7 +165,7 @@ def test_frames_are_read_one_at_a_time() -> None:
             {"references": [*pan(1, 1, 20, 20), *pan(1, 1, 20, 21)]},
             "references must have the height and width of the first",
         ),
-        ({"references": [torch.rand(2, 1, 9, 9)]}, "references must have batch size 1 or 1, got 2"),
+        ({"references": [torch.rand(2, 1, 9, 9)]}, "references must have batch size 1, got 2"),
     ],
 )
 def test_bad_references(arguments: dict, sentence: str) -> None:

@@ -42,6 +42,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "lloyd": (features, landmarks, 3, 1e-6),
         "invert": (factor @ factor.mT + torch.eye(LANDMARKS, dtype=dtype),),
         "choose": (features, 1, PIXELS, LANDMARKS, "kmeans"),
+        "without": (factor, norms > norms.median()),
         "settle": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
 

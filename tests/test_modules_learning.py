@@ -199,6 +199,7 @@ def test_bad_construction_is_one_clear_sentence(
         (lambda f: f(image(), alpha=torch.ones(2, 2, 2)), ValueError, "alpha must have shape"),
         (lambda f: f(image(), guide=image(batch=3)), ValueError, "batch size"),
         (lambda f: f(image(), mask=torch.ones(2, 1, 5, 5)), ValueError, "mask must have the height and width"),
+        (lambda f: f(image(), mask=1.5 * torch.ones_like(image())), ValueError, r"mask must be in \[0, 1\]"),
         (lambda f: f(image().to(torch.float8_e4m3fn)), TypeError, "must have a floating-point dtype .*float8"),
         (lambda f: f(image(), guide=image().to(torch.int32)), TypeError, "guide must have a floating-point dtype"),
         (lambda f: f(image().to(torch.complex64)), TypeError, "must have a floating-point dtype"),

@@ -289,6 +289,35 @@ def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
     assert torch.equal(read_photograph(out).pixels, read_photograph(tmp_path / "same.png").pixels)
 
 
+@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.parametrize(
+    ("step", "sentence"),
+    [
+        (Step.idle("tone"), "edit.json holds no step that changes anything: the photograph is written as it is"),
+        (COLORIZE, "in.png is in colour: colorize replaces its colours everywhere by those of the scribbles"),
+    ],
+    ids=["idle", "colorize"],
+)
+def test_apply_notes(
+    pixels: torch.Tensor,
+    tmp_path: Path,
+    step: Step,
+    sentence: str,
+    tiled: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if tiled:
+        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+    write_photograph(Photograph(pixels), tmp_path / "in.png")
+    (tmp_path / "edit.json").write_text(Recipe((step,)).to_json(drawn=True))
+    files = [str(tmp_path / name) for name in ("in.png", "out.png", "edit.json")]
+    assert main(["apply", *files[:2], "--preset", files[2]]) == 0
+    (note,) = capsys.readouterr().err.splitlines()
+    assert sentence in note
+    assert read_photograph(files[1]).size == (48, 64)
+
+
 def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["apply", "in.png", str(tmp_path / "out.png"), "--preset", "nothing"]) == 2
     assert "nothing is neither a file nor one of the presets" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import balance_in_memory, change_luminance
-from nlfilter_torch.edits.detail import held_back, split_sliders
+from nlfilter_torch.edits.detail import limit_by_activity, split_sliders
 from nlfilter_torch.edits.resizing import resize, resized
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
@@ -144,9 +144,9 @@ def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
 def test_calm_areas_are_strengthened_less_and_smoothed_alike() -> None:
     changes = torch.tensor([0.4, 0.1]).view(1, 2, 1, 1).expand(1, 2, 1, 3)
     variance = torch.tensor([0.0, 1e-4, 1.0]).view(1, 1, 1, 3)
-    found = held_back(changes, variance, 0.01).flatten()
+    found = limit_by_activity(changes, variance, 0.01).flatten()
     torch.testing.assert_close(found, torch.tensor([0.1, 0.3, 0.5]), atol=1e-4, rtol=0)
-    assert torch.equal(held_back(changes, variance, 0.0), torch.full((1, 1, 1, 3), 0.5))
+    assert torch.equal(limit_by_activity(changes, variance, 0.0), torch.full((1, 1, 1, 3), 0.5))
     added, rest = split_sliders(torch.tensor([0.5, -0.5, 2.0, 0.3]))
     assert added.tolist() == [0.5, 0.0, 2.0, 0.0]
     assert (added + rest).tolist() == pytest.approx([0.5, -0.5, 2.0, 0.3])

@@ -258,6 +258,8 @@ class Editor:
         self.follow()
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")
+            if opened.pages > 1:
+                ui.notify(f"{opened.name} has several pages; the first is shown.", position="bottom-left", timeout=8000)
             if self.session.recipe != Recipe():
                 ui.notify("The edit is as you left it. Reset begins anew.", position="bottom-left", timeout=4000)
 
@@ -284,7 +286,7 @@ class Editor:
 
     async def _ask(self, title: str, name: str, check: Callable[[str], Path], save: Save) -> None:
         """Ask for a name that passes a check, and whether to replace a file of that name, and save."""
-        with self._client, ui.dialog() as dialog, ui.card().classes("dialog"):
+        with self._client, ui.dialog().props(f'aria-label="{title}"') as dialog, ui.card().classes("dialog"):
             ui.label(title).classes("text-h6")
             field = ui.input("Name", value=name).props("outlined autofocus").classes("w-full")
             note = ui.label(f"In {self.session.folder.resolve()}").classes("hint")

@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.applying import prepare, scribbles_of, seeded, shared
+from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
 from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, nearby_or_far
-from nlfilter_torch.edits.detail import activity, change_of_mean, held_back, split_sliders
+from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.recipe import Recipe
@@ -101,7 +101,7 @@ class Preview:
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
         order = len(detail["alpha"]) - 1
-        key = (*shared(detail), detail["viewing_size"], order)
+        key = (*filter_key(detail), detail["viewing_size"], order)
         if self._layers is None or self._layers.key != key:
             stride, shown = self._compared(detail)
             luminance = reduce_channels(shown, "luminance")
@@ -213,7 +213,7 @@ class Preview:
         found = changes(detail["alpha"])
         if mask is not None:
             found = torch.lerp(found, changes(detail.sliders_inside), mask)
-        change = held_back(found, self._activity(detail), detail["threshold"] / 255)
+        change = limit_by_activity(found, self._activity(detail), detail["threshold"] / 255)
         rows = [detail["alpha"], detail.sliders_inside]
         brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
         balance = None
@@ -227,7 +227,7 @@ class Preview:
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""
-        key = (*before, step.edit, *shared(step))
+        key = (*before, step.edit, *filter_key(step))
         if self._filter is not None and self._filter[0] == key:
             return self._filter[1]
         if keep:

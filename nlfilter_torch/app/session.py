@@ -10,10 +10,10 @@ from torch import Tensor
 
 from nlfilter_torch.app.preview import PIXELS, Preview
 from nlfilter_torch.app.sidecar import Sidecar
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, thin
+from nlfilter_torch.io import tiff
 from nlfilter_torch.io.photographs import (
     BITS,
     DEPTHS,
@@ -21,28 +21,31 @@ from nlfilter_torch.io.photographs import (
     Photograph,
     check_memory,
     check_output,
+    first_bytes,
     open_beside,
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import FIFTH, modest_memory
+from nlfilter_torch.io.rows import FIFTH, tile_memory
 from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
-from nlfilter_torch.tiled.sampling import Report
-from nlfilter_torch.tiled.tiles import Passes, in_silence
+from nlfilter_torch.tiled.sampling import Report, in_silence
+from nlfilter_torch.tiled.tiles import Passes
 
 SPACING = 0.2  # of the points of a stroke, as a share of its radius
 UNDOS = 100
+OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
 
 
 @dataclass(frozen=True)
 class Opened:
-    """An open photograph, the name of its file, its preview, and parts of it at full size."""
+    """An open photograph, the name of its file, its preview, parts of it at full size, and the pages of the file."""
 
     name: str
     photograph: Photograph
     preview: Preview
     parts: Parts
+    pages: int = 1
 
 
 class Session:
@@ -82,14 +85,14 @@ class Session:
                 which ``path`` may be a copy.
         """
         try:
-            # At least as much memory as saving will need.
-            photograph = read_photograph(path, bytes_per_pixel=working_bytes(100, 5))
+            photograph = read_photograph(path, bytes_per_pixel=OPEN_BYTES)
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
         if self.opened is not None:
             self.opened.parts.close()
         parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), "the photograph")
-        self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels), parts)
+        pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
+        self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels), parts, pages)
         self.recipe = self._shown = self.saved = Recipe()
         self._past, self._future = [], []
 
@@ -223,7 +226,7 @@ class Session:
         passes = Passes(
             str(photograph.pixels.numpy().dtype),
             "sample" if needs_tiles(recipe, photograph) else "full",
-            memory=modest_memory(),
+            memory=tile_memory(),
             report=report,
         )
         with self._fitting:
@@ -292,9 +295,9 @@ class Session:
 
     @staticmethod
     def _in_tiles(recipe: Recipe, photograph: Photograph, folder: Path, report: Report) -> Tensor:
-        """The edited pixels, from as much memory as an edit takes without being asked."""
+        """The edited pixels, within the memory that an edit in tiles uses if no limit is given."""
         rows = photograph.pixels[0].permute(1, 2, 0).numpy()
-        passes = Passes(str(rows.dtype), memory=modest_memory(), report=report, folder=folder)
+        passes = Passes(str(rows.dtype), memory=tile_memory(), report=report, folder=folder)
         channels = 3 if recipe.gives_colour else rows.shape[2]
         pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
         for part, values in edit_rows(passes, rows, recipe, "the photograph"):

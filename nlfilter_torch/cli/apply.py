@@ -1,5 +1,6 @@
 """``nlfilter-torch apply``: apply a saved edit to a photograph."""
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
@@ -14,16 +15,8 @@ Edits = Annotated[
         "--preset",
         metavar="FILE|NAME",
         help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, or the name of a "
-        "preset (see `nlfilter-torch presets`). May be given several times, each with a --mask.",
-    ),
-]
-Masks = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--mask",
-        metavar="FILE",
-        help="A grey picture of the size of the photograph, white where the --preset of the same number applies; the "
-        "rest stays unchanged.",
+        "preset (see `nlfilter-torch presets`). May be repeated, each time with the --mask of its region; the rest of "
+        "the photograph stays unchanged.",
     ),
 ]
 
@@ -32,10 +25,12 @@ def apply(
     source: options.Source,
     target: options.Target,
     preset: Edits,
-    mask: Masks = None,
+    mask: options.Masks = None,
     depth: options.OutputDepth = None,
     memory: options.Memory = None,
     full: options.Full = False,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
 ) -> None:
     """Apply an edit saved in the browser to a photograph, including its sliders and strokes.
 
@@ -55,23 +50,33 @@ def apply(
 
     from torch import Tensor
 
-    from nlfilter_torch.cli import editing
+    from nlfilter_torch.cli import editing, showing
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.edits.detail import blend_edited
     from nlfilter_torch.io.photographs import Photograph
-    from nlfilter_torch.tiled.pictures import Rows
-    from nlfilter_torch.tiled.recipe import edit_regions, edit_rows
+    from nlfilter_torch.tiled.pictures import Picture
+    from nlfilter_torch.tiled.recipe import edit_regions, edit_tiling
+    from nlfilter_torch.tiled.tiles import Tiling
+
+    for recipe, name in zip(recipes, preset, strict=True):
+        showing.note_idle(recipe, name)
+    colorizes = any(step.edit == "colorize" for recipe in recipes for step in recipe.acting)
 
     def work(photograph: Photograph) -> Tensor:
+        if colorizes:
+            showing.note_colours(source, photograph.size, lambda rows: photograph.pixels[..., rows, :])
         if not masks:
             return recipes[0].apply(photograph.pixels)
         shares = editing.read_masks(masks, source, photograph.size)
         return blend_edited(photograph.pixels, [recipe.apply(photograph.pixels) for recipe in recipes], shares)
 
-    def by_rows(job: Job) -> Rows:
+    def by_rows(job: Job) -> AbstractContextManager[Tiling]:
         passes = job.passes(full, Path(target).parent)
+        if colorizes:
+            picture = Picture(job.picture.rows, source)
+            showing.note_colours(source, job.size, lambda rows: picture.tile(rows.start, rows.stop, 0).pixels)
         if not masks:
-            return edit_rows(passes, job.picture.rows, recipes[0], source)
+            return edit_tiling(passes, job.picture.rows, recipes[0], source)
         found = [job.open(path) for path in masks]
         for path, one in zip(masks, found, strict=True):
             if tuple(one.shape[:2]) != job.size:
@@ -90,4 +95,6 @@ def apply(
         memory=memory,
         by_rows=by_rows,
         coloured=any(recipe.gives_colour for recipe in recipes),
+        workers=workers,
+        cluster=cluster,
     )

@@ -40,8 +40,9 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="The scheduler of a Dask cluster, such as tcp://host:8786, whose workers edit the photographs in place of "
-        "this machine. They have one thread each and see the folders under the same names. Needs the extra cluster.",
+        help="The address of a Dask cluster, such as tcp://host:8786, or Ray cluster, such as ray://host:10001, whose "
+        "workers edit the photographs in place of this machine. They have one thread each and see the folders under "
+        "the same names. Needs the extra cluster or ray.",
     ),
 ]
 

@@ -1,7 +1,7 @@
 """The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,11 +18,18 @@ from nlfilter_torch.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import StoredPicture, check_place, is_zarr, modest_memory, open_picture, write_picture
+from nlfilter_torch.io.rows import (
+    StoredPicture,
+    check_place,
+    is_zarr,
+    modest_memory,
+    open_picture,
+    tile_memory,
+    write_picture,
+)
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.tiled.pictures import Rows
 from nlfilter_torch.tiled.sampling import Report
-from nlfilter_torch.tiled.tiles import Passes, Statistics
+from nlfilter_torch.tiled.tiles import Passes, Processes, Statistics, Tiling
 
 MOST = 1e6  # gigabytes; upper limit of ``--memory``
 
@@ -34,6 +41,11 @@ def allowed_memory(gigabytes: float | None) -> int:
     if not 0 < gigabytes <= MOST:
         raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
     return int(gigabytes * 1e9)
+
+
+def tile_limit(gigabytes: float | None) -> int:
+    """Largest memory in bytes of the tiles of an edit, given ``--memory``."""
+    return tile_memory() if gigabytes is None else allowed_memory(gigabytes)
 
 
 def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int) -> Photograph | None:
@@ -74,16 +86,20 @@ class Job:
     Attributes:
         picture: the input.
         kind: dtype of the output.
-        memory: bytes that are still free.
+        memory: bytes that may still be used.
+        limit: bytes that tiles may use, at most.
         report: called with the progress.
         files: closes opened files.
+        processes: compute tiles in place of the threads of this process, if given.
     """
 
     picture: StoredPicture
     kind: str
     memory: int
+    limit: int
     report: Report
     files: ExitStack
+    processes: Processes | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -93,13 +109,35 @@ class Job:
     def passes(self, full: bool, folder: Path) -> Passes:
         """Tiling options, with statistics from all pixels or from a sample, and a folder for temporary files."""
         statistics: Statistics = "full" if full else "sample"
-        return Passes(self.kind, statistics, memory=max(self.memory, 1), report=self.report, folder=folder)
+        memory = max(min(self.memory, self.limit), 1)
+        return Passes(self.kind, statistics, memory=memory, report=self.report, folder=folder, processes=self.processes)
 
     def open(self, path: Path) -> StoredPicture:
         """Open another picture to be read by rows; it is closed at the end of the job."""
         found = self.files.enter_context(open_picture(path, self.memory))
         self.memory -= found.cached
         return found
+
+
+def check_processes(source: str, target: str, workers: int | None, cluster: str | None) -> None:
+    """Raise ValueError if worker processes are asked for and the files are not zarr arrays."""
+    option = "--workers" if cluster is None else "--cluster"
+    if workers is not None and cluster is not None:
+        raise ValueError(f"--workers are those of the cluster, got {workers} and {cluster}; leave out one of them")
+    if (workers is not None or cluster is not None) and not (is_zarr(Path(source)) and is_zarr(Path(target))):
+        raise ValueError(
+            f"{option} takes zarr arrays, which several processes can write, as IN and OUT, got {source} and {target}; "
+            "leave it out, or convert them"
+        )
+
+
+def processes_for(workers: int | None, cluster: str | None, stack: ExitStack) -> Processes | None:
+    """The worker processes that are asked for, until ``stack`` is closed, or None."""
+    if workers is None and cluster is None:
+        return None
+    from nlfilter_torch.cli.processes import zarr_processes
+
+    return stack.enter_context(zarr_processes(workers, cluster))
 
 
 def edit_file(
@@ -110,8 +148,10 @@ def edit_file(
     *,
     bytes_per_pixel: int,
     memory: float | None,
-    by_rows: Callable[[Job], Rows],
+    by_rows: Callable[[Job], AbstractContextManager[Tiling]],
     coloured: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
 ) -> None:
     """Edit the photograph in a file, and write it to another file or the same one, with its metadata.
 
@@ -121,10 +161,13 @@ def edit_file(
         depth: of the output; None is that of the input.
         edit: computes new pixels (1, C, H, W) from the photograph.
         bytes_per_pixel: memory that the edit needs per pixel of an image.
-        memory: gigabytes that may be used; None is a fifth of the machine's.
+        memory: gigabytes that may be used; None is a fifth of the machine's, and at most 1 for tiles.
         by_rows: the same edit for photographs that do not fit in memory.
         coloured: whether the edit by rows adds colours to a grey photograph.
+        workers: number of processes that filter zarr arrays, instead of threads.
+        cluster: address of the cluster whose processes do this.
     """
+    check_processes(source, target, workers, cluster)
     allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:
         begin("Reading")
@@ -143,5 +186,8 @@ def edit_file(
         stored = kind or found
         written = picture.in_colour() if coloured else picture
         check_place(Path(target), stored, written, allowed)
-        job = Job(picture, stored, allowed - picture.cached, stack.enter_context(stages()), stack)
-        write_picture(Path(target), by_rows(job), stored, written)
+        processes = processes_for(workers, cluster, stack)
+        report = stack.enter_context(stages())
+        job = Job(picture, stored, allowed - picture.cached, tile_limit(memory), report, stack, processes)
+        with by_rows(job) as tiling:
+            write_picture(Path(target), tiling, stored, written)

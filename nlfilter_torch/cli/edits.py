@@ -1,8 +1,8 @@
 """One command per edit, with options generated from the declaration of its parameters."""
 
 import inspect
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -89,7 +89,7 @@ def option_value(parameter: Parameter, value: Any) -> Any:
 
 
 def option(parameter: Parameter, panel: str | None = None) -> Any:
-    """The annotation of a parameter's option; ``panel`` is the title of its section in the help."""
+    """The annotation of a parameter's option; ``panel`` replaces the title of its section in the help."""
     kind: Any = Literal[parameter.choices] if parameter.choices else TYPES[parameter.kind]
     limits: dict[str, Any] = {}
     if parameter.words:
@@ -103,7 +103,7 @@ def option(parameter: Parameter, panel: str | None = None) -> Any:
         *(f"--{name.replace('_', '-')}" for name in names),
         metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
         help=parameter.help,
-        rich_help_panel=panel,
+        rich_help_panel=panel or parameter.panel,
         **limits,
     )
     return Annotated[kind | None if parameter.optional else kind, decorated]
@@ -117,18 +117,20 @@ def _declared(parameter: Parameter, panel: str | None = None) -> inspect.Paramet
     return _argument(parameter.name, option(parameter, panel), option_value(parameter, parameter.default))
 
 
-def signature(edit: Edit) -> inspect.Signature:
-    """The signature of an edit's command."""
+def signature(edit: Edit, *, target: Any = options.Target, depth: Any = options.OutputDepth) -> inspect.Signature:
+    """The signature of an edit's command; ``target`` and ``depth`` annotate its output and the depth of that."""
     return inspect.Signature(
         [
             _argument("source", options.Source, inspect.Parameter.empty),
-            _argument("target", options.Target, inspect.Parameter.empty),
+            _argument("target", target, inspect.Parameter.empty),
             *(_argument(name, annotation, None) for name, annotation in SCRIBBLES.get(edit.name, {}).items()),
             *(_declared(p) for p in edit if p.is_option),
-            _argument("depth", options.OutputDepth, None),
+            _argument("depth", depth, None),
             _argument("seed", options.Seed, 0),
             _argument("memory", options.Memory, None),
             _argument("full", options.Full, False),
+            _argument("workers", options.Workers, None),
+            _argument("cluster", options.Cluster, None),
         ]
     )
 
@@ -187,6 +189,8 @@ def edit_photograph(
     seed: int = 0,
     memory: float | None = None,
     full: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
     **given: Any,
 ) -> None:
     """Apply an edit, given by name, to a file; ``given`` are options of its command, by default those of the edit."""
@@ -205,14 +209,15 @@ def edit_photograph(
 
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.editing import Job
-    from nlfilter_torch.cli.noise import NoiseReport, write_map
+    from nlfilter_torch.cli.noise import NoiseReport, squared_difference, write_map
     from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
     from nlfilter_torch.edits.noise import Noise, noise_of
     from nlfilter_torch.edits.source import InMemory, Source
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.io.rows import StoredPicture, open_picture
-    from nlfilter_torch.tiled.pictures import Picture, Rows
+    from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.source import Tiled
+    from nlfilter_torch.tiled.tiles import Tiling
     from nlfilter_torch.tiled.workers import single_threaded
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
@@ -247,13 +252,19 @@ def edit_photograph(
             drawn = scribbles.of_edit(step, photograph.size, given, read)
             tell(drawn, photograph.size, rows_of)
             noise = measured(drawn[1], InMemory(photograph.pixels), rows_of) if name == "denoise" else None
-            edited = apply_to(step, photograph.pixels, *scribbles.at_once(*drawn), generator=seeded(seed))
+            marked = scribbles.at_once(*drawn)
+            if name == "colorize":
+                showing.note_colours(source, photograph.size, rows_of)
+            edited = apply_to(step, photograph.pixels, *marked, generator=seeded(seed))
             if noise is not None:
-                noise.add(photograph.pixels.numpy(), edited.numpy())
+                noise.add(
+                    squared_difference(*(pixels[0].permute(1, 2, 0).numpy() for pixels in (photograph.pixels, edited)))
+                )
                 noise.tell()
             return edited
 
-    def by_rows(job: Job) -> Rows:
+    @contextmanager
+    def by_rows(job: Job) -> Iterator[Tiling]:
         tiled = Tiled(
             Picture(job.picture.rows, source),
             job.passes(full, Path(target).parent),
@@ -268,8 +279,12 @@ def edit_photograph(
         noise = measured(drawn[1], tiled, rows_of) if name == "denoise" else None
         with single_threaded(tiled.passes.workers(1)):
             fitted = fit_step(step, tiled, *drawn, generator=seeded(seed))
-        rows = tiled.rows(fitted)
-        yield from rows if noise is None else noise.watched(rows, job.picture.rows)
+        if name == "colorize":
+            showing.note_colours(source, job.size, rows_of)
+        with tiled.tiling(fitted) as tiling:
+            yield tiling if noise is None else noise.watched(tiling)
+        if noise is not None:
+            noise.tell()
 
     for which in ("show", "map"):
         editing.check_apart(f"--{which}", given.get(which), photograph=source, output=target)
@@ -283,4 +298,6 @@ def edit_photograph(
         memory=memory,
         by_rows=by_rows,
         coloured=edit.coloured,
+        workers=workers,
+        cluster=cluster,
     )

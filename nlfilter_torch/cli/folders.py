@@ -1,27 +1,22 @@
-"""A folder of photographs edited by worker processes: those of joblib on this machine, or those of a Dask cluster.
+"""A folder of photographs edited by worker processes: those of joblib on this machine, or those of a cluster.
 
-Needs the ``cli`` extra, and ``cluster`` for a cluster. A file is done when the output folder has a file of its name,
-since a name appears only when its file is complete (:func:`~nlfilter_torch.io.photographs.open_beside`). An interrupted
-run continues when it is started again.
+Needs the ``cli`` extra, and ``cluster`` or ``ray`` for a cluster. A file is done when the output folder has a file of
+its name, since a name appears only when its file is complete (:func:`~nlfilter_torch.io.photographs.open_beside`). An
+interrupted run continues when it is started again.
 """
 
 import contextlib
 import io
 import json
-import os
 import warnings
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from nlfilter_torch.cli.workers import be_worker
+from nlfilter_torch.cli.workers import DEATHS, Workers, is_death, worker_pool
 from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, remove_stale
 
-CONNECTING = 30  # seconds for a cluster to answer
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
-DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the files
 
 DIED = "the process that worked on it died; give it more memory, by fewer --workers, or look at the file"
 
@@ -106,8 +101,8 @@ def edit_folder(
         edit: edits one of them in a worker; its errors and warnings are reported.
         workers: number of processes on this machine.
         threads: of each process.
-        cluster: address of the scheduler of a Dask cluster, whose workers see the folders under the same names and have
-            one thread each; None is this machine.
+        cluster: address of a cluster as in :func:`worker_pool`, whose workers see the folders under the same names;
+            None is this machine.
         tell: called with a sentence for every failure and warning, as they happen.
         begin: called with the name of every file that ended.
         tally: updated as each file ends, so that it is correct after an interrupt too.
@@ -122,8 +117,8 @@ def edit_folder(
     deaths = 0
     with (
         contextlib.ExitStack() as afterwards,
-        _pool(cluster, min(workers, len(jobs)), threads) as workers,
-        contextlib.closing(_outcomes(jobs, target, edit, workers)) as ended,
+        worker_pool(cluster, min(workers, len(jobs)), threads) as pool,
+        contextlib.closing(_outcomes(jobs, target, edit, pool)) as ended,
     ):
         afterwards.callback(remove_stale, target, names)  # of workers that were ended by an interrupt
         for path, outcome in ended:
@@ -137,63 +132,33 @@ def edit_folder(
                 continue
             tally.failures[path.name] = outcome
             tell(outcome if path.name in outcome else f"{path.name}: {outcome}")
-            if deaths >= DEATHS * workers:
+            if deaths >= DEATHS * pool.number:
                 tell(f"{deaths} workers died one after the other; no other file is begun")
                 return
 
 
-@contextlib.contextmanager
-def _pool(cluster: str | None, workers: int, threads: int) -> Iterator[int]:
-    """Have joblib work in these processes, or in those of a cluster; gives their number."""
-    import joblib
-
-    if cluster is None:
-        from joblib.externals.loky import get_reusable_executor
-
-        # With one, joblib would work in this process, which must outlive the files; a second one stays idle then.
-        options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
-        try:
-            with (
-                joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options),
-                warnings.catch_warnings(),
-            ):
-                warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
-                yield workers
-        finally:
-            get_reusable_executor().shutdown()
-        return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ValueError("--cluster needs the extra cluster; install nlfilter-torch[cluster]") from error
-    try:
-        client = Client(cluster, timeout=CONNECTING)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"--cluster must be the address of a Dask scheduler, got {cluster}; {error}") from error
-    with client, joblib.parallel_config("dask", client=client, wait_for_workers_timeout=CONNECTING):
-        yield joblib.effective_n_jobs()
-
-
-def _outcomes(jobs: Sequence[Path], target: Path, edit: Edit, workers: int) -> Generator[tuple[Path, list[str] | str]]:
+def _outcomes(
+    jobs: Sequence[Path], target: Path, edit: Edit, workers: Workers
+) -> Generator[tuple[Path, list[str] | str]]:
     """Each job with its warnings or why it failed, as they end.
 
     When a worker dies, joblib ends the others, too. Files are begun in their order, so that one of the first that have
     not ended is the cause. Each of these is then worked on alone.
     """
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
     def run(paths: Sequence[Path]) -> Generator[tuple[Path, list[str] | str]]:
         calls = [delayed(_work)(edit, path, target / path.name) for path in paths]
-        return Parallel(return_as="generator_unordered", pre_dispatch=workers, batch_size=1)(calls)
+        return workers.run(calls)
 
     def alone(path: Path) -> tuple[Path, list[str] | str]:
         if (target / path.name).exists():  # it had ended
             return path, []
-        if workers > 1:
+        if workers.number > 1:
             try:
                 (outcome,) = run([path])
             except Exception as error:
-                if not _is_death(error):
+                if not is_death(error):
                     raise
             else:
                 return outcome
@@ -207,16 +172,11 @@ def _outcomes(jobs: Sequence[Path], target: Path, edit: Edit, workers: int) -> G
                     del waiting[path]
                     yield path, outcome
         except Exception as error:
-            if not _is_death(error):
+            if not is_death(error):
                 raise
-            for path in list(waiting)[:workers]:
+            for path in list(waiting)[: workers.number]:
                 del waiting[path]
                 yield alone(path)
-
-
-def _is_death(error: Exception) -> bool:
-    """Whether a worker died; Dask tries a file on several of them before it says so."""
-    return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
 
 
 def _work(edit: Edit, source: Path, target: Path) -> tuple[Path, list[str] | str]:

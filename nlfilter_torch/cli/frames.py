@@ -23,14 +23,16 @@ BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, 
 Frames = Annotated[
     Path,
     typer.Argument(
-        metavar="FRAMES", help="A film (.mp4 or .mov), or a folder of photographs, read in the order of their names."
+        metavar="FRAMES",
+        help="A film (.mp4, .m4v or .mov), or a folder of photographs, read in the order of their names.",
     ),
 ]
 Edited = Annotated[
     Path,
     typer.Argument(
         metavar="OUT",
-        help="The edited film (.mp4 or .mov), or the folder for the edited photographs; created if it does not exist.",
+        help="The edited film (.mp4, .m4v or .mov), or the folder for the edited photographs; created if it does not "
+        "exist.",
     ),
 ]
 References = Annotated[
@@ -86,13 +88,13 @@ def frames(
     """
     recipe = chosen_recipe(context, edit, preset, given)
 
-    from nlfilter_torch.cli.editing import allowed_memory
+    from nlfilter_torch.cli.editing import tile_limit
     from nlfilter_torch.io.films import is_film
     from nlfilter_torch.tiled.film import FilmEdit, film_steps
     from nlfilter_torch.tiled.tiles import Passes
 
     film_steps(recipe)
-    passes = Passes("float32", memory=allowed_memory(memory))
+    passes = Passes("float32", memory=tile_limit(memory))
 
     def fit(samples: list[Any]) -> FilmEdit:
         return FilmEdit(recipe, samples, passes, seed=seed)
@@ -154,7 +156,7 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     from nlfilter_torch.io.photographs import check_folder, check_output, read_photograph, write_photograph
 
     if source.is_file():
-        raise ValueError(f"{source} must be a film (.mp4 or .mov) or a folder; convert it")
+        raise ValueError(f"{source} must be a film (.mp4, .m4v or .mov) or a folder; convert it")
     paths = pictures(source, "frames")
     if target.exists() and target.resolve() == source.resolve():
         raise ValueError(f"{target} must not be the folder of the frames; choose another folder")

@@ -1,18 +1,31 @@
 """``nlfilter-torch mask``: write a soft mask of an object in a photograph."""
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
+
+import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import signature
 from nlfilter_torch.edits.parameters import MASK
 
-if TYPE_CHECKING:
-    from nlfilter_torch.tiled.pictures import Rows
-
+Target = Annotated[
+    str,
+    typer.Argument(
+        metavar="OUT",
+        help="The mask: a grey picture of the photograph's size, white in the selected area. Its extension selects the "
+        "file type: .tif (16 bits), .png, .jpg, .webp, .avif (8 bits) or .pfm (floats).",
+    ),
+]
+Depth = Annotated[
+    options.FileDepth | None,
+    typer.Option(
+        help="Bits of the mask, or floats (TIFF only): 16 also for .png. Default: see OUT.",
+        rich_help_panel=options.FILES_PANEL,
+    ),
+]
 GIVE = "give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60"
 
 
@@ -28,6 +41,8 @@ def mask(
     seed: int = 0,
     memory: float | None = None,
     full: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
     **given: Any,
 ) -> None:
     """See :data:`MASK`."""
@@ -51,6 +66,7 @@ def mask(
     place, floats = Path(target), Path(target).suffix.lower() == PFM
     kind = options.DEPTHS[depth or ("16" if place.suffix.lower() in (".tif", ".tiff") else "8")]
     allowed = editing.allowed_memory(memory)
+    editing.check_processes(source, target, workers, cluster)
 
     def values(size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
         return {p.keyword: p.argument_of(given[p.name], size, stride) for p in MASK}
@@ -97,21 +113,18 @@ def mask(
         plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
         check_place(place, kind, plain, allowed)
         with ExitStack() as files:
-            job = editing.Job(picture, kind, allowed - picture.cached, report, files)
+            processes = editing.processes_for(workers, cluster, files)
+            limit = editing.tile_limit(memory)
+            job = editing.Job(picture, kind, allowed - picture.cached, limit, report, files, processes)
             tiled = Tiled(Picture(picture.rows, source), job.passes(full, place.parent), "--region")
             drawn = selected_by(job.size, job.open)
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
             with single_threaded(tiled.passes.workers(1)):
                 fitted = fit_mask(tiled, *drawn, **arguments(job.size))
-            write_picture(place, _first_channel(tiled.rows(fitted)), kind, plain)
-
-
-def _first_channel(rows: "Rows") -> Iterator[Any]:
-    """Drop the transparency of the photograph."""
-    for part, values in rows:
-        yield part, values[..., :1]
+            with tiled.tiling(fitted) as tiling:
+                write_picture(place, replace(tiling, transparent=False), kind, plain)
 
 
 mask.__doc__ = MASK.help
-mask.__signature__ = signature(MASK)  # type: ignore[attr-defined]  # read by typer
+mask.__signature__ = signature(MASK, target=Target, depth=Depth)  # type: ignore[attr-defined]  # read by typer
 mask.__annotations__ = {}

@@ -1,6 +1,7 @@
 """The report of ``nlfilter-torch denoise``: the noise of the photograph, and how much it was changed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from nlfilter_torch.cli.options import LEVELS
 from nlfilter_torch.edits.denoise import NEGLIGIBLE_NOISE
 from nlfilter_torch.edits.noise import Noise
 from nlfilter_torch.io.photographs import Photograph, write_photograph
-from nlfilter_torch.tiled.pictures import WHITE, Rows, RowSource
+from nlfilter_torch.tiled.pictures import WHITE
+from nlfilter_torch.tiled.tiles import Tiling
 
 VISIBLE_LEVELS = 0.5  # grey levels; the rounding error of eight bits
 WHITE_LEVELS = 64  # grey levels; white in a map
@@ -34,20 +36,14 @@ class NoiseReport:
         self._ends = f" ({LEVELS * ends[0]:.2f} in black, {LEVELS * ends[1]:.2f} in white)" if noise.gain > 0 else ""
         self._squares, self._count = 0.0, 0
 
-    def add(self, before: NDArray[np.generic], after: NDArray[np.generic]) -> None:
-        """Add the difference of some rows (h, W, S) before and after, both in their stored dtypes."""
-        difference = _scaled(after) - _scaled(before)
-        self._squares += float(np.square(difference, dtype=np.float64).sum())
-        self._count += difference.size
+    def add(self, difference: tuple[float, int]) -> None:
+        """Add the difference of some pixels, from :func:`squared_difference`."""
+        self._squares += difference[0]
+        self._count += difference[1]
 
-    def watched(self, rows: Rows, source: RowSource) -> Rows:
-        """Pass edited rows through, adding their differences, and print the report after the last."""
-        for part, values in rows:
-            colours = 3 if values.shape[2] >= 3 else 1  # the rest is transparency
-            before = np.asarray(source[part]).reshape(values.shape)
-            self.add(before[..., :colours], values[..., :colours])
-            yield part, values
-        self.tell()
+    def watched(self, tiling: Tiling) -> Tiling:
+        """Edited rows whose differences are added as they are computed."""
+        return replace(tiling, compare=squared_difference, compared=self.add)
 
     def tell(self) -> None:
         """Print the report."""
@@ -78,6 +74,13 @@ def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tenso
         parts.append(levels.square().mean(1, keepdim=True).sqrt()[..., start - first : stop - first, :])
     levels = torch.cat(parts, dim=2) * (LEVELS / WHITE_LEVELS)
     write_photograph(Photograph(levels.clamp(0, 1), "uint16"), path)
+
+
+def squared_difference(before: NDArray[np.generic], after: NDArray[np.generic]) -> tuple[float, int]:
+    """Sum of the squared differences of stored rows (h, W, S) without their transparency, and the number of values."""
+    colours = 3 if after.shape[2] >= 3 else 1
+    difference = _scaled(after[..., :colours]) - _scaled(before[..., :colours])
+    return float(np.square(difference, dtype=np.float64).sum()), difference.size
 
 
 def _scaled(rows: NDArray[np.generic]) -> NDArray[np.float32]:

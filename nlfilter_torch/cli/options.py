@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from nlfilter_torch.edits.declaration import GAINS, MAX_SLIDERS, UNITS, Parameter
+from nlfilter_torch.edits.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNITS, Parameter
 
 if TYPE_CHECKING:
     from nlfilter_torch.io.photographs import Depth
 
+FILES_PANEL = "Files and memory"  # section in the help
 LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
 
 
@@ -78,6 +79,7 @@ Seed = Annotated[
         max=2**63 - 1,
         metavar="N",
         help="Random seed: the same seed gives the same picture again, another seed a variation of it.",
+        rich_help_panel=FILTER_PANEL,
     ),
 ]
 Target = Annotated[
@@ -89,14 +91,18 @@ Target = Annotated[
 ]
 OutputDepth = Annotated[
     FileDepth | None,
-    typer.Option(help="Bits per channel of the output, or floats (TIFF only). Default: as in the input."),
+    typer.Option(
+        help="Bits per channel of the output, or floats (TIFF only). Default: as in the input.",
+        rich_help_panel=FILES_PANEL,
+    ),
 ]
 Memory = Annotated[
     float | None,
     typer.Option(
         metavar="GB",
         help="Memory limit in gigabytes, in addition to 0.3 for the program itself. A photograph that needs more is "
-        "processed in tiles, without seams. Default: a fifth of the machine's memory.",
+        "processed in tiles, without seams. Default: a fifth of the machine's memory, and at most 1 for tiles.",
+        rich_help_panel=FILES_PANEL,
     ),
 ]
 Full = Annotated[
@@ -104,6 +110,26 @@ Full = Annotated[
     typer.Option(
         "--full",
         help="In tiles: compute statistics from every pixel instead of a sample. Takes two or three times as long.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
+
+
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="With zarr arrays as IN and OUT: filter and write their parts by this many processes instead of threads.",
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="With zarr arrays as IN and OUT: the address of a Dask cluster, such as tcp://host:8786, or Ray cluster, "
+        "such as ray://host:10001, whose workers filter and write their parts. They have one thread each and see the "
+        "folders under the same names. Needs the extra cluster or ray.",
     ),
 ]
 
@@ -148,6 +174,16 @@ SliderRegions = _rectangles(
     "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be repeated.",
 )
 MaskFile = _file("--mask", "A picture of the same size as the photograph, white where selected and black elsewhere.")
+_LOOK_MASK = "A grey picture of the size of the photograph, white in the region of one look. May be repeated."
+Masks = Annotated[list[Path] | None, typer.Option("--mask", metavar="FILE", help=_LOOK_MASK)]
+MasksOfPairs = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--mask",
+        metavar="FILE",
+        help=f"{_LOOK_MASK} For folders of photographs, a folder of such pictures under the same names.",
+    ),
+]
 NoiseMap = _file(
     "--map", "Also write a picture of the standard deviation of the noise at every pixel; white is 64 grey levels."
 )

@@ -1,4 +1,7 @@
-"""What scribbles cover: their colours as text, a note where one covers very different colours, and a picture."""
+"""What scribbles cover: their colours as text, a note where one covers very different colours, and a picture.
+
+Also other notes on what an edit does to a photograph.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -12,9 +15,11 @@ from torch import Tensor
 
 from nlfilter_torch.cli.scribbles import Overlay, Strokes
 from nlfilter_torch.edits.applying import seeded
+from nlfilter_torch.edits.colour import hundredths_of_lab
 from nlfilter_torch.edits.defocus import REACH
-from nlfilter_torch.edits.mask import lab_of, region_mask
+from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import MASK
+from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
@@ -22,6 +27,8 @@ MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
 LARGE_DISTANCE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
 NOTE_SHARE = 0.15  # share of such pixels above which a note is printed
 CHUNK_ROWS = 64
+COLOUR_ROWS = 16  # rows of a photograph that are read to see whether it is in colour
+COLOURED, COLOURED_SHARE = 0.04, 0.01  # difference of channels in a coloured pixel, and share of such pixels
 OUTSIDE_BRIGHTNESS = 0.4  # brightness outside the mask, where the picture is shown in grey
 
 
@@ -45,16 +52,40 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
             typer.echo(f"{place}: {pixels.shape[2]} pixels, median colour #{red:02x}{green:02x}{blue:02x}")
             share = unlike(pixels, middle)
             if share > NOTE_SHARE:
-                typer.echo(
-                    f"nlfilter-torch: note: {place} covers very different colours: {100 * share:.0f} % of its pixels "
-                    "differ strongly from the median; make it smaller or move it, and check it with --show FILE",
-                    err=True,
+                note(
+                    f"{place} covers very different colours: {100 * share:.0f} % of its pixels differ strongly from "
+                    f"the median; mark each part separately, with a smaller {option} on each, and check them with "
+                    "--show FILE"
                 )
+
+
+def note_colours(name: str, size: tuple[int, int], read: Read) -> None:
+    """Print a note if a photograph that is to be colourised is in colour."""
+    step = max(1, size[0] // COLOUR_ROWS)
+    rows = torch.cat([read(slice(y, y + 1)).float() for y in range(step // 2, size[0], step)], dim=2)
+    if bool(((rows.amax(1) - rows.amin(1)) > COLOURED).float().mean() > COLOURED_SHARE):
+        note(
+            f"{name} is in colour: colorize replaces its colours everywhere by those of the scribbles; "
+            "to change the colour of one object, use recolor"
+        )
+
+
+def note_idle(recipe: Recipe, name: str) -> None:
+    """Print a note if an edit changes nothing."""
+    if not recipe.acting:
+        note(f"{name} holds no step that changes anything: the photograph is written as it is")
+
+
+def note(sentence: str) -> None:
+    """Print a note on standard error."""
+    typer.echo(f"nlfilter-torch: note: {sentence}", err=True)
 
 
 def unlike(pixels: Tensor, middle: Tensor) -> float:
     """The share of pixels (1, C, n) whose colour is very different from a colour (1, C)."""
-    lab = lab_of(pixels.expand(-1, 3, -1).unsqueeze(2)) - lab_of(middle.expand(-1, 3)[..., None, None])
+    lab = hundredths_of_lab(pixels.expand(-1, 3, -1).unsqueeze(2)) - hundredths_of_lab(
+        middle.expand(-1, 3)[..., None, None]
+    )
     return float((lab.norm(dim=1) > LARGE_DISTANCE).float().mean())
 
 

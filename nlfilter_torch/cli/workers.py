@@ -1,13 +1,127 @@
-"""How a worker process of ``nlfilter-torch batch`` begins, before it imports anything that takes time."""
+"""Worker processes: those of joblib on this machine, or those of a cluster.
 
+A worker begins by importing this module, which therefore imports nothing that takes time.
+"""
+
+import contextlib
 import os
 import signal
 import threading
 import time
+import warnings
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any
 
 import psutil
 
+CONNECTING = 30  # seconds for a cluster to answer
+DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the work
 PAUSE = 0.5  # seconds between two looks at the main process
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Processes that joblib's calls run in.
+
+    Attributes:
+        number: of processes.
+        streaming: whether results come as they end; otherwise they come in rounds of one call for each process.
+    """
+
+    number: int
+    streaming: bool = True
+
+    def run(self, calls: Sequence[Any]) -> Generator[Any]:
+        """Results of calls that are made with ``joblib.delayed``, in any order; calls begin in their order."""
+        from joblib import Parallel
+
+        if self.streaming:
+            yield from Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)(calls)
+            return
+        with Parallel(batch_size=1) as parallel:
+            for first in range(0, len(calls), self.number):
+                yield from parallel(calls[first : first + self.number])
+
+
+@contextlib.contextmanager
+def worker_pool(cluster: str | None, workers: int, threads: int) -> Iterator[Workers]:
+    """Have joblib work in processes of this machine, or in those of a cluster.
+
+    Args:
+        cluster: address of the scheduler of a Dask cluster, or of a Ray cluster (``ray://host:10001``, or ``ray:`` and
+            what ``ray.init`` takes, such as ``ray:auto``), whose workers have one thread each; None is this machine.
+        workers: number of processes on this machine.
+        threads: of each of these.
+
+    Raises:
+        ValueError: if there is no cluster at that address.
+    """
+    if cluster is None:
+        yield from _of_this_machine(workers, threads)
+    elif cluster.startswith("ray:"):
+        yield from _of_ray(cluster)
+    else:
+        yield from _of_dask(cluster)
+
+
+def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
+    import joblib
+    from joblib.externals.loky import get_reusable_executor
+
+    # With one, joblib would work in this process, which must outlive the work; a second one stays idle then.
+    options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
+    try:
+        with (
+            joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options),
+            warnings.catch_warnings(),
+        ):
+            warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
+            yield Workers(workers)
+    finally:
+        get_reusable_executor().shutdown()
+
+
+def _of_dask(address: str) -> Iterator[Workers]:
+    import joblib
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError("--cluster needs the extra cluster; install nlfilter-torch[cluster]") from error
+    try:
+        client = Client(address, timeout=CONNECTING)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"--cluster must be the address of a Dask scheduler, got {address}; {error}") from error
+    with client, joblib.parallel_config("dask", client=client, wait_for_workers_timeout=CONNECTING):
+        yield Workers(joblib.effective_n_jobs())
+
+
+def _of_ray(address: str) -> Iterator[Workers]:
+    import joblib
+
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError as error:
+        raise ValueError("--cluster ray: needs the extra ray; install nlfilter-torch[ray]") from error
+    try:
+        ray.init(address if address.startswith("ray://") else address.removeprefix("ray:"), log_to_driver=False)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ValueError(f"--cluster must be the address of a Ray cluster, got {address}; {error}") from error
+    try:
+        register_ray()
+        number = int(ray.cluster_resources()["CPU"])
+        with joblib.parallel_config("ray", n_jobs=number):
+            yield Workers(number, streaming=False)
+    finally:
+        ray.shutdown()
+
+
+def is_death(error: Exception) -> bool:
+    """Whether a worker died; Dask tries a task on several of them before it says so."""
+    return isinstance(error, BrokenProcessPool) or type(error).__name__ in ("KilledWorker", "ActorDiedError")
 
 
 def be_worker(parent: int) -> None:

@@ -73,7 +73,8 @@ def check_image(
             f"{name} must have {channels} channel(s), got {image.shape[1]}; select or convert the channels"
         )
     if batch is not None and image.shape[0] not in (1, batch):
-        raise ValueError(f"{name} must have batch size 1 or {batch}, got {image.shape[0]}; pass one image per guide")
+        sizes = "1" if batch == 1 else f"1 or {batch}"
+        raise ValueError(f"{name} must have batch size {sizes}, got {image.shape[0]}; pass one image per guide")
     check_finite(image, name)
 
 
@@ -91,7 +92,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
 
 def check_unit_range(tensor: Tensor, name: str) -> None:
     """Raise unless all values are in [0, 1]; skipped if :func:`~nlfilter_torch.core.values.is_hidden`."""
-    if is_hidden(tensor):
+    if is_hidden(tensor) or tensor.numel() == 0:
         return
     low, high = tensor.detach().aminmax()
     if low < 0 or high > 1:
@@ -119,8 +120,12 @@ def warn_of_scale(image: Tensor, name: str) -> None:
         )
 
 
-def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str) -> None:
-    """Raise unless the last two dimensions of ``tensor`` are ``size``."""
+def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str, part: Tensor | None = None) -> None:
+    """Raise unless the last two dimensions of ``tensor`` are ``size``, and it is on the device of ``part`` if given."""
+    if part is not None and tensor.device != part.device:
+        raise ValueError(
+            f"{name} must be on the device of the {other}, {part.device}, got {tensor.device}; move one by .to()"
+        )
     if tuple(tensor.shape[-2:]) != tuple(size):
         raise ValueError(
             f"{name} must have the height and width of the {other}, {size[0]}x{size[1]}, "

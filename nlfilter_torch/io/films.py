@@ -49,7 +49,7 @@ def check_film_output(path: Path) -> str:
     check_file(path)
     kind = FILMS.get(path.suffix.lower())
     if kind is None:
-        raise ValueError(f"{path} must end in .mp4 or .mov, got {path.suffix!r}; choose one of these")
+        raise ValueError(f"{path} must end in .mp4, .m4v or .mov, got {path.suffix!r}; choose one of these")
     return kind
 
 

@@ -48,6 +48,7 @@ ENCODING: dict[str, dict[str, object]] = {
     "WebP": {"lossless": True},
     "AVIF": {"quality": 90, "subsampling": "4:4:4"},
 }
+CONVERTED = 1 << 18  # pixels that are converted at a time between files and floats
 PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
 unfinished: set[Path] = set()  # files being written; read by the command line when interrupted
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
@@ -114,10 +115,18 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
 
     depth = check_depth(path, channels.dtype)
-    planes = Picture(channels, str(path), channels=channels.shape[2]).tile(0, len(channels), 0).pixels  # (1, S, H, W)
+    planes = _planes(Picture(channels, str(path), channels=channels.shape[2]))
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
     return Photograph(planes[:, :colours], depth, alpha, icc, exif, read_extras(path))  # type: ignore[arg-type]
+
+
+def _planes(picture: Picture) -> Tensor:
+    """All channels (1, S, H, W) of a picture, converted a few rows at a time, which takes the least memory."""
+    planes = torch.empty(1, picture.samples, *picture.size, dtype=picture.dtype)
+    for tile in picture.tiles(0, max(1, CONVERTED // picture.size[1])):
+        planes[:, :, tile.start : tile.start + tile.pixels.shape[2]] = tile.pixels
+    return planes
 
 
 def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
@@ -182,7 +191,9 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     path = Path(path)
     kind = check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
-    channels = stored_as(torch.cat(planes, dim=1), photograph.depth)  # (H, W, S)
+    rows = max(1, CONVERTED // photograph.size[1])
+    parts = zip(*(each.split(rows, dim=2) for each in planes), strict=True)
+    channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
     with open_beside(path) as stream:
         encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif, photograph.extras)
 

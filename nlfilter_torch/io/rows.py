@@ -33,10 +33,12 @@ from nlfilter_torch.io.photographs import (
 )
 from nlfilter_torch.io.tiff import TiffRows
 from nlfilter_torch.tiled.pictures import Rows, RowSource
+from nlfilter_torch.tiled.tiles import Tiling
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
 FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is tiled
+TILED = 1_000_000_000  # bytes of a tiled edit, at most, if no limit is given; more saves little time
 CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 
@@ -115,7 +117,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
 def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> None:
     """Raise unless the picture can be written to ``path`` at that depth, using at most ``memory`` bytes."""
     if path.suffix.lower() == ZARR:
-        _zarr()
+        zarr_package()
         if not path.is_dir():
             check_file(path)
             if path.exists():
@@ -132,8 +134,8 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         )
 
 
-def write_picture(path: Path, rows: Rows, depth: str, like: StoredPicture) -> None:
-    """Write rows as they arrive, with the shape, profile and metadata of another picture."""
+def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPicture) -> None:
+    """Write rows as they are computed, with the shape, profile and metadata of another picture."""
     shape, dtype = like.shape, np.dtype(depth)
     if path.suffix.lower() == ZARR:
         _write_zarr(path, rows, dtype, like)
@@ -162,9 +164,15 @@ def modest_memory() -> int:
     return min(FIFTH, free_memory())
 
 
+def tile_memory() -> int:
+    """Memory budget in bytes of an edit in tiles if none is given."""
+    return min(modest_memory(), TILED)
+
+
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     with tiff.decoding(path):
         rows = stack.enter_context(TiffRows(path))
+    tiff.warn_of_pages(path)
     source: RowSource = _turn(rows, stack) if rows.turned else rows
     return StoredPicture(source, rows.alpha, rows.cached, rows.icc, rows.exif, extras=read_extras(path))
 
@@ -184,7 +192,8 @@ def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
     return upright
 
 
-def _zarr() -> Any:
+def zarr_package() -> Any:
+    """The package zarr; raises ValueError if it is not installed."""
     try:
         import zarr
     except ImportError as error:
@@ -194,8 +203,8 @@ def _zarr() -> Any:
     return zarr
 
 
-class _ZarrRows:
-    """A zarr array that detects a change of its shape."""
+class ZarrRows:
+    """A zarr array that detects a change of its shape; another process opens it again."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -203,9 +212,12 @@ class _ZarrRows:
         self.shape: tuple[int, ...] = tuple(self.array.shape)
         self.dtype = self.array.dtype
 
+    def __reduce__(self) -> tuple[type["ZarrRows"], tuple[Path]]:
+        return ZarrRows, (self.path.absolute(),)
+
     def _open(self) -> Any:
         try:
-            return _zarr().open_array(self.path, mode="r")
+            return zarr_package().open_array(self.path, mode="r")
         except (FileNotFoundError, KeyError, TypeError) as error:
             raise ValueError(f"{self.path} is not a zarr array ({error}); choose the folder of one") from error
 
@@ -220,7 +232,7 @@ class _ZarrRows:
 
 
 def _open_zarr(path: Path) -> StoredPicture:
-    rows = _ZarrRows(path)
+    rows = ZarrRows(path)
     if len(rows.shape) not in (2, 3):
         raise ValueError(
             f"{path} must have the shape (H, W) or (H, W, S), got {rows.shape}; choose the array of a picture"
@@ -231,24 +243,33 @@ def _open_zarr(path: Path) -> StoredPicture:
     return StoredPicture(rows, alpha, cached, attributes=dict(rows.array.attrs))
 
 
-def _write_zarr(path: Path, rows: Rows, dtype: np.dtype[Any], like: StoredPicture) -> None:
+def write_band(array: Any, start: int, rows: NDArray[Any]) -> None:
+    """Write rows (h, W, S) to a zarr array from row ``start`` on, where a chunk begins."""
+    values, width = rows.reshape(len(rows), *array.shape[1:]), array.chunks[1]
+    # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
+    for left in range(0, array.shape[1], width):
+        array[start : start + len(values), left : left + width] = values[:, left : left + width]
+
+
+def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[Any], like: StoredPicture) -> None:
     """Write an array under another name, which replaces an existing array only when it is complete."""
     shape = tuple(like.rows.shape)
     path = link_target(path)
     former = name_beside(path)
     chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
     with part_beside(path) as beside:
-        array = _zarr().create_array(
+        array = zarr_package().create_array(
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
         )
         with claimed(beside):
-            start = 0
-            for band in tiff.bands((part for _, part in rows), CHUNK):
-                values = band.reshape(len(band), *shape[1:])
-                # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
-                for left in range(0, shape[1], CHUNK):
-                    array[start : start + len(band), left : left + CHUNK] = values[:, left : left + CHUNK]
-                start += len(band)
+            processes = rows.passes.processes if isinstance(rows, Tiling) else None
+            if processes is not None and isinstance(rows, Tiling):
+                processes.fill(rows, beside)
+            else:
+                start = 0
+                for band in tiff.bands((part for _, part in rows), CHUNK):
+                    write_band(array, start, band)
+                    start += len(band)
             if path.exists():
                 path.replace(former)
             try:

@@ -13,6 +13,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
+from nlfilter_torch.core.checks import warn
 from nlfilter_torch.io import exif as exif_tags
 
 # Tags that describe the photograph. The others describe how the file stores it and are not copied.
@@ -24,6 +25,7 @@ XMP = 700  # tag
 TILE_SIZE = 256  # side of the tiles that are written
 MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
+MOST_PAGES = 100  # that are counted
 CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
 
 
@@ -60,7 +62,28 @@ def read(
         channels = np.asarray(rows.page.asarray())
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
+        warn_of_pages(path)
         return plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.icc, rows.exif
+
+
+def count_pages(path: Path) -> int:
+    """Number of pictures in a TIFF file, at most :data:`MOST_PAGES`, not counting masks and reduced versions."""
+    count = 1
+    with path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
+        try:
+            for number in range(1, MOST_PAGES):
+                page: Any = file.pages[number]
+                count += not (page.is_reduced or page.is_mask)
+        except Exception:  # no such page, or damage behind the first one, which alone is needed
+            return count
+    return count
+
+
+def warn_of_pages(path: Path) -> None:
+    """Warn if a file has several pages, of which only the first is read."""
+    if (count := count_pages(path)) > 1:
+        least = "at least " if count == MOST_PAGES else ""
+        warn(f"{path} has {least}{count} pages, of which only the first is read; save the others as files of their own")
 
 
 def check_page(path: Path, page: Any) -> None:
@@ -288,6 +311,9 @@ class TiffRows:
         self.segment = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
         self.segment = (min(self.segment[0], self.shape[0]), self.segment[1])
         self.bands: dict[int, NDArray[Any]] = {}
+
+    def __reduce__(self) -> tuple[type["TiffRows"], tuple[Path]]:
+        return TiffRows, (self.path.absolute(),)  # another process opens the file again
 
     def __enter__(self) -> "TiffRows":
         return self

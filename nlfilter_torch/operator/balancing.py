@@ -284,6 +284,19 @@ def settle(
     return found.scaling, torch.stack(moments), found.residual, found.inverse.contiguous(), removed
 
 
+def _fake_without(factor: Tensor, removed: Tensor) -> Tensor:
+    return torch.empty_like(factor)
+
+
+@register("without(Tensor factor, Tensor removed) -> Tensor", None, _fake_without, differentiable=True)
+def without(factor: Tensor, removed: Tensor) -> Tensor:
+    """The factor (B, M, N) without the removed pixels (B, N).
+
+    An operator of its own, since inductor would write the product once for every operator that takes it.
+    """
+    return factor * ~removed.unsqueeze(1)
+
+
 def balance_in_graph(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Balancing, tuple[Tensor, ...]]:
@@ -291,7 +304,7 @@ def balance_in_graph(
     scaling, moments, residual, inverse, removed = settle(
         factor.detach(), diagonal.detach(), tolerance, completed, bound
     )
-    factor, diagonal = factor * ~removed.unsqueeze(1), torch.where(removed, 1.0, diagonal)
+    factor, diagonal = without(factor, removed), torch.where(removed, 1.0, diagonal)
     scaling = _Settled.apply(factor, diagonal, scaling, moments[-1], inverse, completed)  # type: ignore[no-untyped-call]
     return factor, diagonal, Balancing(scaling, moments[-1], residual, 0), moments[:-1].unbind()
 

@@ -172,7 +172,7 @@ class NonlocalOperator:
         """Compute ``W y, ..., W^k y``, (B, k, C, H, W), in the operator's dtype; arguments and errors as in matmul."""
         check_order(order)
         check_image(image, "image", empty=True)
-        check_same_size(image, self.size, "image", "operator")
+        check_same_size(image, self.size, "image", "operator", self.factor)
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
         if folded.numel() == 0:  # an empty batch
             return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, -1, -1, -1)

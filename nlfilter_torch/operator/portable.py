@@ -172,6 +172,11 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
     return (factor @ images.mT).double()
 
 
+def without(factor: Tensor, removed: Tensor) -> Tensor:
+    """As :func:`nlfilter_torch.operator.balancing.without`, for no removed pixel."""
+    return factor
+
+
 def hypot(down: Tensor, right: Tensor) -> Tensor:
     """As :func:`torch.hypot`, which ONNX lacks, except that squares of values above 1e19 overflow."""
     return (down.square() + right.square()).sqrt()
@@ -185,4 +190,5 @@ FORMS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.nlfilter.moment.default: moment,
     torch.ops.nlfilter.settle.default: settle,
     torch.ops.nlfilter.spread.default: spread,
+    torch.ops.nlfilter.without.default: without,
 }

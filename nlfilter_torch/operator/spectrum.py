@@ -184,7 +184,7 @@ class Spectrum(RitzPairs):
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
         """
         check_image(image, "image")
-        check_same_size(image, self.size, "image", "spectrum")
+        check_same_size(image, self.size, "image", "spectrum", self.factor)
         planes = fold_batch(image.to(self.factor), self.factor.shape[0])
         total = self.among.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]

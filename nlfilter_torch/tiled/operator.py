@@ -18,7 +18,17 @@ from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import GuidePicture, Tile
-from nlfilter_torch.tiled.sampling import ColumnCache, Draws, Pilot, Report, over_all, patches_at, scaled_patches, visit
+from nlfilter_torch.tiled.sampling import (
+    ColumnCache,
+    Draws,
+    Pilot,
+    Report,
+    in_silence,
+    over_all,
+    patches_at,
+    scaled_patches,
+    visit,
+)
 from nlfilter_torch.tiled.statistics import (
     CONVERGED,
     Block,
@@ -121,6 +131,15 @@ class TiledOperator:
     _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
     _grams: Tensor | float = 0.0  # added to those of the sample
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The operator in another process: without columns that can be computed again."""
+        sums = list(self._sums.values())
+        return self.__dict__ | {"report": in_silence, "cache": ColumnCache(1, 0), "_sums": sums}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the operator; planes have other ids in another process."""
+        self.__dict__.update(state | {"_sums": {id(known[0]): known for known in state["_sums"]}})
+
     @torch.no_grad()
     @full_precision
     def prepare(self, planes: Planes = first_plane, order: int = 1) -> None:
@@ -201,6 +220,11 @@ class TiledOperator:
     def margin(self) -> int:
         """Number of pixels around a pixel that its column depends on."""
         return self.kernel.recipe.patch_weights.shape[0] // 2 + self.guide.margin
+
+    @property
+    def picture_margin(self) -> int:
+        """Number of pixels of the picture around a pixel that its column depends on if no guide is stored."""
+        return self.kernel.recipe.patch_weights.shape[0] // 2 + self.guide.guide.margin
 
     def features(self, tile: Tile) -> Tensor:
         """Features (1, D, h W) of a tile of the picture."""

@@ -93,7 +93,7 @@ class SomeColumns:
 
 def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
     """Read the pixels of a rectangle."""
-    margin = max((margin_of(operator) for operator in tiled.operators), default=0)
+    margin = tiled.margin
     around = part.grown(margin, tiled.size)
     picture = Picture(SomeColumns(tiled.picture.source, around.columns), tiled.picture.name)
     tile = picture.tile(part.rows.start, part.rows.stop, margin)
@@ -107,11 +107,6 @@ def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
 
     first = part.rows.start * tiled.size[1] + part.columns.start
     return TilePixels(tile.inner[..., columns], features, first, tiled.size[1])
-
-
-def margin_of(operator: TiledOperator) -> int:
-    """Number of pixels around a pixel that its column depends on if no guide is stored."""
-    return operator.kernel.recipe.patch_weights.shape[0] // 2 + operator.guide.guide.margin
 
 
 @torch.no_grad()

@@ -160,6 +160,10 @@ class GuidePicture(Picture):
         self.picture, self.guide = picture, guide
         self.stored: Tensor | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The guide in another process, which computes it from the picture."""
+        return self.__dict__ | {"stored": None}
+
     def store(self, rows: int, workers: int) -> None:
         """Compute the whole guide in tiles of ``rows``, and keep it in memory for further passes."""
         planes: Tensor | None = None

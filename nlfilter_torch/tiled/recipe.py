@@ -1,7 +1,7 @@
 """A whole edit, as saved by the editor, on a picture larger than memory: one step after another, in tiles of rows."""
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import torch
@@ -12,16 +12,22 @@ from nlfilter_torch.edits.detail import blend_edited
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.strokes import strokes_by_rows
-from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes
+from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
 from nlfilter_torch.tiled.workers import single_threaded
 
 
 def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Rows:
-    """Yield the rows (h, W, S) of the picture edited as by :meth:`Recipe.apply`, in order.
+    """Yield the rows (h, W, S) of the picture edited as by :meth:`Recipe.apply`, in order; see :func:`edit_tiling`."""
+    with edit_tiling(passes, source, recipe, name) as tiling:
+        yield from tiling
+
+
+@contextmanager
+def edit_tiling(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Iterator[Tiling]:
+    """Yield the rows of the picture edited as by :meth:`Recipe.apply`, not yet computed after the last step.
 
     Args:
         passes: tiling options of every step.
@@ -33,36 +39,31 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
         ValueError: if a step needs the whole picture at once, or does not suit the picture.
         OSError: if a temporary file does not fit.
     """
-    picture = Picture(source, name)
     steps = recipe.acting
     with ExitStack() as stack:
         for step in steps[:-1]:
-            rows = step_rows(step, replace(passes, kind="float32"), source, name)
-            clipped = ((part, values.clip(0, 1)) for part, values in rows)
-            source = stack.enter_context(intermediate(clipped, picture.size, passes.folder))
+            with step_tiling(step, replace(passes, kind="float32"), source, name) as tiling:
+                source = stack.enter_context(passes.stored(clipped(tiling)))
         if steps:
-            yield from step_rows(steps[-1], passes, source, name)
+            yield stack.enter_context(step_tiling(steps[-1], passes, source, name))
         else:
-            yield from passes.apply_in_tiles(
-                picture, lambda tile: tile.inner, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1])
-            )
+            yield tile_by_tile(passes, Picture(source, name), inner)
 
 
+@contextmanager
 def edit_regions(
     passes: Passes, source: RowSource, recipes: Sequence[Recipe], masks: Sequence[RowSource], name: str
-) -> Rows:
+) -> Iterator[Tiling]:
     """The rows of the picture under one edit for each mask, whose rows are of a grey picture of the same size.
 
     Raises:
-        ValueError, OSError: as :func:`edit_rows`.
+        ValueError, OSError: as :func:`edit_tiling`.
     """
-    picture = Picture(source, name)
-    each = replace(passes, kind="float32")
+    each, edited = replace(passes, kind="float32"), []
     with ExitStack() as stack:
-        edited = [
-            Picture(stack.enter_context(intermediate(edit_rows(each, source, recipe, name), picture.size, each.folder)))
-            for recipe in recipes
-        ]
+        for recipe in recipes:
+            with edit_tiling(each, source, recipe, name) as tiling:
+                edited.append(Picture(stack.enter_context(passes.stored(tiling))))
         shares = [Picture(mask) for mask in masks]
 
         def blended(tile: Tile) -> Tensor:
@@ -71,14 +72,29 @@ def edit_regions(
             grey = [reduce_channels(one.tile(tile.start, stop, 0).inner, "luminance").to(image) for one in shares]
             return blend_edited(image, found, torch.cat(grey, dim=1))
 
-        yield from passes.apply_in_tiles(
-            picture, blended, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1])
-        )
+        yield tile_by_tile(passes, Picture(source, name), blended)
 
 
-def step_rows(step: Step, passes: Passes, source: RowSource, name: str) -> Rows:
-    """Yield the rows of a picture after a step."""
+@contextmanager
+def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Iterator[Tiling]:
+    """Yield the rows of a picture after a step, not yet computed."""
     tiled = Tiled(Picture(source, name), passes)
     with single_threaded(passes.workers(1)):
         fitted = fit_step(step, tiled, *strokes_by_rows(step, tiled.size))
-    yield from tiled.rows(fitted)
+    with tiled.tiling(fitted) as tiling:
+        yield tiling
+
+
+def tile_by_tile(passes: Passes, picture: Picture, edit: TileEdit) -> Tiling:
+    """An edit that computes each pixel from that of the picture."""
+    return Tiling(passes, picture, edit, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1]))
+
+
+def inner(tile: Tile) -> Tensor:
+    """The pixels of a tile."""
+    return tile.inner
+
+
+def clipped(tiling: Tiling) -> Tiling:
+    """The same rows, in [0, 1]."""
+    return replace(tiling, edit=lambda tile: tiling.edit(tile).clamp(0, 1))

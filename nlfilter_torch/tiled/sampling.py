@@ -38,6 +38,10 @@ CHUNK = 1 << 16  # scribbled pixels whose factor is in memory at once
 Report = Callable[[str, int, int], None]
 
 
+def in_silence(stage: str, done: int, rows: int) -> None:
+    """Report nothing."""
+
+
 class ColumnCache:
     """Cache of columns between passes, for the first pixels of a picture.
 

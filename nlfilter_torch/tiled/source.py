@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -11,16 +12,15 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.pixels import corner
-from nlfilter_torch.edits.resizing import Read, resized_parts
+from nlfilter_torch.edits.resizing import Read, block_means, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
-from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source, block_means
+from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
-from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.sampling import ColumnCache, take_pilot, visit
 from nlfilter_torch.tiled.scribbles import RegionRows, check_scribble_memory, floats_per_scribbled_pixel, read_scribbles
-from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, cacheable_pixels, rows_that_fit
+from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
 from nlfilter_torch.tiled.workers import Result, in_order, single_threaded
 
 CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses
@@ -317,7 +317,7 @@ class Tiled:
     @property
     def margin(self) -> int:
         """Number of rows around a tile that its columns depend on."""
-        return max((operator.margin for operator in self.operators), default=0)
+        return max((operator.picture_margin for operator in self.operators), default=0)
 
     @property
     def plain(self) -> Passes:
@@ -325,13 +325,19 @@ class Tiled:
         return replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
 
     def rows(self, fitted: Fitted, *, plain: bool = False) -> Rows:
-        """Yield the rows (h, W, S) of the edited picture, in order.
+        """Yield the rows (h, W, S) of the edited picture, in order; arguments as those of :meth:`tiling`."""
+        with self.tiling(fitted, plain=plain) as tiling:
+            yield from tiling
+
+    @contextmanager
+    def tiling(self, fitted: Fitted, *, plain: bool = False) -> Iterator[Tiling]:
+        """Yield the rows of the edited picture, not yet computed; they can be computed within the block.
 
         Args:
             fitted: edit fitted to this source.
             plain: whether rows are in the dtype of the computation, without transparency.
         """
-        passes = self.plain if plain else self.passes
+        passes = replace(self.plain, processes=None) if plain else self.passes  # for an edit that is being fitted
         landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
         rows = self.passes.tile_rows or (
             self.fitting_rows(0, landmarks) if self.operators else TILE_PIXELS // self.size[1]
@@ -341,27 +347,22 @@ class Tiled:
         with single_threaded(workers):
             for operator in self.operators:
                 operator.prepare()  # before several workers need it
-        if fitted.finish is None:
-            yield from passes.apply_in_tiles(
-                self.picture,
-                lambda tile: self.edited(fitted, tile),
-                self.margin,
-                rows,
-                workers=workers,
-                transparent=not plain,
-            )
-            return
-        finish, margin = fitted.finish, fitted.margin
-        before = self.plain.apply_in_tiles(
+        tiling = Tiling(
+            passes,
             self.picture,
             lambda tile: self.edited(fitted, tile),
             self.margin,
             rows,
-            workers=workers,
-            transparent=False,
-            stage="Comparing",
+            together,
+            workers,
+            transparent=not plain,
         )
-        with intermediate(before, self.size, self.passes.folder) as planes:
+        if fitted.finish is None:
+            yield tiling
+            return
+        finish, margin = fitted.finish, fitted.margin
+        before = replace(tiling, passes=replace(passes, kind=self.plain.kind), transparent=False, stage="Comparing")
+        with passes.stored(before) as planes:
             stored = Picture(planes, self.picture.name, channels=planes.shape[2])
 
             def finished(tile: Tile) -> Tensor:
@@ -370,9 +371,7 @@ class Tiled:
                 return found[..., tile.halo[0] : found.shape[2] - tile.halo[1], :]
 
             rows, workers = self._rows_to_finish(fitted, rows, workers)
-            yield from passes.apply_in_tiles(
-                self.picture, finished, margin, rows, workers=workers, transparent=not plain
-            )
+            yield replace(tiling, edit=finished, margin=margin, rows=rows, together=fitted.step, workers=workers)
 
     def _rows_to_finish(self, fitted: Fitted, rows: int, workers: int) -> tuple[int, int]:
         """Rows per tile and number of workers for ``finish``.

@@ -1,9 +1,10 @@
 """Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -12,8 +13,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.tiled import sampling
+from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.pictures import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
-from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.sampling import Report, in_silence
 from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
@@ -21,10 +23,6 @@ TILE_PIXELS = 1 << 17  # longer tiles are no faster
 CHUNK_PIXELS, LARGE_MEMORY = 1 << 14, 1 << 28  # pixels computed together, for speed, if that many bytes may be used
 Statistics = Literal["sample", "full"]
 TileEdit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
-
-
-def in_silence(stage: str, done: int, rows: int) -> None:
-    """Report nothing."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,7 @@ class Passes:
         report: called with the progress.
         folder: for planes between two passes; None is the system's folder for temporary files.
         threads: number of threads that tiles are divided among.
+        processes: compute the tiles of the output in place of these threads, if given.
     """
 
     kind: str
@@ -50,6 +49,7 @@ class Passes:
     report: Report = in_silence
     folder: Path | None = None
     threads: int = field(default_factory=torch.get_num_threads)
+    processes: "Processes | None" = None
 
     @staticmethod
     def of(
@@ -71,6 +71,10 @@ class Passes:
         if self.tile_rows is not None:
             check_count(self.tile_rows, "tile_rows")
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The options in another process, which reports nothing."""
+        return self.__dict__ | {"report": in_silence, "processes": None}
+
     def chunk_rows(self, width: int) -> int:
         """Number of rows that are always computed together; the height of a tile is a multiple of it."""
         return max(1, (CHUNK_PIXELS if self.memory >= LARGE_MEMORY else 1) // width)
@@ -85,32 +89,106 @@ class Passes:
         """Whether a guide of ``guide_bytes`` bytes is kept from one pass to the next."""
         return self.memory >= LARGE_MEMORY and guide_bytes <= self.memory // 4
 
-    def apply_in_tiles(
-        self,
-        picture: Picture,
-        edit: TileEdit,
-        margin: int,
-        rows: int,
-        *,
-        workers: int = 1,
-        transparent: bool = True,
-        stage: str = "Filtering",
-    ) -> Rows:
-        """Yield the edited rows in tiles of ``rows``, with their transparency if ``transparent``."""
+    def stored(self, tiling: "Tiling") -> AbstractContextManager[RowSource]:
+        """Compute rows and store them for a further pass over them, in a temporary file or array."""
+        if self.processes is not None:
+            return self.processes.stored(tiling, self.folder)
+        return intermediate(iter(tiling), tiling.picture.size, self.folder)
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """The rows of an edited picture, which can be computed in any order, and in other processes.
+
+    Iteration computes them in order, in tiles.
+
+    Attributes:
+        passes: tiling options.
+        picture: to be edited.
+        edit: computes the colours of a tile.
+        margin: number of rows around a tile that ``edit`` reads.
+        rows: of a tile, a multiple of ``together``.
+        together: number of rows that are always computed together; tiles begin at multiples of it.
+        workers: number of threads of this process, with a tile each.
+        transparent: whether the output has the transparency of the picture.
+        stage: name for the progress.
+        compare: computes something from rows before and after the edit, both as they are stored.
+        compared: called with each of these results, in this process.
+    """
+
+    passes: Passes
+    picture: Picture
+    edit: TileEdit
+    margin: int
+    rows: int
+    together: int = 1
+    workers: int = 1
+    transparent: bool = True
+    stage: str = "Filtering"
+    compare: Callable[[NDArray[Any], NDArray[Any]], Any] | None = None
+    compared: Callable[[Any], None] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The tiling in another process."""
+        return self.__dict__ | {"compared": None}
+
+    def __iter__(self) -> Rows:
+        """Yield the edited rows, in order."""
 
         def tiles() -> Iterator[Tile]:
-            for tile in picture.tiles(margin, rows):
-                self.report(stage, tile.start, picture.size[0])
+            for tile in self.picture.tiles(self.margin, self.rows):
+                self.passes.report(self.stage, tile.start, self.picture.size[0])
                 yield tile
 
-        def edited_tile(tile: Tile) -> tuple[slice, NDArray[Any]]:
-            values = stored_as(edit(tile), self.kind)
-            if transparent:
-                values = np.concatenate([values, transparency(tile, self.kind)], axis=2)
-            return slice(tile.start, tile.start + len(values)), values
+        def found(tile: Tile) -> tuple[slice, NDArray[Any], list[Any]]:
+            values = self._edited(tile)
+            return slice(tile.start, tile.start + len(values)), values, self._comparison(tile.stored, values)
 
-        yield from in_order(edited_tile, tiles(), workers)
-        self.report(stage, picture.size[0], picture.size[0])
+        for part, values, comparison in in_order(found, tiles(), self.workers):
+            self.note(comparison)
+            yield part, values
+        self.passes.report(self.stage, self.picture.size[0], self.picture.size[0])
+
+    @torch.no_grad()
+    def part(self, start: int, stop: int) -> tuple[NDArray[Any], list[Any]]:
+        """The edited rows from ``start`` to ``stop``, computed in this thread, and the results for :meth:`note`."""
+        last = min(-(-stop // self.together) * self.together, self.picture.size[0])
+        parts, comparisons = [], []
+        for first in range(start // self.together * self.together, last, self.rows):
+            tile = self.picture.tile(first, min(first + self.rows, last), self.margin)
+            wanted = slice(max(start - first, 0), stop - first)
+            parts.append(self._edited(tile)[wanted])
+            comparisons += self._comparison(tile.stored[wanted], parts[-1])
+        return np.concatenate(parts), comparisons
+
+    def note(self, comparisons: list[Any]) -> None:
+        """Pass results of ``compare`` on."""
+        if self.compared is not None:
+            for comparison in comparisons:
+                self.compared(comparison)
+
+    def _edited(self, tile: Tile) -> NDArray[Any]:
+        values = stored_as(self.edit(tile), self.passes.kind)
+        if not self.transparent:
+            return values
+        return np.concatenate([values, transparency(tile, self.passes.kind)], axis=2)
+
+    def _comparison(self, before: NDArray[Any], after: NDArray[Any]) -> list[Any]:
+        return [] if self.compare is None else [self.compare(before, after)]
+
+
+class Processes(Protocol):
+    """Processes that compute tiles and write them to arrays of zarr."""
+
+    @property
+    def on_this_machine(self) -> int:
+        """Number of processes that share the memory of this machine."""
+
+    def fill(self, tiling: Tiling, path: Path) -> None:
+        """Compute rows and write them to the array in a folder."""
+
+    def stored(self, tiling: Tiling, folder: Path | None) -> AbstractContextManager[RowSource]:
+        """Compute rows and store them where all processes can read them."""
 
 
 def factor_bytes(pixels: int, num_landmarks: int) -> int:
@@ -175,7 +253,8 @@ def rows_that_fit(
             f"{picture.name} needs at least {max(row, least) / 1e6:.0f} MB of memory, but only "
             f"{passes.memory / 1e6:.0f} MB may be used; allow more, or use fewer landmarks"
         )
-    tiles, together = 1 + passes.workers(num_landmarks), passes.chunk_rows(picture.size[1]) * picture.size[1]
+    at_once = passes.workers(num_landmarks) if passes.processes is None else passes.processes.on_this_machine
+    tiles, together = 1 + max(1, at_once), passes.chunk_rows(picture.size[1]) * picture.size[1]
     taken = picture.dtype.itemsize * extra_floats + (tiles - 1) * factor_bytes(together, num_landmarks)
     return max(1, min((passes.memory - taken) // (tiles * row), TILE_PIXELS // picture.size[1]))
 
