@@ -25,7 +25,12 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 def run(notebook: Any, folder: Path) -> None:
     """Run all cells with ``folder`` as working directory, and shrink their outputs."""
     client = NotebookClient(
-        notebook, timeout=600, kernel_name="python3", record_timing=False, resources={"metadata": {"path": folder}}
+        notebook,
+        timeout=600,
+        kernel_name="python3",
+        record_timing=False,
+        coalesce_streams=True,  # else text is split by when it was printed
+        resources={"metadata": {"path": folder}},
     )
     client.execute()
     tidy(notebook)

@@ -213,8 +213,10 @@ def test_ties_are_broken_by_one_rule(level: int, image: torch.Tensor, spatial_ba
         )
         return operator.kernel.landmarks, operator @ filtered
 
-    for found, expected in zip(build(), by_torch(build), strict=True):
-        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    (landmarks, result), (expected, by_definition) = build(), by_torch(build)
+    torch.testing.assert_close(landmarks, expected, atol=1e-5, rtol=1e-5)
+    # Balancing enlarges rounding where all landmarks are far away.
+    torch.testing.assert_close(result, by_definition, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(("pixels", "marks"), sizes([1, 300, 8256, 40_000], [1, 3, 50, 900]))

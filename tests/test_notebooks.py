@@ -82,7 +82,8 @@ def test_runs(script: Path, tmp_path: Path, kernel: AsyncKernelManager) -> None:
         notebook.cells.append(nbformat.v4.new_code_cell(DRAG))
     forget = nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}")  # as in a new kernel
     notebook.cells.insert(0, forget)
-    client = NotebookClient(notebook, km=kernel, timeout=300, resources={"metadata": {"path": tmp_path}})
+    resources = {"metadata": {"path": tmp_path}}
+    client = NotebookClient(notebook, km=kernel, timeout=300, coalesce_streams=True, resources=resources)
     client.execute()
     assert client.kc is not None
     client.kc.stop_channels()
