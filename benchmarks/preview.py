@@ -3,7 +3,8 @@
 Each photograph is opened in a session of the editor, edited, and saved. Printed is the root mean square difference in
 grey levels between the picture on the screen, before it becomes a JPEG, and the saved file resized to its size: for
 each edit the mean over all photographs and strides and the largest, the mean of each stride, and by how much the edit
-changes the picture.
+changes the picture. The editor first shows a fast preview, and once nothing has changed for a second the edit of the
+whole photograph; the figures are those of the latter and, below "fast", of the former.
 
 G'MIC and darktable do the same if they are installed (``--peers``): G'MIC edits the photograph and its reduction, and
 darktable exports it in a smaller size from its fast pipeline, which its own preview uses, and from its full one.
@@ -81,7 +82,10 @@ def sized(picture: Tensor, pixels: int, stride: int) -> Tensor:
 
 
 def errors(picture: Tensor, pixels: int, stride: int, recipes: dict[str, Recipe]) -> Iterator[tuple[str, float, float]]:
-    """For each recipe its name, the difference between preview and saved file, and how much the edit changes."""
+    """For each recipe its name, the difference between preview and saved file, and how much the edit changes.
+
+    Then the same for the fast preview.
+    """
     mask.VIEWED = VIEWING_SIZE.default * pixels / PIXELS  # in proportion, as in the editor
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.tif"
@@ -92,9 +96,10 @@ def errors(picture: Tensor, pixels: int, stride: int, recipes: dict[str, Recipe]
         assert round(session.preview.stride) == stride
         for name, recipe in recipes.items():
             session.load(scaled(recipe, pixels))
-            shown = session.render()
             saved = resize(read_photograph(session.save("saved.tif")).pixels, session.preview.size).clamp(0, 1)
-            yield name, levels(shown - saved), levels(saved - session.preview.pixels.clamp(0, 1))
+            change = levels(saved - session.preview.pixels.clamp(0, 1))
+            yield name, levels(session.at_rest(session.recipe) - saved), change
+            yield f"{name} (fast)", levels(session.render() - saved), change
 
 
 def errors_of_peers(picture: Tensor, pixels: int, stride: int) -> Iterator[tuple[str, float, float]]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from nicegui import ui
+from torch import Tensor
 
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.panel import BRUSHES, Brush
@@ -83,14 +84,15 @@ class Canvas:
     def open(self, opened: Opened) -> None:
         """Show a photograph that was opened."""
         preview = opened.preview
+        self._edited = preview.pixels.clamp(0, 1)
         height, width = opened.photograph.size
         self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
         fitting = f"min(100cqw, calc(100cqh * {preview.size[1] / preview.size[0]:.4f}))"
         self._photo.style(f"width: var(--photo-width, {fitting})")
         ui.run_javascript(f"closeup.open({width}, {height}, '/picture/{self._token}')")
         self._mask_shown = None
-        self.pictures = {"before": drawing.picture(preview.pixels.clamp(0, 1))}
-        self.clipped_before = drawing.clipped_shares(preview.pixels.clamp(0, 1))
+        self.pictures = {"before": drawing.picture(self._edited)}
+        self.clipped_before = drawing.clipped_shares(self._edited)
         self._show("before", self._before)
         self._show("before", self._photo)
         self._welcome.set_visibility(False)
@@ -105,12 +107,16 @@ class Canvas:
 
     def draw(self, upto: str | None) -> None:
         """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
-        drawn = self.session.render(upto)
-        self.pictures["after"] = drawing.picture(drawn)
-        self.pictures["clipped"] = drawing.clipped_picture(drawn) if self._show_clipped.value else b""
-        self.histogram, self.clipped = drawing.histogram_svg(drawn), drawing.clipped_shares(drawn)
+        self.take(self.session.render(upto))
         mask = self.session.mask()
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
+
+    def take(self, edited: Tensor) -> None:
+        """Take the edited picture (1, C, h, w), in [0, 1], that is shown next."""
+        self._edited = edited
+        self.pictures["after"] = drawing.picture(edited)
+        self.pictures["clipped"] = drawing.clipped_picture(edited) if self._show_clipped.value else b""
+        self.histogram, self.clipped = drawing.histogram_svg(edited), drawing.clipped_shares(edited)
 
     def show(self) -> None:
         """Show the picture that was computed."""
@@ -137,7 +143,7 @@ class Canvas:
         """Show what is clipped, if it is asked for."""
         wanted = bool(self._show_clipped.value) and self.session.opened is not None
         if wanted and not self.pictures.get("clipped"):
-            self.pictures["clipped"] = drawing.clipped_picture(self.session.render())
+            self.pictures["clipped"] = drawing.clipped_picture(self._edited)
         if wanted:
             self._show("clipped", self._clipped)
         self._clipped.set_visibility(wanted)

@@ -56,6 +56,11 @@ class Closeup:
         self._covered = torch.zeros(-(-height // CELL), -(-width // CELL), dtype=torch.bool)
         self._forget()
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a part is shown at full size, or a slider is moving."""
+        return self._held or self._view is not None
+
     def look(self, view: Any) -> None:
         """Show a part: left, top, right and bottom in pixels of the photograph, or None for no part."""
         self._view = None if view is None else self._part(view)

@@ -11,9 +11,11 @@ from urllib.parse import quote
 
 from nicegui import background_tasks, events, ui
 from nicegui.elements.upload_files import FileUpload
+from torch import Tensor
 
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.access import LARGEST
+from nlfilter_torch.app.at_rest import AtRest
 from nlfilter_torch.app.canvas import Canvas
 from nlfilter_torch.app.closeup import Closeup
 from nlfilter_torch.app.library import Library
@@ -67,6 +69,7 @@ class Editor:
         ui.add_css(CSS)
         ui.add_head_html(LEAVING + SCRIPT)
         self._closeup = Closeup(self._run, self._start, self._tell)
+        self._at_rest = AtRest(self._run, self._start, self._is_preview, self._take)
         self._build_header()
         brush = Brush()
         with ui.element("div").classes("editor"):
@@ -77,7 +80,7 @@ class Editor:
                 handle.classes("handle").on("click", js_handler=FOLD)
                 self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
         ui.keyboard(on_key=self._key)
-        ui.on("closeup", lambda event: self._closeup.look(event.args))
+        ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
         self._client.on_connect(lambda: self._begin(image, address))
 
@@ -211,12 +214,32 @@ class Editor:
             while self._wanted:
                 upto = self._wanted.pop()
                 await self._run("Working", partial(self._canvas.draw, upto))
-                self._canvas.show()
+                self._show()
                 self._draw_response()
-                self._panel.draw_levels(self._canvas.histogram, self._canvas.clipped, self._canvas.clipped_before)
                 self._canvas.draw_mask(moving=upto is not None)
         finally:
             self._drawing = False
+        self._at_rest.drawn(self.session)
+
+    def _show(self) -> None:
+        """Show the picture that the canvas has taken, and its histogram."""
+        self._canvas.show()
+        self._panel.draw_levels(self._canvas.histogram, self._canvas.clipped, self._canvas.clipped_before)
+
+    def _take(self, picture: Tensor) -> None:
+        self._canvas.take(picture)
+        self._show()
+
+    def _look(self, view: Any) -> None:
+        """Show a part at full size, or the whole photograph if ``view`` is None."""
+        self._closeup.look(view)
+        if self.session.opened is not None:
+            self._at_rest.drawn(self.session)
+
+    def _is_preview(self, session: Session) -> bool:
+        """Whether the page shows the preview of a session, and nothing is being drawn or moved."""
+        gone, drawing = self._client.is_deleted, self._drawing or bool(self._wanted)
+        return self.session is session and not (gone or drawing or self._closeup.is_busy)
 
     def _draw_response(self) -> None:
         detail = self.session.recipe.last("detail")

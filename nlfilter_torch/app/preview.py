@@ -1,7 +1,8 @@
 """A reduced picture under an edit, fast enough to follow a slider.
 
 A photograph is reduced to the size at which edits of brightness look at it, so that the preview holds the very picture
-that these work on. What depends on the pixels of the photograph itself comes from there: :class:`Reduced`.
+that these work on. What depends on the pixels of the photograph itself comes from there. Edits of single pixels differ
+a little from what a file will hold, which :meth:`~nlfilter_torch.app.session.Session.at_rest` computes.
 
 Slow results are cached with the settings they depend on: the layers that the sliders weigh, the filter for masks, the
 filter of the step that is being changed, and the picture after each step.

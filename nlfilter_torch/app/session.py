@@ -13,6 +13,7 @@ from nlfilter_torch.app.sidecar import Sidecar
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, thin
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io import tiff
 from nlfilter_torch.io.photographs import (
     BITS,
@@ -72,6 +73,7 @@ class Session:
         self._kept = Recipe()  # what the sidecar holds
         self._drawing = threading.Lock()  # previews keep what was computed, one picture at a time
         self._fitting = threading.Lock()  # and so do parts at full size
+        self._at_rest: tuple[tuple[Step, ...], Tensor] | None = None  # the last result, for other tabs
         self._pixels = pixels
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
@@ -94,6 +96,7 @@ class Session:
         pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
         self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels), parts, pages)
         self.recipe = self._shown = self.saved = Recipe()
+        self._at_rest = None
         self._past, self._future = [], []
 
     def keep_in(self, sidecar: Sidecar) -> None:
@@ -220,6 +223,29 @@ class Session:
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
         """
+        with self._fitting:
+            return self._fitted(recipe, report).edited(place)
+
+    def at_rest(self, recipe: Recipe, report: Report = in_silence) -> Tensor:
+        """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.
+
+        :meth:`render` is fast, and approximate for edits that depend on single pixels; this takes as long as saving.
+
+        Args:
+            recipe: the edit.
+            report: told of the progress; may raise an error to interrupt.
+
+        Raises:
+            ValueError, OSError, MemoryError: as :meth:`part`.
+        """
+        with self._fitting:
+            if self._at_rest is None or self._at_rest[0] != recipe.acting:
+                found = self._fitted(recipe, report).reduced(self.preview.size, report)
+                self._at_rest = recipe.acting, found
+            return self._at_rest[1]
+
+    def _fitted(self, recipe: Recipe, report: Report) -> Parts:
+        """The parts of the photograph, with an edit fitted to the whole."""
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to show")
         photograph, parts = self.opened.photograph, self.opened.parts
@@ -229,9 +255,8 @@ class Session:
             memory=tile_memory(),
             report=report,
         )
-        with self._fitting:
-            parts.fit(recipe, passes)
-            return parts.edited(place)
+        parts.fit(recipe, passes)
+        return parts
 
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""

@@ -16,12 +16,13 @@ from torch import Tensor
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, RowSource
-from nlfilter_torch.tiled.sampling import ColumnCache
+from nlfilter_torch.tiled.sampling import ColumnCache, Report, in_silence
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.strokes import strokes_by_rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics
@@ -224,6 +225,21 @@ class Parts:
         if self._last is None:
             return self.original(part)
         return edited_part(*self._last, part).clamp(0, 1)
+
+    def reduced(self, size: tuple[int, int], report: Report = in_silence) -> Tensor:
+        """The whole picture after the edit that was fitted last, reduced to a smaller size, (1, C, h, w) in [0, 1].
+
+        Args:
+            size: (h, w).
+            report: told how many of the rows are done; may raise an error to interrupt.
+        """
+        height, width = self._stages[0].picture.size
+
+        def read(start: int, stop: int) -> Tensor:
+            report("Full size", start, height)
+            return self.edited(Rectangle(range(start, stop), range(width)))
+
+        return resized(read, (height, width), size).clamp(0, 1)
 
     def original(self, part: Rectangle) -> Tensor:
         """A rectangle (1, C, h, w) of the picture, in [0, 1]."""

@@ -1,0 +1,69 @@
+"""The picture of a page at rest: what a file would hold, in place of the preview."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from nlfilter_torch.app.closeup import OutdatedError
+from nlfilter_torch.app.session import Session
+from nlfilter_torch.core.progress import Progress
+from nlfilter_torch.edits.recipe import Recipe
+
+QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
+
+
+class AtRest:
+    """Replaces the preview by the photograph under the edit, reduced, once nothing has changed for a second.
+
+    Args:
+        run: runs something in a thread while the page says what it does; see ``Editor``.
+        start: starts a task in the background, and reports its failure.
+        wanted: whether a session and its current edit are what the page shows as a preview.
+        show: shows the result.
+    """
+
+    def __init__(
+        self,
+        run: Callable[[str, Callable[[], Any], Progress], Awaitable[Any]],
+        start: Callable[[Awaitable[None]], None],
+        wanted: Callable[[Session], bool],
+        show: Callable[[Tensor], None],
+    ) -> None:
+        self._run, self._start, self._wanted, self._show = run, start, wanted, show
+        self._working = False
+        self._again: Session | None = None
+
+    def drawn(self, session: Session) -> None:
+        """Begin anew: the preview of a session has been drawn."""
+        if session.preview.stride > 1 and session.recipe.acting:
+            self._again = session
+            if not self._working:
+                self._start(self._work())
+
+    async def _work(self) -> None:
+        self._working = True
+        try:
+            while self._again is not None:
+                session, self._again = self._again, None
+                await asyncio.sleep(QUIET)
+                with suppress(OutdatedError):
+                    await self._edit(session, session.recipe)
+        finally:
+            self._working = False
+
+    async def _edit(self, session: Session, recipe: Recipe) -> None:
+        progress = Progress()
+
+        def report(stage: str, done: int, total: int) -> None:
+            if self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session):
+                raise OutdatedError
+            progress(stage, done, total)
+
+        report("Full size", 0, 1)
+        picture = await self._run("Full size", partial(session.at_rest, recipe, report), progress)
+        report("Full size", 1, 1)
+        self._show(picture)
