@@ -9,7 +9,13 @@ import torch.nn.functional as F
 
 from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.colour import balance_in_memory, change_luminance
+from nlfilter_torch.edits.colour import (
+    balance_of,
+    balanced_change,
+    change_luminance,
+    limited_change,
+    move_luminance,
+)
 from nlfilter_torch.edits.detail import limit_by_activity, split_sliders
 from nlfilter_torch.edits.resizing import resize, resized
 from nlfilter_torch.edits.viewing import viewed_size
@@ -36,10 +42,27 @@ def drawn(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return image, torch.randn(2, 1, 40, 40, generator=generator, dtype=torch.float64)
 
 
+def balanced(image: torch.Tensor, change: torch.Tensor, brighter: float = 0.0) -> torch.Tensor:
+    return move_luminance(image, *balanced_change(image, change, brighter))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_whole_image_is_balanced_as_its_parts_are(channels: int) -> None:
+    image, change = drawn()
+    image = image[:, :channels]
+    balance = balance_of(lambda function: function(image, change).mean((2, 3), keepdim=True), 0.05)
+    for found, expected in zip(
+        balanced_change(image, change, 0.05), limited_change(image, change, balance), strict=True
+    ):
+        if found is None or expected is None:
+            assert found is expected is None
+        else:
+            torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+
+
 def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
     image, change = drawn()
-    for balance in (None, balance_in_memory(image, change)):
-        found = change_luminance(image, change, balance=balance)
+    for found in (change_luminance(image, change), balanced(image, change)):
         levels = (255 * found).round()
         assert not bool(((levels <= 0) & (image > 0)).any())  # no channel clips that did not before
         assert not bool(((levels >= 255) & (image < 1)).any())
@@ -56,7 +79,7 @@ def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
     torch.testing.assert_close(change_luminance(middle, middle[:, :1] * 0.002), middle + 0.001, atol=2e-6, rtol=0)
     still = torch.zeros_like(change)
     assert torch.equal(change_luminance(image, still), image)
-    assert torch.equal(change_luminance(image, still, balance=balance_in_memory(image, still)), image)
+    assert torch.equal(balanced(image, still), image)
     assert torch.equal(change_luminance(image, change, "none"), image + change)
 
 
@@ -81,8 +104,7 @@ def test_balance_keeps_mean_brightness_and_chroma(channels: int) -> None:
     alone = means(change_luminance(image, change))
     assert (alone[0] - means(image)[0]).abs().min() > 0.004
     for brighter in (0.0, 0.05):
-        balance = balance_in_memory(image, change, brighter)
-        found = means(change_luminance(image, change, balance=balance))
+        found = means(balanced(image, change, brighter))
         torch.testing.assert_close(found[0], (1 + brighter) * means(image)[0], atol=2e-6, rtol=0)
         torch.testing.assert_close(found[1], means(image)[1], atol=2e-6, rtol=0)
 
@@ -121,7 +143,7 @@ def test_soft_limits_do_not_clip_and_none_is_the_plain_sum(name: str) -> None:
     chroma = [x - luminance(x) for x in (hard, image)]
     torch.testing.assert_close(chroma[0], chroma[1], atol=1e-5, rtol=0)  # the change is the same in all channels
     change = luminance(hard) - luminance(image)
-    limited = change_luminance(image, change, balance=balance_in_memory(image, change))
+    limited = balanced(image, change)
     torch.testing.assert_close(limited, soft, atol=1e-5, rtol=0)
     with pytest.raises(ValueError, match="limits must be one of 'soft', 'none', got 'hard'"):
         EDITS[name](image, limits="hard")

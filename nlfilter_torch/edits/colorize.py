@@ -231,5 +231,5 @@ def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
 
     before = viewed.all(Fitted(twice))
     found = viewed.all(Fitted(lambda some: chroma(some)[:, ::2]))  # without green
-    changes = Coarse.of(before, before, found, "none", None).changes(source, twice)
+    changes = Coarse.of(before, found, None, "none").changes(source, twice)
     return Fitted(lambda some: merge_luminance(luminance(some), with_green(changes(some)[0])))

@@ -104,28 +104,51 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
     """
 
     def shifts(image: Tensor, change: Tensor) -> Tensor:
-        before = _before(image, change)
-        moved = _limited(image, change)
-        after = before + moved
-        return torch.cat([moved, before, after * (1 - after)], dim=1)
+        return _shifts(_before(image, change), _limited(image, change))
 
-    moved, before, room = mean(shifts).chunk(3, dim=1)
-    curve = ((moved - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
+    curve = _curve(mean(shifts), brighter)
 
     def chromas(image: Tensor, change: Tensor) -> Tensor:
         if change.shape[1] == image.shape[1]:
             return image.new_zeros(len(image), 2, *image.shape[2:])
-        scale, more = _saturation(image, _curved(image, change, curve))
-        chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
-        return torch.cat([-scale * chroma, more * chroma], dim=1)
+        return _chromas(image, *_saturation(image, _curved(image, change, curve)))
 
-    lost, gained = mean(chromas).chunk(2, dim=1)
-    return Balance(curve, (lost / gained.clamp(min=EPSILON)).clamp(max=1.0))
+    return Balance(curve, _colour(mean(chromas)))
 
 
-def balance_in_memory(image: Tensor, change: Tensor, brighter: float | Tensor = 0.0) -> Balance:
-    """Compute :func:`balance_of` for an image (B, C, H, W) and its change."""
-    return balance_of(lambda function: function(image, change).mean((2, 3), keepdim=True), brighter)
+def balanced_change(image: Tensor, change: Tensor, brighter: float | Tensor = 0.0) -> tuple[Tensor, Tensor | None]:
+    """:func:`limited_change` of a whole image (B, C, H, W) under its balance, with nothing computed twice."""
+    before, moved = _before(image, change), _limited(image, change)
+    curve = _curve(_shifts(before, moved).mean((2, 3), keepdim=True), brighter)
+    moved = _bent(before, moved, curve)
+    if change.shape[1] == image.shape[1]:
+        return moved, None
+    less, more = _saturation(image, moved)
+    return moved, less + _colour(_chromas(image, less, more).mean((2, 3), keepdim=True)) * more
+
+
+def _shifts(before: Tensor, moved: Tensor) -> Tensor:
+    """Planes (B, 3S, H, W) whose means :func:`_curve` needs."""
+    after = before + moved
+    return torch.cat([moved, before, after * (1 - after)], dim=1)
+
+
+def _curve(means: Tensor, brighter: float | Tensor) -> Tensor:
+    """Parameter of the tone curve that corrects the mean brightness."""
+    moved, before, room = means.chunk(3, dim=1)
+    return ((moved - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
+
+
+def _chromas(image: Tensor, less: Tensor, more: Tensor) -> Tensor:
+    """Lost and possible gained chroma, (B, 2, H, W), whose means :func:`_colour` needs."""
+    chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
+    return torch.cat([-less * chroma, more * chroma], dim=1)
+
+
+def _colour(means: Tensor) -> Tensor:
+    """Fraction of the possible gain in saturation that makes up for what is lost."""
+    lost, gained = means.chunk(2, dim=1)
+    return (lost / gained.clamp(min=EPSILON)).clamp(max=1.0)
 
 
 def _before(image: Tensor, change: Tensor) -> Tensor:
@@ -157,8 +180,12 @@ def _limited(image: Tensor, change: Tensor) -> Tensor:
 
 def _curved(image: Tensor, change: Tensor, curve: float | Tensor) -> Tensor:
     """Limit the change, and apply the tone curve after it."""
-    moved = _limited(image, change)
-    after = _before(image, change) + moved
+    return _bent(_before(image, change), _limited(image, change), curve)
+
+
+def _bent(before: Tensor, moved: Tensor, curve: float | Tensor) -> Tensor:
+    """Apply the tone curve after a change."""
+    after = before + moved
     return moved - curve * after * (1 - after)
 
 

@@ -109,9 +109,10 @@ def fit_change(
             lambda image, found: change_luminance(image, finish(image, found), limits, balance),
             fitted.margin,
         )
-    before, after = reduced.all(Fitted(planes)), reduced.all(fitted)
-    image = reduced.all(Fitted(lambda pixels: pixels.image)) if limits == "soft" else before
-    coarse = Coarse.of(image, before, after, limits, balance)
+    before, after, saturation = reduced.all(Fitted(planes)), reduced.all(fitted), None
+    if limits == "soft":
+        after, saturation = limited_change(reduced.all(Fitted(lambda pixels: pixels.image)), after, balance)
+    coarse = Coarse.of(before, after, saturation, limits)
     found = coarse.changes(source, planes)
     return Fitted(lambda pixels: coarse.change(pixels.image, *found(pixels)))
 
@@ -132,11 +133,8 @@ class Coarse:
     limits: Limits
 
     @staticmethod
-    def of(image: Tensor, before: Tensor, change: Tensor, limits: Limits, balance: Balance | None) -> "Coarse":
-        """Limit the change of planes of an image."""
-        saturation = None
-        if limits == "soft":
-            change, saturation = limited_change(image, change, balance)
+    def of(before: Tensor, change: Tensor, saturation: Tensor | None, limits: Limits) -> "Coarse":
+        """Join planes, their change and, if they are luminance, the change of saturation."""
         parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
