@@ -30,7 +30,7 @@ from benchmarks.photographs import pictures
 from benchmarks.unsharp import gaussian
 from nlfilter_torch import enhance
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.colour import balance_in_memory, change_luminance, edit_luminance
+from nlfilter_torch.edits.colour import balanced_change, edit_luminance, move_luminance
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.operator.features import reduce_channels
@@ -127,7 +127,7 @@ def ours(image: Tensor) -> Strength:
 
     def edit(strength: float) -> Tensor:
         moved = strength * change
-        return change_luminance(image, moved, balance=balance_in_memory(image, moved))
+        return move_luminance(image, *balanced_change(image, moved))
 
     return edit
 
