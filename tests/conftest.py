@@ -28,6 +28,15 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+@pytest.fixture(params=[False, True], ids=["memory", "tiles"])
+def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether commands and the editor work in tiles, as for large photographs."""
+    if request.param:
+        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+        monkeypatch.setattr("nlfilter_torch.app.session.FIFTH", 0)
+    return bool(request.param)
+
+
 @pytest.fixture
 def session(tmp_path: Path) -> "Session":
     """A session of the editor with a small photograph open: cat.png, in the folder that the session saves to."""

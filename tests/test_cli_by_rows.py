@@ -47,8 +47,8 @@ def detail(*arguments: object) -> int:
     return main(["detail", *map(str, arguments), "--landmarks", "40"])
 
 
+@pytest.mark.usefixtures("tiled")
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("tiled", [False, True])
 @pytest.mark.parametrize(
     ("kind", "note"), [(tifffile.FILETYPE.REDUCEDIMAGE, False), (tifffile.FILETYPE.PAGE, True)], ids=["reduced", "page"]
 )
@@ -56,13 +56,9 @@ def test_of_several_pages_the_first_is_edited(
     tmp_path: Path,
     kind: int,
     note: bool,
-    tiled: bool,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A reduced version of the photograph is no further page."""
-    if tiled:
-        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
     picture = cat(40, 60, 3)
     with tifffile.TiffWriter(tmp_path / "in.tif") as file:
         file.write(picture, photometric="rgb")

@@ -12,14 +12,6 @@ from nlfilter_torch.cli import main
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 
-@pytest.fixture(params=[False, True], ids=["memory", "tiles"])
-def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether the photograph is edited in tiles."""
-    if request.param:
-        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
-    return bool(request.param)
-
-
 def write(path: Path, noise: float, *, alpha: bool = False) -> Path:
     ramp = torch.linspace(0.2, 0.8, 96).expand(1, 3, 64, 96)
     pixels = ramp + noise / 255 * torch.randn(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))

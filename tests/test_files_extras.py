@@ -56,14 +56,10 @@ def test_what_other_programs_wrote(tmp_path: Path) -> None:
     assert read_extras(tmp_path / "plain.tif") == Extras()
 
 
-@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.usefixtures("tiled")
 @pytest.mark.parametrize(("name", "depth"), [("in.tif", "uint16"), ("in.jpg", "uint8")])
-def test_commands_carry_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, depth: str, tiled: bool
-) -> None:
+def test_commands_carry_them(tmp_path: Path, name: str, depth: str) -> None:
     write_photograph(Photograph(cat(4), depth, extras=EXTRAS), tmp_path / name)  # type: ignore[arg-type]
-    if tiled:
-        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
     for out in ("out.tif", "out.png"):
         assert main(["tone", str(tmp_path / name), str(tmp_path / out), "--landmarks", "20"]) == 0
         check(tmp_path / out)

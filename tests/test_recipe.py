@@ -289,7 +289,7 @@ def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
     assert torch.equal(read_photograph(out).pixels, read_photograph(tmp_path / "same.png").pixels)
 
 
-@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.usefixtures("tiled")
 @pytest.mark.parametrize(
     ("step", "sentence"),
     [
@@ -303,12 +303,8 @@ def test_apply_notes(
     tmp_path: Path,
     step: Step,
     sentence: str,
-    tiled: bool,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if tiled:
-        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
     write_photograph(Photograph(pixels), tmp_path / "in.png")
     (tmp_path / "edit.json").write_text(Recipe((step,)).to_json(drawn=True))
     files = [str(tmp_path / name) for name in ("in.png", "out.png", "edit.json")]

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from nlfilter_torch.app.closeup import OutdatedError
+from nlfilter_torch.app.closeup import OutdatedError, interrupted
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.edits.recipe import Recipe
@@ -56,13 +56,11 @@ class AtRest:
             self._working = False
 
     async def _edit(self, session: Session, recipe: Recipe) -> None:
+        def is_outdated() -> bool:
+            return self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session)
+
         progress = Progress()
-
-        def report(stage: str, done: int, total: int) -> None:
-            if self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session):
-                raise OutdatedError
-            progress(stage, done, total)
-
+        report = interrupted(progress, is_outdated)
         report("Full size", 0, 1)
         picture = await self._run("Full size", partial(session.at_rest, recipe, report), progress)
         report("Full size", 1, 1)

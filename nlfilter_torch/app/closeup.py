@@ -12,6 +12,7 @@ from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.tiled.parts import Rectangle
+from nlfilter_torch.tiled.sampling import Report
 
 CELL = 64  # pixels; pieces consist of squares of that size
 PIECE = 1 << 19  # pixels of a piece, at most
@@ -21,6 +22,17 @@ LARGEST = 40_000_000  # pixels that a page may ask for at once
 
 class OutdatedError(Exception):
     """The edit has changed meanwhile."""
+
+
+def interrupted(report: Report, is_outdated: Callable[[], bool]) -> Report:
+    """Pass reports on, and raise OutdatedError at the first one after something is outdated."""
+
+    def interrupting(stage: str, done: int, total: int) -> None:
+        if is_outdated():
+            raise OutdatedError
+        report(stage, done, total)
+
+    return interrupting
 
 
 class Closeup:
@@ -144,12 +156,7 @@ class Closeup:
 
     def _work_out(self, session: Session, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
         """A piece; runs in a thread."""
-
-        def report(stage: str, done: int, total: int) -> None:
-            if self._is_outdated(session, recipe):
-                raise OutdatedError
-            progress(stage, done, total)
-
+        report = interrupted(progress, lambda: self._is_outdated(session, recipe))
         return drawing.lossless(session.part(part, recipe, report))
 
     def _add(self, part: Rectangle, content: bytes) -> None:

@@ -233,7 +233,7 @@ class Editor:
     def _look(self, view: Any) -> None:
         """Show a part at full size, or the whole photograph if ``view`` is None."""
         self._closeup.look(view)
-        if self.session.opened is not None:
+        if view is None and self.session.opened is not None:
             self._at_rest.drawn(self.session)
 
     def _is_preview(self, session: Session) -> bool:

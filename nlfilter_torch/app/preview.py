@@ -11,14 +11,13 @@ filter of the step that is being changed, and the picture after each step.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
-from nlfilter_torch.edits.colour import balanced_change, limited_change, move_luminance, nearby_or_far
+from nlfilter_torch.edits.colour import balanced_change, move_luminance, nearby_or_far
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
@@ -218,14 +217,13 @@ class Preview:
         change = limit_by_activity(found, self._activity(detail), detail["threshold"] / 255)
         rows = [detail["alpha"], detail.sliders_inside]
         brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
-        moved, saturation = change, None
-        if detail["limits"] == "soft":
-            limited = limited_change if brighter is None else partial(balanced_change, brighter=brighter)
-            moved, saturation = limited(self.pixels, change)
+        limits, saturation = detail["limits"], None
+        if limits == "soft":
+            change, saturation = balanced_change(self.pixels, change, brighter)
         if self.stride == 1:
-            return self.pixels + moved if detail["limits"] == "none" else move_luminance(self.pixels, moved, saturation)
+            return move_luminance(self.pixels, change, saturation, limits)
         luminance = reduce_channels(self.pixels, "luminance")
-        coarse = Coarse.of(luminance, moved, saturation, detail["limits"])
+        coarse = Coarse.of(luminance, change, saturation, limits)
         return coarse.change(self.pixels, *coarse.left(luminance, self.stride))
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:

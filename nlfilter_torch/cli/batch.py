@@ -40,9 +40,7 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="The address of a Dask cluster, such as tcp://host:8786, or Ray cluster, such as ray://host:10001, whose "
-        "workers edit the photographs in place of this machine. They have one thread each and see the folders under "
-        "the same names. Needs the extra cluster or ray.",
+        help=f"The {options.ADDRESS} edit the photographs in place of this machine. {options.ON_CLUSTER}",
     ),
 ]
 

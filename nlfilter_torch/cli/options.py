@@ -123,13 +123,13 @@ Workers = Annotated[
         help="With zarr arrays as IN and OUT: filter and write their parts by this many processes instead of threads.",
     ),
 ]
+ADDRESS = "address of a Dask cluster, such as tcp://host:8786, or Ray cluster, such as ray://host:10001, whose workers"
+ON_CLUSTER = "They have one thread each and see the folders under the same names. Needs the extra cluster or ray."
 Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="With zarr arrays as IN and OUT: the address of a Dask cluster, such as tcp://host:8786, or Ray cluster, "
-        "such as ray://host:10001, whose workers filter and write their parts. They have one thread each and see the "
-        "folders under the same names. Needs the extra cluster or ray.",
+        help=f"With zarr arrays as IN and OUT: the {ADDRESS} filter and write their parts. {ON_CLUSTER}",
     ),
 ]
 

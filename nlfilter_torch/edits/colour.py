@@ -63,9 +63,8 @@ def change_luminance(image: Tensor, change: Tensor, limits: Limits = "soft", bal
         >>> change_luminance(sky, torch.full((1, 1, 1, 1), 0.1)).flatten()
         tensor([0.6951, 0.8665, 0.9950])
     """
-    if limits == "none":
-        return image + change
-    return move_luminance(image, *limited_change(image, change, balance))
+    moved, saturation = (change, None) if limits == "none" else limited_change(image, change, balance)
+    return move_luminance(image, moved, saturation, limits)
 
 
 def limited_change(image: Tensor, change: Tensor, balance: Balance | None = None) -> tuple[Tensor, Tensor | None]:
@@ -83,8 +82,10 @@ def limited_change(image: Tensor, change: Tensor, balance: Balance | None = None
     return moved, less + balance.colour * more
 
 
-def move_luminance(image: Tensor, moved: Tensor, saturation: Tensor | None) -> Tensor:
+def move_luminance(image: Tensor, moved: Tensor, saturation: Tensor | None, limits: Limits = "soft") -> Tensor:
     """Add the result of :func:`limited_change` to an image, clamped to the limits of :func:`change_luminance`."""
+    if limits == "none":
+        return image + moved
     before = image if saturation is None else reduce_channels(image, "luminance")
     low, high = _ends(before)
     moved = torch.minimum(torch.maximum(moved, low - before), high - before)
@@ -116,8 +117,15 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
     return Balance(curve, _colour(mean(chromas)))
 
 
-def balanced_change(image: Tensor, change: Tensor, brighter: float | Tensor = 0.0) -> tuple[Tensor, Tensor | None]:
-    """:func:`limited_change` of a whole image (B, C, H, W) under its balance, with nothing computed twice."""
+def balanced_change(
+    image: Tensor, change: Tensor, brighter: float | Tensor | None = 0.0
+) -> tuple[Tensor, Tensor | None]:
+    """:func:`limited_change` of a whole image (B, C, H, W) under its balance, with nothing computed twice.
+
+    Without a balance if ``brighter`` is None.
+    """
+    if brighter is None:
+        return limited_change(image, change)
     before, moved = _before(image, change), _limited(image, change)
     curve = _curve(_shifts(before, moved).mean((2, 3), keepdim=True), brighter)
     moved = _bent(before, moved, curve)

@@ -147,9 +147,7 @@ class Coarse:
 
     def change(self, image: Tensor, moved: Tensor, saturation: Tensor) -> Tensor:
         """Apply a change of the planes and of the saturation to pixels of the picture."""
-        if self.limits == "none":
-            return image + moved
-        return move_luminance(image, moved, saturation if saturation.shape[1] else None)
+        return move_luminance(image, moved, saturation if saturation.shape[1] else None, self.limits)
 
     def left(self, planes: Tensor, stride: float) -> tuple[Tensor, Tensor]:
         """Changes in a preview at the viewing size, as if it had been enlarged, changed and reduced again."""

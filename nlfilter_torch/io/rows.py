@@ -262,9 +262,8 @@ def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[Any], like: Sto
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
         )
         with claimed(beside):
-            processes = rows.passes.processes if isinstance(rows, Tiling) else None
-            if processes is not None and isinstance(rows, Tiling):
-                processes.fill(rows, beside)
+            if isinstance(rows, Tiling) and rows.passes.processes is not None:
+                rows.passes.processes.fill(rows, beside)
             else:
                 start = 0
                 for band in tiff.bands((part for _, part in rows), CHUNK):

@@ -69,13 +69,9 @@ def page(large: Session, monkeypatch: pytest.MonkeyPatch) -> Page:
     return Page(large)
 
 
-@pytest.mark.parametrize("tiles", [False, True])
+@pytest.mark.usefixtures("tiled")
 @pytest.mark.parametrize("name", RECIPES)
-def test_the_picture_at_rest_is_the_saved_file(
-    name: str, tiles: bool, large: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if tiles:
-        monkeypatch.setattr("nlfilter_torch.app.session.FIFTH", 0)
+def test_the_picture_at_rest_is_the_saved_file(name: str, large: Session) -> None:
     large.load(RECIPES[name])
     saved = resize(read_photograph(large.save("out.png")).pixels, large.preview.size).clamp(0, 1)
     shown = large.at_rest(large.recipe)

@@ -41,14 +41,10 @@ RECIPES = {
 }
 
 
-@pytest.mark.parametrize("tiles", [False, True])
+@pytest.mark.usefixtures("tiled")
 @pytest.mark.parametrize("name", RECIPES)
-def test_what_is_shown_at_full_size_is_what_is_saved(
-    name: str, tiles: bool, session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_shown_at_full_size_is_what_is_saved(name: str, session: Session) -> None:
     """They agree to one grey level, whether the photograph is saved in memory or, as large ones are, in tiles."""
-    if tiles:
-        monkeypatch.setattr("nlfilter_torch.app.session.FIFTH", 0)
     session.load(RECIPES[name])
     saved = read_photograph(session.save("out.png")).pixels
     shown = session.part(PLACE, session.recipe)
