@@ -2,16 +2,21 @@
 
 Prints medians and quartiles of 20, in milliseconds, on a square preview; with ``--browser`` from the pointer's move to
 the picture in a headless Chromium as well, over the server and its pictures as JPEG. Then, for a photograph of
-``--megapixels``, from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new.
+``--megapixels``, from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new; the time to
+open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with the same edit, and the
+memory at the peak, above that before the photograph was opened.
 """
 
 import argparse
 import asyncio
+import multiprocessing
 import platform
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +24,25 @@ import skimage.data
 import torch
 import torch.nn.functional as F
 
+from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.whole import measure
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.closeup import Closeup
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.scribbles import Stroke
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 REPEATS = 20
 VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800
+
+HERE = ((0.4, 0.4), (0.5, 0.4))
+SAVED = {
+    "detail": Step("detail", alpha=(2.0, 2.0, 2.0, 1.0)),
+    "recolor": Step("recolor", (Stroke(HERE, 0.02, "#2040e0"),)),
+    "denoise": Step("denoise"),
+}
 
 
 def photograph(height: int, width: int) -> torch.Tensor:
@@ -45,7 +61,7 @@ def milliseconds(work: Callable[[], object]) -> float:
 def report(name: str, times: list[float]) -> None:
     """Print a line of the table."""
     low, middle, high = statistics.quantiles(times, n=4) if len(times) > 1 else times * 3
-    print(f"{name:<44} {middle:>8.0f}   {low:.0f} to {high:.0f}")
+    print(f"{name:<52} {middle:>8.0f}   {low:.0f} to {high:.0f}")
 
 
 def in_the_library(path: Path) -> None:
@@ -127,6 +143,32 @@ def at_full_size(path: Path) -> None:
         report(f"{name}, all of it", [look(0.5, 0.3 + 0.2 * i) for i in range(3)])
 
 
+def opened_and_saved(path: Path, edit: str) -> tuple[float, float, float]:
+    """Milliseconds to open the first photograph of a process and to save an edit of it, and MB above the start."""
+    session = Session(path.parent)
+    forget_peak()
+    before = resident("VmRSS")
+    opening = milliseconds(lambda: session.open(path))
+    session.load(Recipe((SAVED[edit],)))
+    saving = milliseconds(lambda: session.save("saved.jpg"))
+    return opening, saving, (resident("VmHWM") - before) * MIB / 1e6
+
+
+def files(path: Path) -> None:
+    """Opening and saving in the editor, and on the command line."""
+    folder = path.parent
+    for edit, step in SAVED.items():
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
+            opening, saving, memory = fresh.submit(opened_and_saved, path, edit).result()
+        preset = folder / "edit.json"
+        preset.write_text(Recipe((step,)).to_json())
+        call = ["-m", "nlfilter_torch", "apply", str(path), str(folder / "out" / "out.jpg"), "--preset", str(preset)]
+        _, wall, _ = measure("apply", [sys.executable, *call], folder)
+        report("open", [opening])
+        report(f"save {edit}, {memory:.0f} MB above the start", [saving])
+        report("the same on the command line", [1e3 * wall])
+
+
 def in_the_browser(path: Path) -> None:
     """From the pointer's move to the picture in the page."""
     from tests.app.browser import Editor, Tab, chromium
@@ -164,14 +206,16 @@ def main() -> None:
     parser.add_argument("--browser", action="store_true", help="with headless Chromium too")
     arguments = parser.parse_args()
     print(f"{arguments.side}x{arguments.side} pixels, {torch.get_num_threads()} threads, {platform.machine()}")
-    print(f"{'milliseconds, median and quartiles':<44}")
+    print(f"{'milliseconds, median and quartiles':<52}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.png"
         write_photograph(Photograph(photograph(arguments.side, arguments.side)), path)
         in_the_library(path)
-        large = Path(folder) / "large.tif"
+        large, compressed = Path(folder) / "large.tif", Path(folder) / "large.jpg"
         height = round((arguments.megapixels * 1e6 / 1.5) ** 0.5)
-        write_photograph(Photograph(photograph(height, round(1.5 * height))), large)
+        for file in (large, compressed):
+            write_photograph(Photograph(photograph(height, round(1.5 * height))), file)
+        files(compressed)
         at_full_size(large)
         if arguments.browser:
             in_the_browser(path)

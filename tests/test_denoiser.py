@@ -88,6 +88,25 @@ def test_rows_that_begin_at_a_tile_are_those_of_the_whole() -> None:
     torch.testing.assert_close(lower[..., SIDE:, :], whole[..., STEP + SIDE :, :], rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("inner", [(slice(80, 200), slice(None)), (slice(None), slice(30, 31)), (slice(299, 300),) * 2])
+def test_only_the_tiles_of_a_part_are_computed(inner: tuple[slice, slice]) -> None:
+    image = noisy(colour("chelsea", 300, 300)[:, :1], 0.1)
+    noise, computed = torch.full_like(image, 0.1), []
+
+    def watched(tiles: torch.Tensor, levels: torch.Tensor) -> torch.Tensor:
+        computed.append(len(tiles))
+        return TRAINED_ONE.estimate_noise(tiles, levels)
+
+    with torch.no_grad():
+        whole = in_tiles(image, noise, watched)
+        count = sum(computed)
+        computed.clear()
+        part = in_tiles(image, noise, watched, inner)
+    torch.testing.assert_close(part[..., *inner], whole[..., *inner], rtol=0, atol=1e-6)
+    assert part.isfinite().all()
+    assert sum(computed) < 0.8 * count
+
+
 def test_colours_are_split_and_joined() -> None:
     image = torch.rand(2, 3, 4, 6, generator=seeded(0)).double()
     planes, noise = split_colours(image, torch.full((2, 1, 4, 6), 0.3).double())

@@ -39,6 +39,13 @@ def run(source: Path, target: Path, *more: str) -> int:
     return main(["mask", str(source), str(target), "--region", REGION, "--background", GROUND, *more])
 
 
+def floats(path: Path) -> np.ndarray:
+    """The plane in a PFM file."""
+    head, size, scale, values = path.read_bytes().split(b"\n", 3)
+    assert (head, size, scale) == (b"Pf", b"80 64", b"-1.0")
+    return np.frombuffer(values, "<f4").reshape(SIZE)[::-1]
+
+
 def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = expected(photograph)
     assert run(photograph, tmp_path / "out.png") == 0
@@ -51,9 +58,7 @@ def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.Ca
     assert sixteen.dtype == np.uint16
     np.testing.assert_allclose(sixteen / 65535, wanted, atol=1e-4)
     assert run(photograph, tmp_path / "out.pfm") == 0
-    head, size, scale, floats = (tmp_path / "out.pfm").read_bytes().split(b"\n", 3)
-    assert (head, size, scale) == (b"Pf", b"80 64", b"-1.0")
-    np.testing.assert_allclose(np.frombuffer(floats, "<f4").reshape(SIZE)[::-1], wanted, atol=1e-5)
+    np.testing.assert_allclose(floats(tmp_path / "out.pfm"), wanted, atol=1e-5)
 
 
 def test_a_rough_mask_becomes_a_soft_one(photograph: Path, tmp_path: Path) -> None:
@@ -71,6 +76,8 @@ def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     found = tifffile.imread(tmp_path / "out.tif")
     assert found.shape == SIZE
     np.testing.assert_allclose(found / 65535, expected(photograph), atol=0.02)
+    assert run(photograph, tmp_path / "out.pfm") == 0
+    np.testing.assert_allclose(floats(tmp_path / "out.pfm"), found / 65535, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def test_the_command_line_goes_to_tiles(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(editing, "read_if_it_fits", watched)
     assert main(arguments) == 0
     whole = read_photograph(tmp_path / "out.tif").pixels
-    monkeypatch.setattr(rows, "FIFTH", 38_000_000)
+    monkeypatch.setattr(rows, "WHOLE", 38_000_000)
     assert main(arguments) == 0
     assert used == [False, True]
     assert difference(read_photograph(tmp_path / "out.tif").pixels, whole) <= 2
@@ -101,7 +101,7 @@ def test_saving_in_the_editor_goes_to_tiles(session: Session, monkeypatch: pytes
     stages: list[str] = []
     whole = read_photograph(session.save("whole.png", lambda stage, *_: stages.append(stage))).pixels
     assert stages == ["Writing"]
-    monkeypatch.setattr("nlfilter_torch.app.session.FIFTH", 0)
+    monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", 0)
     tiled = read_photograph(session.save("tiled.png", lambda stage, *_: stages.append(stage))).pixels
     assert len(set(stages)) > 2
     assert tiled.shape == whole.shape

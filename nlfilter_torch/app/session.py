@@ -27,7 +27,7 @@ from nlfilter_torch.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import FIFTH, tile_memory
+from nlfilter_torch.io.rows import WHOLE, tile_memory
 from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.sampling import Report, in_silence
@@ -349,4 +349,4 @@ class Session:
 def needs_tiles(recipe: Recipe, photograph: Photograph) -> bool:
     """Whether an edit takes so much memory that it is done in tiles."""
     height, width = photograph.size
-    return width * height * recipe.bytes_per_pixel > FIFTH
+    return width * height * recipe.bytes_per_pixel > WHOLE

@@ -25,6 +25,7 @@ from nlfilter_torch.io.rows import (
     modest_memory,
     open_picture,
     tile_memory,
+    whole_memory,
     write_picture,
 )
 from nlfilter_torch.operator.features import reduce_channels
@@ -48,11 +49,12 @@ def tile_limit(gigabytes: float | None) -> int:
     return tile_memory() if gigabytes is None else allowed_memory(gigabytes)
 
 
-def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, memory: int) -> Photograph | None:
-    """Read the photograph, or return None if it must be read by rows."""
+def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: float | None) -> Photograph | None:
+    """Read the photograph, or return None if it must be read by rows, given ``--memory``."""
     if is_zarr(Path(source)) or is_zarr(Path(target)):
         return None
     try:
+        memory = whole_memory() if gigabytes is None else allowed_memory(gigabytes)
         return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=memory)
     except TooLarge:
         return None
@@ -161,7 +163,7 @@ def edit_file(
         depth: of the output; None is that of the input.
         edit: computes new pixels (1, C, H, W) from the photograph.
         bytes_per_pixel: memory that the edit needs per pixel of an image.
-        memory: gigabytes that may be used; None is a fifth of the machine's, and at most 1 for tiles.
+        memory: gigabytes that may be used; None is a fifth of the machine's, at most 2, and 1 for tiles.
         by_rows: the same edit for photographs that do not fit in memory.
         coloured: whether the edit by rows adds colours to a grey photograph.
         workers: number of processes that filter zarr arrays, instead of threads.
@@ -171,7 +173,7 @@ def edit_file(
     allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:
         begin("Reading")
-        photograph = read_if_it_fits(source, target, bytes_per_pixel, allowed)
+        photograph = read_if_it_fits(source, target, bytes_per_pixel, memory)
         if photograph is not None:
             edited = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, edited)

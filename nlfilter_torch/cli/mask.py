@@ -26,6 +26,7 @@ Depth = Annotated[
         rich_help_panel=options.FILES_PANEL,
     ),
 ]
+PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once
 GIVE = "give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60"
 
 
@@ -53,7 +54,7 @@ def mask(
     from nlfilter_torch.edits.mask import fit_mask, region_mask
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
-    from nlfilter_torch.io.photographs import Photograph, check_file, check_output, write_photograph
+    from nlfilter_torch.io.photographs import Photograph, check_file, check_memory, check_output, write_photograph
     from nlfilter_torch.io.rows import check_place, open_picture, write_picture
     from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.scribbles import RegionRows
@@ -88,7 +89,7 @@ def mask(
 
     with steps(3) as begin:
         begin("Reading")
-        photograph = editing.read_if_it_fits(source, target, working_bytes(given["landmarks"], 3), allowed)
+        photograph = editing.read_if_it_fits(source, target, working_bytes(given["landmarks"], 3), memory)
         if photograph is not None:
             selected = Photograph(photograph.pixels[:, :1], kind)
             check_file(place) if floats else check_output(place, selected)
@@ -106,12 +107,13 @@ def mask(
                 write_photograph(selected.with_pixels(found), place)
             return
     with open_picture(Path(source), allowed) as picture, stages() as report:
-        if floats:
-            raise ValueError(
-                f"{target} cannot be written in tiles, since it is a PFM file; write a TIFF file, or raise --memory"
-            )
         plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
-        check_place(place, kind, plain, allowed)
+        if floats:
+            check_file(place)
+            height, width = picture.rows.shape[:2]
+            check_memory(Path(source), width, height, PLANE_BYTES, allowed)
+        else:
+            check_place(place, kind, plain, allowed)
         with ExitStack() as files:
             processes = editing.processes_for(workers, cluster, files)
             limit = editing.tile_limit(memory)
@@ -121,6 +123,9 @@ def mask(
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
             with single_threaded(tiled.passes.workers(1)):
                 fitted = fit_mask(tiled, *drawn, **arguments(job.size))
+            if floats:
+                write_pfm(place, tiled.all(fitted)[0, 0].float().numpy())
+                return
             with tiled.tiling(fitted) as tiling:
                 write_picture(place, replace(tiling, transparent=False), kind, plain)
 

@@ -126,7 +126,7 @@ def fit_abstract(
     scale = source.size[0] / viewed_size(source.size, viewing_size)[0]
     return Fitted(
         fitted.pixels,
-        lambda _, planes: draw(planes, edges, width, tones, scale),
+        lambda _, planes, __: draw(planes, edges, width, tones, scale),
         margin=blur_margin(WIDER * width) + 1,
     )
 

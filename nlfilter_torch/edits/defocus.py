@@ -11,6 +11,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
+from nlfilter_torch.edits.pixels import Inner
 from nlfilter_torch.edits.source import Fitted, Source, edited
 
 Aperture = Literal["disc", "gaussian"]
@@ -102,7 +103,7 @@ def fit_defocus(
     spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
     found = fit_regions(source, [scribbles], [], reach=REACH, spatial_bandwidth=spatial_bandwidth, **options)
 
-    def finish(image: Tensor, masks: Tensor) -> Tensor:
+    def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:
         return blur_behind(image, focus_of(masks), blur_radius, aperture)
 
     return Fitted(found.masks, finish, _kernel_radius(blur_radius, aperture))

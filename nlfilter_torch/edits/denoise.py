@@ -16,6 +16,7 @@ from nlfilter_torch.core.values import is_fake
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
+from nlfilter_torch.edits.pixels import Inner
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source, edited
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, noise_map
@@ -137,11 +138,11 @@ def _by_network(source: Source, noise: float | Tensor | Noise, strength: float |
             "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
         )
 
-    def finish(image: Tensor, _: Tensor) -> Tensor:
+    def finish(image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
         level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
-        return image - _network(image).estimate_in_tiles(image, level, turns=1)
+        return image - _network(image).estimate_in_tiles(image, level, turns=1, inner=inner)
 
     return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
 

@@ -18,6 +18,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import Limits, nearby_or_far
 from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, MASK
+from nlfilter_torch.edits.pixels import Inner
 from nlfilter_torch.edits.shared_parameters import FILTER
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.steps import Step
@@ -179,7 +180,7 @@ def fit_detail(
             halves = zip(split_sliders(moved), (0.0, None), strict=True)
             return torch.cat([changed(pixels, half, weight) for half, weight in halves], dim=1)
 
-        def limited(image: Tensor, found: Tensor) -> Tensor:
+        def limited(image: Tensor, found: Tensor, _: Inner) -> Tensor:
             return limit_by_activity(found, activity(image), threshold)
 
         if regions is None:

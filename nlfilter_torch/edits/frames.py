@@ -100,7 +100,7 @@ def filter_frames(
                 return torch.cat([changed(added, None), changed(rest, None)], dim=1)
             return torch.cat([changed(added, 0.0), changed(rest, residual - 1)], dim=1)
 
-        return Fitted(of, lambda image, found: limit_by_activity(found, activity(image), threshold))
+        return Fitted(of, lambda image, found, _: limit_by_activity(found, activity(image), threshold))
 
     brighter = alpha[-1] - 1
 

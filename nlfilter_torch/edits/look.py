@@ -11,7 +11,7 @@ from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.look_parameters import LOOK
-from nlfilter_torch.edits.pixels import corner
+from nlfilter_torch.edits.pixels import WHOLE, Inner, corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
@@ -164,7 +164,7 @@ def fit_look_edit(
             return Fitted(pixels)
         mean = viewed.mean(luminance) if acts(gains) else None
 
-        def around(image: Tensor, found: Tensor) -> Tensor:
+        def around(image: Tensor, found: Tensor, _: Inner) -> Tensor:
             found = found if mean is None else found + band_change(image, gains, mean)
             return found + texture_change(image, textured) if acts(textured) else found
 
@@ -185,13 +185,13 @@ def fit_look_edit(
         moved = fitted.pixels(pixels)
         return moved if equalized is None else torch.cat([moved, equalized(pixels)], dim=1)
 
-    def finished(image: Tensor, found: Tensor) -> Tensor:
+    def finished(image: Tensor, found: Tensor, inner: Inner) -> Tensor:
         moved, local = (found, None) if equalized is None else found.tensor_split([-image.shape[1]], dim=1)
-        shown = result(image, moved if fitted.finish is None else fitted.finish(image, moved))
+        shown = result(image, moved if fitted.finish is None else fitted.finish(image, moved, inner))
         return shown if local is None else shown + strength * local
 
     if fitted.finish is None:
-        return Fitted(lambda pixels: finished(pixels.image, planes(pixels)))
+        return Fitted(lambda pixels: finished(pixels.image, planes(pixels), WHOLE))
     return Fitted(planes, finished, fitted.margin)
 
 

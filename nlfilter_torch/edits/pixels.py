@@ -29,6 +29,8 @@ def corner(pixels: Pixels) -> tuple[int, int]:
 
 
 Planes = Callable[[Any], Tensor]  # values (B, C, h, W) at given pixels
+Inner = tuple[slice, slice]  # rows and columns of an image whose values are needed
+WHOLE: Inner = (slice(None), slice(None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +39,14 @@ class Fitted:
 
     Attributes:
         pixels: function that returns the edited pixels, or planes that ``finish`` takes.
-        finish: function of the image and these planes that returns the edited image, for edits that depend on the
-            neighbourhood of a pixel.
+        finish: function of the image, these planes and the part that is needed, which returns the edited image, for
+            edits that depend on the neighbourhood of a pixel; values elsewhere may be any.
         margin: radius of this neighbourhood in pixels.
         step: period, in rows and in columns, of what ``finish`` does, counted from the first row and column that it is
             given; tiles begin at multiples of it, and ``margin`` is a multiple of it.
     """
 
     pixels: Planes
-    finish: Callable[[Tensor, Tensor], Tensor] | None = None
+    finish: Callable[[Tensor, Tensor, Inner], Tensor] | None = None
     margin: int = 0
     step: int = 1

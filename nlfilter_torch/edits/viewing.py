@@ -106,7 +106,7 @@ def fit_change(
         finish = fitted.finish
         return Fitted(
             fitted.pixels,
-            lambda image, found: change_luminance(image, finish(image, found), limits, balance),
+            lambda image, found, inner: change_luminance(image, finish(image, found, inner), limits, balance),
             fitted.margin,
         )
     before, after, saturation = reduced.all(Fitted(planes)), reduced.all(fitted), None

@@ -37,8 +37,9 @@ from nlfilter_torch.tiled.tiles import Tiling
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
-FIFTH = psutil.virtual_memory().total // 5  # bytes; an edit that needs more is tiled
-TILED = 1_000_000_000  # bytes of a tiled edit, at most, if no limit is given; more saves little time
+FIFTH = psutil.virtual_memory().total // 5  # bytes that a command uses, at most, if no limit is given
+WHOLE = min(FIFTH, 2_000_000_000)  # bytes of an edit, likewise; a photograph that needs more is edited in tiles
+TILED = 1_000_000_000  # bytes of these tiles, likewise; more saves no time
 CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 
@@ -160,8 +161,13 @@ def free_memory() -> int:
 
 
 def modest_memory() -> int:
-    """Memory budget in bytes of an edit if none is given: a fifth of the machine's memory, at most what is free."""
+    """Memory budget in bytes of a command if none is given: a fifth of the machine's memory, at most what is free."""
     return min(FIFTH, free_memory())
+
+
+def whole_memory() -> int:
+    """Memory budget in bytes of an edit if none is given; a photograph that needs more is edited in tiles."""
+    return min(modest_memory(), WHOLE)
 
 
 def tile_memory() -> int:

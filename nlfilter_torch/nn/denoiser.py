@@ -35,6 +35,8 @@ SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
 BORDER = 16  # width in pixels of the border added to images, so that their own border does not affect results
 TILE_BATCH = 8  # tiles processed at once
+Part = tuple[slice, slice]  # rows and columns of an image
+WHOLE: Part = (slice(None), slice(None))
 
 
 class NonlocalDenoiser(nn.Module):
@@ -115,8 +117,11 @@ class NonlocalDenoiser(nn.Module):
         image = noisy.to(dtype)
         return as_given(image - self.estimate_in_tiles(image, levels, turns), noisy)
 
-    def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int) -> Tensor:
-        """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype."""
+    def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Part = WHOLE) -> Tensor:
+        """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype.
+
+        Values outside ``inner`` may be any.
+        """
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
         quarters = range(0, 4, 4 // turns)
@@ -128,7 +133,7 @@ class NonlocalDenoiser(nn.Module):
             ]
             return torch.stack(found).mean(0)
 
-        return in_tiles(image, noise, mean)
+        return in_tiles(image, noise, mean, inner)
 
     def estimate_noise(self, noisy: Tensor, noise: Tensor) -> Tensor:
         """Estimate the noise without dividing the image: called with crops in training, with tiles otherwise.
@@ -215,19 +220,20 @@ def join_colours(planes: Tensor, channels: int) -> Tensor:
     return torch.einsum("cp,bphw->bchw", torch.linalg.inv(_mixture(planes)), planes)
 
 
-def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], Tensor], inner: Part = WHOLE) -> Tensor:
     """Apply a function to an image (B, C, H, W) and its noise in overlapping tiles, or at once if the image is small.
 
     Tiles are ``STEP`` pixels apart, starting at the upper left corner. Their weights fall to 0 in the outermost pixels,
-    so that borders of tiles are not visible.
+    so that borders of tiles are not visible. Only tiles that contain pixels of ``inner`` are computed.
     """
     height, width = image.shape[-2:]
     down, across = _divided(height), _divided(width)
     padding = (BORDER, across[-1].stop - width - BORDER, BORDER, down[-1].stop - height - BORDER)
     image, noise = (_extended(planes, padding) for planes in (image, noise))
-    inner = (..., slice(BORDER, BORDER + height), slice(BORDER, BORDER + width))
+    rest = (..., slice(BORDER, BORDER + height), slice(BORDER, BORDER + width))
     if len(down) == len(across) == 1:
-        return function(image, noise)[inner]
+        return function(image, noise)[rest]
+    down, across = _needed(down, inner[0], height), _needed(across, inner[1], width)
     total, weight = torch.zeros_like(image), image.new_zeros(image.shape[-2:])
     for (height, width), tiles in groupby(sorted(product(down, across), key=_size), key=_size):
         fade = torch.outer(_profile(height), _profile(width)).to(image)
@@ -238,7 +244,7 @@ def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], 
             for window, tile in zip(some, found.split(len(image)), strict=True):
                 total[window] += fade * tile
                 weight[window] += fade
-    return total[inner] / weight[inner]
+    return total[rest] / weight[rest].clamp(min=torch.finfo(weight.dtype).tiny)
 
 
 def _divided(length: int) -> list[slice]:
@@ -247,6 +253,12 @@ def _divided(length: int) -> list[slice]:
     last = max(0, -(-(length - SIDE) // STEP)) * STEP
     end = max(length, last + SMALLEST) if last else length
     return [slice(start, min(start + SIDE, end)) for start in range(0, last + 1, STEP)]
+
+
+def _needed(tiles: list[slice], inner: slice, length: int) -> list[slice]:
+    """Those of the tiles along one axis, extended by a border, that contain pixels of a part of it."""
+    first, last, _ = inner.indices(length)
+    return [tile for tile in tiles if tile.start < last + BORDER and first + BORDER < tile.stop]
 
 
 def _size(tile: tuple[slice, slice]) -> tuple[int, int]:

@@ -131,8 +131,8 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     planes = torch.cat(list(in_order(planes_of, strips, tiled.passes.workers(landmarks))), dim=2)
     if fitted.finish is None:
         return planes
-    found = fitted.finish(pixels_of_part(tiled, around).image, planes)
-    return found[..., *part.inside(around)]
+    inner = part.inside(around)
+    return fitted.finish(pixels_of_part(tiled, around).image, planes, inner)[..., *inner]
 
 
 class Stage:

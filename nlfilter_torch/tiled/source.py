@@ -367,8 +367,8 @@ class Tiled:
 
             def finished(tile: Tile) -> Tensor:
                 stop = tile.start + tile.inner.shape[2]
-                found = finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels)
-                return found[..., tile.halo[0] : found.shape[2] - tile.halo[1], :]
+                inner = slice(tile.halo[0], tile.pixels.shape[2] - tile.halo[1]), slice(None)
+                return finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels, inner)[..., *inner]
 
             rows, workers = self._rows_to_finish(fitted, rows, workers)
             yield replace(tiling, edit=finished, margin=margin, rows=rows, together=fitted.step, workers=workers)
