@@ -122,9 +122,9 @@ class Panel:
             )
             self._automatic = ui.checkbox("as the photo suggests", value=True).props("dense")
             self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
-            self._bandwidth = controls.SteadySlider(min=2, max=80, step=1, value=BANDWIDTH)
-            self._bandwidth.props('dense label aria-label="Bandwidth"').classes("col")
-            self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
+        self._bandwidth = controls.SteadySlider(min=2, max=80, step=1, value=BANDWIDTH)
+        self._bandwidth.props('dense label aria-label="Bandwidth"')
+        self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
         self._build_brush("detail")
 
     def _build_detail_sliders(self, detail: Step) -> None:

@@ -28,6 +28,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     port = _check_address(host, port)
     app.add_middleware(Guard, host=host)
     library = Library(folder, None if image is None else image.parent)
+    app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
 
     @app.get("/picture/{token}/{kind}")
     def _picture(token: str, kind: str, at: str = "") -> Response:
