@@ -79,8 +79,10 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
         ):
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
             yield Workers(workers)
-    finally:
-        get_reusable_executor().shutdown()
+    except BaseException:
+        get_reusable_executor().shutdown(kill_workers=True)  # joblib has not, if the interrupt reached it elsewhere
+        raise
+    get_reusable_executor().shutdown()
 
 
 def _of_dask(address: str) -> Iterator[Workers]:
