@@ -150,6 +150,13 @@ def test_inspect_writes_pictures_and_figures(photo: Path, tmp_path: Path, capsys
         assert name.split("_")[0] in table
 
 
+def test_inspect_shows_the_filter_at_the_viewing_size(photo: Path, tmp_path: Path) -> None:
+    options = ("--landmarks", "20", "--viewing-size", "0.00135")
+    assert main(["inspect", str(photo), str(tmp_path / "looks"), *options]) == 0
+    figures = json.loads((tmp_path / "looks" / "diagnostics.json").read_text())
+    assert (figures["height"], figures["width"]) == (30, 45)
+
+
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["detail", "--help"], ["inspect", "--help"], ["demo", "--help"]])
 def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 0

@@ -40,11 +40,12 @@ MEANINGS = {
 }
 
 
-@with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
+@with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
 def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **given: Any) -> None:
     """Show the filter of a photograph: the patterns it finds, how strong they are, and how sliders change them.
 
-    Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table.
+    Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table. A
+    photograph larger than the viewing size is reduced to it, as for `detail`.
 
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
@@ -53,16 +54,19 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
     import torch
 
     from nlfilter_torch.cli.progress import steps
-    from nlfilter_torch.io.photographs import check_folder, open_beside, read_photograph
+    from nlfilter_torch.edits.resizing import resize
+    from nlfilter_torch.edits.viewing import viewed_size
+    from nlfilter_torch.io.photographs import check_folder, check_memory, open_beside, read_photograph
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.plotting import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
 
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
-        memory = working_bytes(step["landmarks"], step["patch_size"], factors=5)
-        photograph = read_photograph(source, bytes_per_pixel=memory)
-        guide = reduce_channels(photograph.pixels, "luminance")
+        pixels = read_photograph(source).pixels
+        height, width = viewed_size((pixels.shape[2], pixels.shape[3]), step["viewing_size"])
+        check_memory(Path(source), width, height, working_bytes(step["landmarks"], step["patch_size"], factors=5))
+        guide = reduce_channels(resize(pixels, (height, width)), "luminance")
         begin("Comparing patches")
         operator = build_operator(guide, step, seed)
         begin("Finding patterns")

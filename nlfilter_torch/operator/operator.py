@@ -259,10 +259,11 @@ class NonlocalOperator:
         spectrum, certificate = self.spectrum(), self.certify()
         vectors = spectrum.eigenvectors  # (B, R, H, W)
         rank = vectors.shape[1]
-        image = torch.cat([self.matmul(part) for part in vectors.split(16, dim=1)], dim=1)
-        error = (image - spectrum.eigenvalues[:, :, None, None] * vectors).square().flatten(2)
-        error = weighted(error, self.weights).sum(2)
-        residual = self.among.sum(error).sqrt()
+        errors = []
+        for part, eigenvalues in zip(vectors.split(16, dim=1), spectrum.eigenvalues.split(16, dim=1), strict=True):
+            error = (self.matmul(part) - eigenvalues[:, :, None, None] * part).square().flatten(2)
+            errors.append(weighted(error, self.weights).sum(2))
+        residual = self.among.sum(torch.cat(errors, dim=1)).sqrt()
         flat = vectors.flatten(2)
         inner = self.among.sum(weighted(flat, self.weights) @ flat.mT)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
