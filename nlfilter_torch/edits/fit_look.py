@@ -280,16 +280,16 @@ def _add(
     photograph = EditedPhotograph(before, after, masks, step, layout.sliders - 1, generator)
     width = photograph.size[1]
 
-    def sums(pixels: SomePixels, region: _Region) -> list[Sums]:
-        """Sums over the pixels, or over parts of the first pair that has some."""
-        square = torch.zeros_like(pixels.places) if region.folds else _squares(pixels.places, width)
+    def sums(pixels: SomePixels) -> list[Sums]:
+        """Sums over parts of the picture, one after the other, which take less memory than all pixels at once."""
+        square = _squares(pixels.places, width)
         return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
 
     found = photograph.regions_of_sample()
-    known = None if found is None else [sums(*each) for each in zip(found, regions, strict=True)]
+    known = None if found is None else [sums(pixels) for pixels in found]
     if found is None or known is None or _of_sliders(reduce(Sums.__add__, known[0]), layout, LIKELY):
         found = photograph.regions()
-        known = [sums(*each) for each in zip(found, regions, strict=True)]
+        known = [sums(pixels) for pixels in found]
     for region, pixels, parts in zip(regions, found, known, strict=True):
         if not parts:
             continue  # the region is not in this photograph

@@ -50,9 +50,15 @@ class SomePixels:
 
     def sums(self, layout: Layout, parts: list[Tensor]) -> list[Sums]:
         """Sums over parts (P',) of them."""
-        columns = columns_of(self.before, self.bands, self.texture, self.local, self.layers, layout)
-        change = self.after - self.before
-        return [sums_of(columns[..., some], change[:, some], self.weights[:, some]) for some in parts]
+        found = []
+        for some in parts:
+            before, bands, texture, local, layers, after, weights = (
+                values[..., some]
+                for values in (self.before, self.bands, self.texture, self.local, self.layers, self.after, self.weights)
+            )
+            columns = columns_of(before, bands, texture, local, layers, layout)
+            found.append(sums_of(columns, after - before, weights))
+        return found
 
 
 class EditedPhotograph:

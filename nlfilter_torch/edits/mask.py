@@ -46,6 +46,7 @@ COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask;
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
+ODDS = 1.3  # of masks, times those of the solution along borders, which is too low halfway
 EPSILON = 1e-6
 
 
@@ -161,7 +162,7 @@ class Regions:
         """Masks (B, K, h, w) of the given pixels."""
         image, found = pixels.image - 0.5, []
         for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
-            mask = linear_mask(image, self.rows(functions, pixels)).clamp(0.0, 1.0)
+            mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
             front, back = marked.planes(pixels).split(1, dim=1)
             found.append(mask * (1 - front - back) + front)
         return torch.cat(found, dim=1)
@@ -169,7 +170,7 @@ class Regions:
     def reduced_masks(self) -> Tensor:
         """Masks (B, K, h, w) of the reduced picture."""
         image = self.reduced - 0.5
-        return torch.cat([linear_mask(image, f).clamp(0.0, 1.0) for f in self.functions.unbind(1)], dim=1)
+        return torch.cat([calibrated(linear_mask(image, f)) for f in self.functions.unbind(1)], dim=1)
 
 
 def select_regions(
@@ -320,6 +321,12 @@ def _regression(
     known.append((frame, unlike, torch.zeros_like(unlike)))
     fitted = fit(lambda: scribbled_blocks(known), strength=1.0)
     return operator.each(lambda found: fitted(found.factor))
+
+
+def calibrated(mask: Tensor) -> Tensor:
+    """Mask of a solution along borders: a curve on which 0 and 1 stay as they are."""
+    mask = mask.clamp(0.0, 1.0)
+    return ODDS * mask / (1 + (ODDS - 1) * mask)
 
 
 def sharpened(likely: Tensor) -> Tensor:
