@@ -95,15 +95,16 @@ def test_the_command_line_goes_to_tiles(tmp_path: Path, monkeypatch: pytest.Monk
     assert difference(read_photograph(tmp_path / "out.tif").pixels, whole) <= 2
 
 
-def test_saving_in_the_editor_goes_to_tiles(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With statistics of all pixels or, for a large photograph, of a sample."""
     session.set("detail", alpha=(2.0, 1.5, 1.0, 1.0))
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
-    stages: list[str] = []
-    whole = read_photograph(session.save("whole.png", lambda stage, *_: stages.append(stage))).pixels
-    assert stages == ["Writing"]
-    monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", 0)
-    tiled = read_photograph(session.save("tiled.png", lambda stage, *_: stages.append(stage))).pixels
-    assert len(set(stages)) > 2
-    assert tiled.shape == whole.shape
-    assert float((tiled - whole).square().mean().sqrt()) * 255 < 1
-    assert sorted(path.name for path in session.folder.iterdir()) == ["cat.png", "tiled.png", "whole.png"]
+    found = []
+    for name, memory in (("small.png", 10**9), ("large.png", 0)):
+        monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", memory)
+        stages: list[str] = []
+        found.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
+        assert stages[-1] == "Writing"
+        assert len(set(stages)) > 2
+    assert float((found[0] - found[1]).square().mean().sqrt()) * 255 < 1
+    assert sorted(path.name for path in session.folder.iterdir()) == ["cat.png", "large.png", "small.png"]

@@ -20,7 +20,6 @@ from nlfilter_torch.io.photographs import (
     DEPTHS,
     SUFFIXES,
     Photograph,
-    check_memory,
     check_output,
     first_bytes,
     open_beside,
@@ -92,7 +91,7 @@ class Session:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
         if self.opened is not None:
             self.opened.parts.close()
-        parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), "the photograph")
+        parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name or path.name)
         pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
         self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels), parts, pages)
         self.recipe = self._shown = self.saved = Recipe()
@@ -248,15 +247,15 @@ class Session:
         """The parts of the photograph, with an edit fitted to the whole."""
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to show")
-        photograph, parts = self.opened.photograph, self.opened.parts
-        passes = Passes(
-            str(photograph.pixels.numpy().dtype),
-            "sample" if needs_tiles(recipe, photograph) else "full",
-            memory=tile_memory(),
-            report=report,
-        )
-        parts.fit(recipe, passes)
-        return parts
+        self.opened.parts.fit(recipe, self._passes(recipe, self.opened.photograph, report))
+        return self.opened.parts
+
+    def _passes(self, recipe: Recipe, photograph: Photograph, report: Report) -> Passes:
+        """Of an edit at full size, with statistics of all pixels unless the photograph is large."""
+        height, width = photograph.size
+        large = width * height * recipe.bytes_per_pixel > WHOLE
+        kind = str(photograph.pixels.numpy().dtype)
+        return Passes(kind, "sample" if large else "full", memory=tile_memory(), report=report, folder=self.folder)
 
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
@@ -307,27 +306,15 @@ class Session:
         target = self.check_photograph(name)
         assert self.opened is not None  # for mypy
         recipe, photograph = self.recipe, self.opened.photograph
-        height, width = photograph.size
-        if needs_tiles(recipe, photograph):
-            pixels = self._in_tiles(recipe, photograph, target.parent, report)
-        else:
-            check_memory(Path(self.opened.name), width, height, recipe.bytes_per_pixel)
-            pixels = recipe.apply(photograph.pixels)
+        rows = photograph.pixels[0].permute(1, 2, 0).numpy()
+        channels = 3 if recipe.gives_colour else rows.shape[2]
+        pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
+        for part, values in edit_rows(self._passes(recipe, photograph, report), rows, recipe, self.opened.name):
+            pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(photograph.with_pixels(pixels), target)
         self.saved = recipe
         return target
-
-    @staticmethod
-    def _in_tiles(recipe: Recipe, photograph: Photograph, folder: Path, report: Report) -> Tensor:
-        """The edited pixels, within the memory that an edit in tiles uses if no limit is given."""
-        rows = photograph.pixels[0].permute(1, 2, 0).numpy()
-        passes = Passes(str(rows.dtype), memory=tile_memory(), report=report, folder=folder)
-        channels = 3 if recipe.gives_colour else rows.shape[2]
-        pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-        for part, values in edit_rows(passes, rows, recipe, "the photograph"):
-            pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
-        return pixels
 
     def save_preset(self, name: str, report: Report = in_silence) -> Path:
         """Write the edit as a file for :meth:`load_preset` and the command line; nothing to report takes that long.
@@ -344,9 +331,3 @@ class Session:
     def load_preset(self, content: bytes, name: str) -> None:
         """Load the edit in the content of a file; raises ValueError if there is none."""
         self.load(Recipe.from_json(content.decode("utf-8", errors="replace"), name))
-
-
-def needs_tiles(recipe: Recipe, photograph: Photograph) -> bool:
-    """Whether an edit takes so much memory that it is done in tiles."""
-    height, width = photograph.size
-    return width * height * recipe.bytes_per_pixel > WHOLE

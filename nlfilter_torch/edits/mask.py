@@ -46,7 +46,7 @@ COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask;
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
-ODDS = 1.3  # of masks, times those of the solution along borders, which is too low halfway
+ODDS = 1.35  # of masks, times those of the solution along borders, which is too low halfway
 EPSILON = 1e-6
 
 

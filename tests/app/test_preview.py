@@ -206,7 +206,7 @@ def rms(a: torch.Tensor, b: torch.Tensor) -> float:
     [
         (Step("detail", limits="none", **ABOVE), 0.8),
         (Step("detail", **ABOVE), 0.7),
-        (Step("detail", (Stroke(HERE, 0.04, "in"),), inside=(3.0, 2.0, 2.0, 1.0), **ABOVE), 1.0),
+        (Step("detail", (Stroke(HERE, 0.04, "in"),), inside=(3.0, 2.0, 2.0, 1.0), **ABOVE), 1.1),
         (Step("tone", contrast=1.2, clarity=2.0, **LOOKED_AT), 0.5),
     ],
 )
