@@ -1,6 +1,7 @@
 """``nlfilter-torch fit`` and ``detail --preset``: an edit is saved to a file and applied to another photograph."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from nlfilter_torch import apply_look
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.presets import Preset
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb
 
@@ -273,3 +275,15 @@ def test_it_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest
     assert main(["fit", str(tmp_path), str(after), str(look)]) == 2
     assert "two photographs or two folders" in capsys.readouterr().err
     assert not look.exists()
+
+
+def test_large_photographs_are_judged_at_the_viewing_size(
+    before: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("nlfilter_torch.cli.fit.step_of", lambda *_: Step("look", viewing_size=0.003, landmarks=40))
+    height, width = CAT.shape[-2:]
+    write_photograph(Photograph(CAT**1.3), before.with_name("after.png"))
+    seen = before.with_name("seen.png")
+    assert fit(before, before.with_name("after.png"), before.with_name("look.json"), "--preview", seen) == 0
+    assert 2500 < read_photograph(seen).pixels[0, 0].numel() / 4 < 3500 < height * width
+    assert float(re.search(r"explained: ([\d.]+) %", capsys.readouterr().out)[1]) > 99  # type: ignore[index]

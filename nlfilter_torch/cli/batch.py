@@ -81,7 +81,7 @@ def batch(
     from nlfilter_torch.cli.folders import Tally, edit_folder, pictures, prepare
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.core.checks import check_patch_size
-    from nlfilter_torch.io.rows import free_memory
+    from nlfilter_torch.io.rows import WHOLE, free_memory
 
     check_patch_size(given["patch_size"])
     if cluster is not None and workers is not None:
@@ -90,7 +90,7 @@ def batch(
         folder, target = folder.absolute(), target.absolute()
         if preset is not None and preset not in PRESETS:
             preset = str(Path(preset).absolute())
-    shared = allowed_memory(memory) if memory is not None else free_memory()
+    shared = free_memory() if memory is None else allowed_memory(memory)
     settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
     if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
@@ -106,7 +106,9 @@ def batch(
     prepare(paths, target, settings)
     tally, interrupted = Tally(), False
     count = min(workers or _cores(), len(paths))
-    room = shared / count / 1e9 if cluster is None else memory
+    room = memory  # of each; None is as much as the command of an edit uses
+    if cluster is None and (memory is not None or shared < count * WHOLE):
+        room = shared / count / 1e9
     try:
         with steps(len(paths), lines=False) as begin:  # files that fail are told by lines
             edit_folder(

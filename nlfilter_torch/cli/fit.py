@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from nlfilter_torch.edits.fit_look import FittedLook
+    from nlfilter_torch.edits.steps import Step
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit, or a folder of them.")]
 After = Annotated[
@@ -29,13 +30,15 @@ Preview = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="A picture of the first pair: before, after, the look, and what is left, amplified, around grey.",
+        help="A picture of the first pair at the viewing size: before, after, the look, and what is left, amplified, "
+        "around grey.",
     ),
 ]
 Map = Annotated[
     Path | None,
     typer.Option("--map", metavar="FILE", help="A grey picture of what the look leaves of the first pair's edit."),
 ]
+PAIR_BYTES = 140  # per pixel of a pair at its full size, while it is read and compared
 ENOUGH = 0.8  # share that is to be explained
 AMPLIFIED = 4  # what is left, in the preview
 SQUARE = 16  # pixels, of places that an edit is looked for in
@@ -89,7 +92,6 @@ def fit(
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
     for path in (*results, *(path for path in (preview, left) if path is not None)):
         check_file(path)
-    memory = working_bytes(step["landmarks"], step["patch_size"])
     alone = len(paths) == 1
     judged = (alone and not mask) or preview is not None or left is not None
     first: list[tuple[Tensor, ...]] = []  # images that are judged, and masks
@@ -98,7 +100,7 @@ def fit(
         def pairs() -> "Iterator[tuple[Tensor, ...]]":
             for pair, masks in zip(paths, regions, strict=True):
                 begin(f"Comparing {pair[1].name}")
-                images = (*_read(*pair, memory), *([read_masks(masks, pair[0])] if masks else []))
+                images = (*_read(*pair, step), *([read_masks(masks, pair[0])] if masks else []))
                 if judged and not first:
                     first.append(images)
                 yield images
@@ -116,7 +118,7 @@ def fit(
     for look, path in zip(looks, results, strict=True):
         _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
     if whole is not None:
-        _tell_where(*whole)
+        _tell_where(*whole, step=first[0][0].shape[-1] / whole[0].shape[-1])
 
 
 def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
@@ -160,13 +162,16 @@ def _is_picture(path: Path) -> bool:
     return path.suffix.lower() in PHOTOGRAPHS
 
 
-def _read(before: Path, after: Path, memory: int) -> "tuple[Tensor, Tensor]":
+def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     """A pair on the same pixels, in colour if one of them is."""
     from nlfilter_torch.edits.alignment import align
     from nlfilter_torch.edits.fit_look import check_belong
-    from nlfilter_torch.io.photographs import read_photograph
+    from nlfilter_torch.edits.viewing import viewed_size
+    from nlfilter_torch.io.photographs import check_memory, read_photograph
 
-    images = [read_photograph(path, bytes_per_pixel=memory).pixels for path in (before, after)]
+    images = [read_photograph(path, bytes_per_pixel=PAIR_BYTES).pixels for path in (before, after)]
+    height, width = viewed_size((images[0].shape[2], images[0].shape[3]), step["viewing_size"])
+    check_memory(before, width, height, working_bytes(step["landmarks"], step["patch_size"]))
     channels = max(image.shape[1] for image in images)
     first, second = (image.expand(-1, channels, -1, -1) for image in images)
     image, edited, done = align(first, second, str(before), str(after))
@@ -181,9 +186,16 @@ def _read(before: Path, after: Path, memory: int) -> "tuple[Tensor, Tensor]":
 def _judged(
     looks: "Sequence[FittedLook]", image: "Tensor", edited: "Tensor", masks: "Tensor | None" = None
 ) -> "tuple[Tensor, Tensor, Tensor]":
-    """A pair, and what the looks make of the photograph, each in its region."""
+    """A pair at the viewing size, and what the looks make of the photograph, each in its region."""
     from nlfilter_torch.edits.detail import blend_edited
+    from nlfilter_torch.edits.resizing import resize
+    from nlfilter_torch.edits.viewing import viewed_size
 
+    whole = (image.shape[2], image.shape[3])
+    size = viewed_size(whole, looks[0].step["viewing_size"])
+    if size != whole:
+        image, edited = (resize(planes, size).clamp(0, 1) for planes in (image, edited))
+        masks = None if masks is None else resize(masks, size).clamp(0, 1)
     found = [look.apply(image).clamp(0, 1) for look in looks]
     return image, edited, found[0] if masks is None else blend_edited(image, found, masks)
 
@@ -215,8 +227,8 @@ def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> Non
     typer.echo(f"preset: {path}")
 
 
-def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor") -> None:
-    """Say where what is left is, if it is in a few places."""
+def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", step: float) -> None:
+    """Say where what is left is, if it is in a few places; ``step`` is the size of their pixels in the photograph."""
     from torch.nn.functional import avg_pool2d
 
     from nlfilter_torch.edits.alignment import inside_frame
@@ -230,7 +242,7 @@ def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor") -> None:
     if float(largest.values.sum() / rest.sum()) < MOST:
         return
     place = int(largest.indices[0])
-    row, column = (SQUARE * number for number in divmod(place, rest.shape[1]))
+    row, column = (round(SQUARE * step * number) for number in divmod(place, rest.shape[1]))
     _tell(
         f"most of what is left is in a tenth of the picture, around row {row}, column {column}: an edit of a part; "
         "--map shows where, and --mask fits parts by themselves"
