@@ -30,10 +30,10 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(params=[False, True], ids=["memory", "tiles"])
 def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether commands and the editor work in tiles, as for large photographs."""
+    """Whether commands and the editor work as for large photographs."""
     if request.param:
         monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
-        monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", 0)
+        monkeypatch.setattr("nlfilter_torch.app.session.SMALL", 0)
     return bool(request.param)
 
 

@@ -100,8 +100,8 @@ def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch
     session.set("detail", alpha=(2.0, 1.5, 1.0, 1.0))
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
     found = []
-    for name, memory in (("small.png", 10**9), ("large.png", 0)):
-        monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", memory)
+    for name, pixels in (("small.png", 10**9), ("large.png", 0)):
+        monkeypatch.setattr("nlfilter_torch.app.session.SMALL", pixels)
         stages: list[str] = []
         found.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
         assert stages[-1] == "Writing"

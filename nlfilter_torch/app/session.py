@@ -26,14 +26,17 @@ from nlfilter_torch.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import WHOLE, tile_memory
+from nlfilter_torch.io.rows import tile_memory
 from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.sampling import Report, in_silence
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.tiled.tiles import Passes, Statistics
 
 SPACING = 0.2  # of the points of a stroke, as a share of its radius
 UNDOS = 100
+SMALL = (
+    1 << 18
+)  # pixels of a photograph whose statistics are those of all pixels; a sample is nearly as exact, and fast
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
 
 
@@ -247,15 +250,15 @@ class Session:
         """The parts of the photograph, with an edit fitted to the whole."""
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to show")
-        self.opened.parts.fit(recipe, self._passes(recipe, self.opened.photograph, report))
+        self.opened.parts.fit(recipe, self._passes(self.opened.photograph, report))
         return self.opened.parts
 
-    def _passes(self, recipe: Recipe, photograph: Photograph, report: Report) -> Passes:
-        """Of an edit at full size, with statistics of all pixels unless the photograph is large."""
+    def _passes(self, photograph: Photograph, report: Report) -> Passes:
+        """Of an edit at full size."""
         height, width = photograph.size
-        large = width * height * recipe.bytes_per_pixel > WHOLE
+        statistics: Statistics = "full" if width * height <= SMALL else "sample"
         kind = str(photograph.pixels.numpy().dtype)
-        return Passes(kind, "sample" if large else "full", memory=tile_memory(), report=report, folder=self.folder)
+        return Passes(kind, statistics, memory=tile_memory(), report=report, folder=self.folder)
 
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
@@ -309,7 +312,7 @@ class Session:
         rows = photograph.pixels[0].permute(1, 2, 0).numpy()
         channels = 3 if recipe.gives_colour else rows.shape[2]
         pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-        for part, values in edit_rows(self._passes(recipe, photograph, report), rows, recipe, self.opened.name):
+        for part, values in edit_rows(self._passes(photograph, report), rows, recipe, self.opened.name):
             pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(photograph.with_pixels(pixels), target)
