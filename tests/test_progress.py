@@ -96,15 +96,15 @@ def test_the_command_line_goes_to_tiles(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With statistics of all pixels or, for a large photograph, of a sample."""
+    """In memory and, for a large photograph, in tiles."""
     session.set("detail", alpha=(2.0, 1.5, 1.0, 1.0))
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
     found = []
-    for name, pixels in (("small.png", 10**9), ("large.png", 0)):
-        monkeypatch.setattr("nlfilter_torch.app.session.SMALL", pixels)
+    for name, memory in (("small.png", 10**9), ("large.png", 0)):
+        monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", memory)
         stages: list[str] = []
         found.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
         assert stages[-1] == "Writing"
-        assert len(set(stages)) > 2
+        assert len(set(stages)) >= 2
     assert float((found[0] - found[1]).square().mean().sqrt()) * 255 < 1
     assert sorted(path.name for path in session.folder.iterdir()) == ["cat.png", "large.png", "small.png"]

@@ -7,6 +7,8 @@ of the picture, keeps the moves of a slider in order, and includes every script 
 
 import socket
 import sys
+import threading
+import time
 from pathlib import Path
 
 from fastapi import Response
@@ -17,6 +19,7 @@ from nlfilter_torch.app.library import Library
 from nlfilter_torch.app.page import EDITORS, Editor
 
 TITLE = "nlfilter-torch"
+STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
 
 
 def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
@@ -43,8 +46,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     def _page(photo: str = "") -> None:
         Editor(library).build(image, photo)
 
-    shown = f"[{host}]" if ":" in host else host
-    app.on_startup(lambda: print(f"Editor at http://{shown}:{port}/ - Ctrl+C ends it", flush=True))
+    app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port), daemon=True).start)
     ui.run(
         host=host,
         port=port,
@@ -58,6 +60,19 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
         favicon="\U0001f39a\ufe0f",
         uvicorn_logging_level="warning",
     )
+
+
+def _tell_when_ready(host: str, port: int) -> None:
+    """Print the address once the server accepts connections, which is a little after the start."""
+    reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # not on every system as they are
+    for _ in range(round(STARTING / PAUSE)):
+        try:
+            socket.create_connection((reachable, port), timeout=STARTING).close()
+            break
+        except OSError:
+            time.sleep(PAUSE)
+    shown = f"[{host}]" if ":" in host else host
+    print(f"Editor at http://{shown}:{port}/ - Ctrl+C ends it", flush=True)
 
 
 def _check_address(host: str, port: int) -> int:

@@ -12,6 +12,7 @@ from nlfilter_torch.app.preview import PIXELS, Preview
 from nlfilter_torch.app.sidecar import Sidecar
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.scribbles import Stroke, thin
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io import tiff
@@ -20,13 +21,14 @@ from nlfilter_torch.io.photographs import (
     DEPTHS,
     SUFFIXES,
     Photograph,
+    check_memory,
     check_output,
     first_bytes,
     open_beside,
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import tile_memory
+from nlfilter_torch.io.rows import WHOLE, tile_memory
 from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.sampling import Report, in_silence
@@ -242,7 +244,11 @@ class Session:
         """
         with self._fitting:
             if self._at_rest is None or self._at_rest[0] != recipe.acting:
-                found = self._fitted(recipe, report).reduced(self.preview.size, report)
+                pixels = self._edited_at_once(recipe, report)
+                if pixels is None:
+                    found = self._fitted(recipe, report).reduced(self.preview.size, report)
+                else:
+                    found = resize(pixels, self.preview.size).clamp(0, 1)
                 self._at_rest = recipe.acting, found
             return self._at_rest[1]
 
@@ -253,8 +259,22 @@ class Session:
         self.opened.parts.fit(recipe, self._passes(self.opened.photograph, report))
         return self.opened.parts
 
+    def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
+        """The edited pixels (1, C, H, W), as the command line computes them; None if that takes much memory."""
+        if self.opened is None:
+            raise ValueError("open a photograph first; there is nothing to edit")
+        pixels = self.opened.photograph.pixels
+        height, width = self.opened.photograph.size
+        if width * height * recipe.bytes_per_pixel > WHOLE:
+            return None
+        check_memory(Path(self.opened.name), width, height, recipe.bytes_per_pixel)
+        for number, step in enumerate(recipe.acting):
+            report("Editing", number, len(recipe.acting))
+            pixels = Recipe((step,)).apply(pixels.clamp(0, 1) if number else pixels)
+        return pixels
+
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
-        """Of an edit at full size."""
+        """Of an edit in parts at full size."""
         height, width = photograph.size
         statistics: Statistics = "full" if width * height <= SMALL else "sample"
         kind = str(photograph.pixels.numpy().dtype)
@@ -309,11 +329,13 @@ class Session:
         target = self.check_photograph(name)
         assert self.opened is not None  # for mypy
         recipe, photograph = self.recipe, self.opened.photograph
-        rows = photograph.pixels[0].permute(1, 2, 0).numpy()
-        channels = 3 if recipe.gives_colour else rows.shape[2]
-        pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-        for part, values in edit_rows(self._passes(photograph, report), rows, recipe, self.opened.name):
-            pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
+        pixels = self._edited_at_once(recipe, report)
+        if pixels is None:
+            rows = photograph.pixels[0].permute(1, 2, 0).numpy()
+            channels = 3 if recipe.gives_colour else rows.shape[2]
+            pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
+            for part, values in edit_rows(self._passes(photograph, report), rows, recipe, self.opened.name):
+                pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(photograph.with_pixels(pixels), target)
         self.saved = recipe

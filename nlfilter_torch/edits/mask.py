@@ -46,7 +46,7 @@ COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask;
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
-ODDS = 1.35  # of masks, times those of the solution along borders, which is too low halfway
+ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
 EPSILON = 1e-6
 
 
@@ -326,7 +326,8 @@ def _regression(
 def calibrated(mask: Tensor) -> Tensor:
     """Mask of a solution along borders: a curve on which 0 and 1 stay as they are."""
     mask = mask.clamp(0.0, 1.0)
-    return ODDS * mask / (1 + (ODDS - 1) * mask)
+    inside, outside = ODDS * mask**STEEPNESS, (1 - mask) ** STEEPNESS
+    return inside / (inside + outside)
 
 
 def sharpened(likely: Tensor) -> Tensor:

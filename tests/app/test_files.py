@@ -37,7 +37,7 @@ def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> 
     edit = session.save_preset("edit.json")
     assert find_recipe(str(edit)) == session.recipe
     assert main(["apply", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
-    assert difference(saved, read_photograph(photo.with_name("cli.png")).pixels) <= 1.001
+    assert difference(saved, read_photograph(photo.with_name("cli.png")).pixels) <= 1
     assert difference(saved, session.recipe.apply(cat())) <= 1
 
 
@@ -45,7 +45,7 @@ def test_sliders_alone_are_a_preset_of_detail(session: Session, photo: Path) -> 
     session.set("detail", alpha=(3.0, 3.0, 4.0, 1.05), bandwidth=12.0)
     saved, edit = session.save("out.png"), session.save_preset("edit.json")
     assert main(["detail", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
-    assert difference(read_photograph(saved).pixels, read_photograph(photo.with_name("cli.png")).pixels) <= 1.001
+    assert difference(read_photograph(saved).pixels, read_photograph(photo.with_name("cli.png")).pixels) <= 1
 
 
 def test_grey_photographs_become_coloured_files(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_an_edit_too_large_for_the_machine(session: Session, monkeypatch: pytest
     free = type("Memory", (), {"available": 10**6})
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     session.add_stroke("defocus", LINE, 0.05, "in")
-    with pytest.raises(MemoryError, match=r"cat\.png needs at least .* MB of memory, but only 1 MB may be used"):
+    with pytest.raises(MemoryError, match=r"cat\.png has 150x100 pixels and needs"):
         session.save("out.png")
     assert not (session.folder / "out.png").exists()
 
