@@ -1,8 +1,8 @@
 """Time of the editor from a pointer movement to the picture: python -m benchmarks.app [--side 1000] [--browser].
 
-Prints medians and quartiles of 20, in milliseconds, on a square preview; with ``--browser`` from the pointer's move to
-the picture in a headless Chromium as well, over the server and its pictures as JPEG. Then, for a photograph of
-``--megapixels``, from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new; the time to
+Prints medians and quartiles of 20, in milliseconds, on a square preview. Then, for a photograph of ``--megapixels``, the
+same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well, over the server and its
+pictures as JPEG; from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new; the time to
 open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with the same edit, and the
 memory at the peak, above that before the photograph was opened.
 """
@@ -211,14 +211,16 @@ def main() -> None:
         path = Path(folder) / "photograph.png"
         write_photograph(Photograph(photograph(arguments.side, arguments.side)), path)
         in_the_library(path)
+        print(f"\n{arguments.megapixels:g} megapixels")
         large, compressed = Path(folder) / "large.tif", Path(folder) / "large.jpg"
         height = round((arguments.megapixels * 1e6 / 1.5) ** 0.5)
         for file in (large, compressed):
             write_photograph(Photograph(photograph(height, round(1.5 * height))), file)
+        in_the_library(compressed)
         files(compressed)
         at_full_size(large)
         if arguments.browser:
-            in_the_browser(path)
+            in_the_browser(compressed)
 
 
 if __name__ == "__main__":

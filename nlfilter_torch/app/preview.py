@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
-from nlfilter_torch.edits.colour import balanced_change, move_luminance, nearby_or_far
+from nlfilter_torch.edits.colour import balanced_change, in_strips, move_luminance, nearby_or_far
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
@@ -26,7 +26,7 @@ from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.viewing import MEGAPIXEL, Coarse, viewed_size
+from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
@@ -220,11 +220,12 @@ class Preview:
         limits, saturation = detail["limits"], None
         if limits == "soft":
             change, saturation = balanced_change(self.pixels, change, brighter)
-        if self.stride == 1:
-            return move_luminance(self.pixels, change, saturation, limits)
-        luminance = reduce_channels(self.pixels, "luminance")
-        coarse = Coarse.of(luminance, change, saturation, limits)
-        return coarse.change(self.pixels, *coarse.left(luminance, self.stride))
+
+        def moved(image: Tensor, change: Tensor, saturation: Tensor | None = None) -> tuple[Tensor, ...]:
+            return (move_luminance(image, change, saturation, limits),)
+
+        planes = (self.pixels, change) if saturation is None else (self.pixels, change, saturation)
+        return in_strips(moved, *planes)[0]
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""

@@ -20,6 +20,7 @@ MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it fla
 EPSILON = 1e-9
 LIGHTNESS = 0.3  # weight of lightness relative to hue and saturation: a fold in a red cloth is still red
 CHUNK = 8192  # pixels converted at once by one thread
+STRIP = 1 << 17  # pixels computed at a time
 VECTOR_LENGTH = 64  # a multiple of the SIMD width in floats
 Limits = Literal["soft", "none"]
 
@@ -126,13 +127,23 @@ def balanced_change(
     """
     if brighter is None:
         return limited_change(image, change)
-    before, moved = _before(image, change), _limited(image, change)
+    before, (moved,) = _before(image, change), in_strips(lambda *some: (_limited(*some),), image, change)
     curve = _curve(_shifts(before, moved).mean((2, 3), keepdim=True), brighter)
     moved = _bent(before, moved, curve)
     if change.shape[1] == image.shape[1]:
         return moved, None
-    less, more = _saturation(image, moved)
+    less, more = in_strips(_saturation, image, moved)
     return moved, less + _colour(_chromas(image, less, more).mean((2, 3), keepdim=True)) * more
+
+
+def in_strips(function: Callable[..., tuple[Tensor, ...]], *planes: Tensor) -> tuple[Tensor, ...]:
+    """Apply a pointwise function to some rows of images (B, C, H, W) at a time, so that temporaries stay in the cache.
+
+    Faster by several times for megapixels.
+    """
+    rows = max(1, STRIP // planes[0].shape[3])
+    parts = [function(*some) for some in zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)]
+    return tuple(torch.cat(part, dim=2) for part in zip(*parts, strict=True))
 
 
 def _shifts(before: Tensor, moved: Tensor) -> Tensor:
