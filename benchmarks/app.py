@@ -1,10 +1,10 @@
 """Time of the editor from a pointer movement to the picture: python -m benchmarks.app [--side 1000] [--browser].
 
-Prints medians and quartiles of 20, in milliseconds, on a square preview. Then, for a photograph of ``--megapixels``, the
-same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well, over the server and its
-pictures as JPEG; from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new; the time to
-open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with the same edit, and the
-memory at the peak, above that before the photograph was opened.
+Prints medians and quartiles of 20, in milliseconds, on a square preview. Then, for a photograph of ``--megapixels``,
+the same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well, over the server and
+its pictures as JPEG; from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new; the
+time to open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with the same edit,
+and the memory at the peak, above that before the photograph was opened.
 """
 
 import argparse
