@@ -25,24 +25,17 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.preview import RECIPES
 from benchmarks.whole import measure
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.closeup import Closeup
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.recipe import Recipe
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 REPEATS = 20
 VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800
-
-HERE = ((0.4, 0.4), (0.5, 0.4))
-SAVED = {
-    "detail": Step("detail", alpha=(2.0, 2.0, 2.0, 1.0)),
-    "recolor": Step("recolor", (Stroke(HERE, 0.02, "#2040e0"),)),
-    "denoise": Step("denoise"),
-}
+SAVED = ("detail", "recolor", "denoise")
 
 
 def photograph(height: int, width: int) -> torch.Tensor:
@@ -149,7 +142,7 @@ def opened_and_saved(path: Path, edit: str) -> tuple[float, float, float]:
     forget_peak()
     before = resident("VmRSS")
     opening = milliseconds(lambda: session.open(path))
-    session.load(Recipe((SAVED[edit],)))
+    session.load(RECIPES[edit])
     saving = milliseconds(lambda: session.save("saved.jpg"))
     return opening, saving, (resident("VmHWM") - before) * MIB / 1e6
 
@@ -157,11 +150,11 @@ def opened_and_saved(path: Path, edit: str) -> tuple[float, float, float]:
 def files(path: Path) -> None:
     """Opening and saving in the editor, and on the command line."""
     folder = path.parent
-    for edit, step in SAVED.items():
+    for edit in SAVED:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
             opening, saving, memory = fresh.submit(opened_and_saved, path, edit).result()
         preset = folder / "edit.json"
-        preset.write_text(Recipe((step,)).to_json())
+        preset.write_text(RECIPES[edit].to_json())
         call = ["-m", "nlfilter_torch", "apply", str(path), str(folder / "out" / "out.jpg"), "--preset", str(preset)]
         _, wall, _ = measure("apply", [sys.executable, *call], folder)
         report("open", [opening])

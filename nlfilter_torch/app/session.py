@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,7 @@ from nlfilter_torch.tiled.tiles import Passes, Statistics
 
 SPACING = 0.2  # of the points of a stroke, as a share of its radius
 UNDOS = 100
-SMALL = (
-    1 << 18
-)  # pixels of a photograph whose statistics are those of all pixels; a sample is nearly as exact, and fast
+SMALL = 1 << 18  # pixels, up to which statistics are those of all pixels; a sample is nearly as exact, and fast
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
 
 
@@ -268,10 +267,7 @@ class Session:
         if width * height * recipe.bytes_per_pixel > WHOLE:
             return None
         check_memory(Path(self.opened.name), width, height, recipe.bytes_per_pixel)
-        for number, step in enumerate(recipe.acting):
-            report("Editing", number, len(recipe.acting))
-            pixels = Recipe((step,)).apply(pixels.clamp(0, 1) if number else pixels)
-        return pixels
+        return recipe.apply(pixels, partial(report, "Editing"))
 
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
         """Of an edit in parts at full size."""

@@ -10,10 +10,14 @@ from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import stages, steps
+from nlfilter_torch.core.memory import working_bytes
+from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.io.photographs import (
     Photograph,
     TooLarge,
     check_depth,
+    check_memory,
     check_output,
     read_photograph,
     write_photograph,
@@ -47,6 +51,17 @@ def allowed_memory(gigabytes: float | None) -> int:
 def tile_limit(gigabytes: float | None) -> int:
     """Largest memory in bytes of the tiles of an edit, given ``--memory``."""
     return tile_memory() if gigabytes is None else allowed_memory(gigabytes)
+
+
+def viewed_within_memory(path: str | Path, size: tuple[int, int], step: Step, factors: int = 1) -> tuple[int, int]:
+    """Size (h, w) at which the filter of a step looks at a photograph of size (H, W).
+
+    Raises:
+        TooLarge: if so many factors of that size do not fit in the free memory. It is a MemoryError.
+    """
+    height, width = viewed_size(size, step["viewing_size"])
+    check_memory(Path(path), width, height, working_bytes(step["landmarks"], step["patch_size"], factors=factors))
+    return height, width
 
 
 def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: float | None) -> Photograph | None:
@@ -163,7 +178,7 @@ def edit_file(
         depth: of the output; None is that of the input.
         edit: computes new pixels (1, C, H, W) from the photograph.
         bytes_per_pixel: memory that the edit needs per pixel of an image.
-        memory: gigabytes that may be used; None is a fifth of the machine's, at most 2, and 1 for tiles.
+        memory: gigabytes that may be used; None is a fifth of the machine's, but at most 2, or 1 in tiles.
         by_rows: the same edit for photographs that do not fit in memory.
         coloured: whether the edit by rows adds colours to a grey photograph.
         workers: number of processes that filter zarr arrays, instead of threads.

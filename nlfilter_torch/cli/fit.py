@@ -8,7 +8,6 @@ import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import step_of, with_options
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS
 
 if TYPE_CHECKING:
@@ -118,7 +117,7 @@ def fit(
     for look, path in zip(looks, results, strict=True):
         _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
     if whole is not None:
-        _tell_where(*whole, step=first[0][0].shape[-1] / whole[0].shape[-1])
+        _tell_where(*whole, stride=first[0][0].shape[-1] / whole[0].shape[-1])
 
 
 def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
@@ -164,14 +163,13 @@ def _is_picture(path: Path) -> bool:
 
 def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     """A pair on the same pixels, in colour if one of them is."""
+    from nlfilter_torch.cli.editing import viewed_within_memory
     from nlfilter_torch.edits.alignment import align
     from nlfilter_torch.edits.fit_look import check_belong
-    from nlfilter_torch.edits.viewing import viewed_size
-    from nlfilter_torch.io.photographs import check_memory, read_photograph
+    from nlfilter_torch.io.photographs import read_photograph
 
     images = [read_photograph(path, bytes_per_pixel=PAIR_BYTES).pixels for path in (before, after)]
-    height, width = viewed_size((images[0].shape[2], images[0].shape[3]), step["viewing_size"])
-    check_memory(before, width, height, working_bytes(step["landmarks"], step["patch_size"]))
+    viewed_within_memory(before, (images[0].shape[2], images[0].shape[3]), step)
     channels = max(image.shape[1] for image in images)
     first, second = (image.expand(-1, channels, -1, -1) for image in images)
     image, edited, done = align(first, second, str(before), str(after))
@@ -227,8 +225,8 @@ def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> Non
     typer.echo(f"preset: {path}")
 
 
-def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", step: float) -> None:
-    """Say where what is left is, if it is in a few places; ``step`` is the size of their pixels in the photograph."""
+def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", stride: float) -> None:
+    """Say where what is left is, if it is in a few places; ``stride`` is the size of their pixels in the photograph."""
     from torch.nn.functional import avg_pool2d
 
     from nlfilter_torch.edits.alignment import inside_frame
@@ -242,7 +240,7 @@ def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", step: float)
     if float(largest.values.sum() / rest.sum()) < MOST:
         return
     place = int(largest.indices[0])
-    row, column = (round(SQUARE * step * number) for number in divmod(place, rest.shape[1]))
+    row, column = (round(SQUARE * stride * number) for number in divmod(place, rest.shape[1]))
     _tell(
         f"most of what is left is in a tenth of the picture, around row {row}, column {column}: an edit of a part; "
         "--map shows where, and --mask fits parts by themselves"

@@ -9,7 +9,6 @@ import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import step_of, with_options
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.parameters import EDITS
 
 if TYPE_CHECKING:
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
 Folder = Annotated[
     Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
 ]
+READ_BYTES = 40  # per pixel, of a photograph that is read and reduced
 # Meaning of each diagnostic, for readers who do not know the paper.
 MEANINGS = {
     "height": "pixels from top to bottom",
@@ -53,20 +53,19 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 
     import torch
 
+    from nlfilter_torch.cli.editing import viewed_within_memory
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.resizing import resize
-    from nlfilter_torch.edits.viewing import viewed_size
-    from nlfilter_torch.io.photographs import check_folder, check_memory, open_beside, read_photograph
+    from nlfilter_torch.io.photographs import check_folder, open_beside, read_photograph
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.plotting import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
 
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
-        pixels = read_photograph(source).pixels
-        height, width = viewed_size((pixels.shape[2], pixels.shape[3]), step["viewing_size"])
-        check_memory(Path(source), width, height, working_bytes(step["landmarks"], step["patch_size"], factors=5))
-        guide = reduce_channels(resize(pixels, (height, width)), "luminance")
+        photograph = read_photograph(source, bytes_per_pixel=READ_BYTES)
+        size = viewed_within_memory(source, photograph.size, step, factors=5)
+        guide = reduce_channels(resize(photograph.pixels, size), "luminance")
         begin("Comparing patches")
         operator = build_operator(guide, step, seed)
         begin("Finding patterns")

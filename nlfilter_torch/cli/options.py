@@ -101,7 +101,7 @@ Memory = Annotated[
     typer.Option(
         metavar="GB",
         help="Memory limit in gigabytes, in addition to 0.3 for the program itself. A photograph that needs more is "
-        "processed in tiles, without seams. Default: a fifth of the machine's memory, at most 2, and 1 for tiles.",
+        "processed in tiles, without seams. Default: a fifth of the machine's memory, but at most 2, or 1 in tiles.",
         rich_help_panel=FILES_PANEL,
     ),
 ]

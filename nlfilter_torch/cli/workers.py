@@ -71,6 +71,7 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
     from joblib.externals.loky import get_reusable_executor
 
     # With one, joblib would work in this process, which must outlive the work; a second one stays idle then.
+    interrupted = False
     options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
     try:
         with (
@@ -79,10 +80,11 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
         ):
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
             yield Workers(workers)
-    except BaseException:
-        get_reusable_executor().shutdown(kill_workers=True)  # joblib has not, if the interrupt reached it elsewhere
+    except KeyboardInterrupt:
+        interrupted = True  # which joblib does not handle everywhere: its workers would go on
         raise
-    get_reusable_executor().shutdown()
+    finally:
+        get_reusable_executor().shutdown(kill_workers=interrupted)
 
 
 def _of_dask(address: str) -> Iterator[Workers]:

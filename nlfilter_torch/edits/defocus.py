@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_reach
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
-from nlfilter_torch.edits.pixels import Inner
 from nlfilter_torch.edits.source import Fitted, Source, edited
 
 Aperture = Literal["disc", "gaussian"]

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_photograph
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_fake
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
-from nlfilter_torch.edits.pixels import Inner
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source, edited
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, noise_map

@@ -14,11 +14,11 @@ from nlfilter_torch.core.checks import (
     check_tensor,
     check_weight,
 )
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import Limits, nearby_or_far
 from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, MASK
-from nlfilter_torch.edits.pixels import Inner
 from nlfilter_torch.edits.shared_parameters import FILTER
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.steps import Step

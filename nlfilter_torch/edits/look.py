@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.look_parameters import LOOK
-from nlfilter_torch.edits.pixels import WHOLE, Inner, corner
+from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
@@ -191,7 +192,7 @@ def fit_look_edit(
         return shown if local is None else shown + strength * local
 
     if fitted.finish is None:
-        return Fitted(lambda pixels: finished(pixels.image, planes(pixels), WHOLE))
+        return Fitted(lambda pixels: finished(pixels.image, planes(pixels), EVERYWHERE))
     return Fitted(planes, finished, fitted.margin)
 
 

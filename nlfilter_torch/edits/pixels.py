@@ -6,6 +6,8 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from nlfilter_torch.core.inner import Inner
+
 
 class Pixels(Protocol):
     """A set of pixels of a picture: all of them, some rows, or a rectangle."""
@@ -29,8 +31,6 @@ def corner(pixels: Pixels) -> tuple[int, int]:
 
 
 Planes = Callable[[Any], Tensor]  # values (B, C, h, W) at given pixels
-Inner = tuple[slice, slice]  # rows and columns of an image whose values are needed
-WHOLE: Inner = (slice(None), slice(None))
 
 
 @dataclass(frozen=True, eq=False)

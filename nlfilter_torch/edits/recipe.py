@@ -14,7 +14,7 @@ Omitted entries have the defaults of the command of that name. Coordinates of st
 that an edit made on a preview applies to the photograph. Does not import torch until a recipe is applied.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -74,11 +74,12 @@ class Recipe:
         """Whether a grey photograph becomes one in colour."""
         return any(step.declared.coloured for step in self.acting)
 
-    def apply(self, image: "Tensor") -> "Tensor":
+    def apply(self, image: "Tensor", report: Callable[[int, int], object] | None = None) -> "Tensor":
         """Edit a photograph.
 
         Args:
             image: (1, C, H, W) in [0, 1], C = 1 or 3.
+            report: called before each step with how many are done, and of how many.
 
         Returns:
             (1, C, H, W), with C = 3 if a step added colour; the image itself if no step has an effect. Values may leave
@@ -96,8 +97,10 @@ class Recipe:
         """
         from nlfilter_torch.edits.applying import apply_step
 
-        result = image
-        for step in self.acting:
+        result, steps = image, self.acting
+        for done, step in enumerate(steps):
+            if report is not None:
+                report(done, len(steps))
             result = apply_step(step, image if result is image else result.clamp(0, 1))
         return result
 

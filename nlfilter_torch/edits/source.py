@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
+from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.pixels import WHOLE
 from nlfilter_torch.edits.pixels import Fitted as Fitted
 from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
@@ -263,7 +263,7 @@ class InMemory:
     def all(self, fitted: "Fitted") -> Tensor:
         """Apply an edit to all pixels."""
         planes = fitted.pixels(self)
-        return planes if fitted.finish is None else fitted.finish(self.image, planes, WHOLE)
+        return planes if fitted.finish is None else fitted.finish(self.image, planes, EVERYWHERE)
 
     def cached(self, fitted: "Fitted") -> "Fitted":
         """Compute the result of an edit and keep it in memory."""

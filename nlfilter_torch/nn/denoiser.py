@@ -16,6 +16,7 @@ from nlfilter_torch.core.checks import (
     check_values,
     described,
 )
+from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.precision import as_given
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
@@ -35,8 +36,6 @@ SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
 BORDER = 16  # width in pixels of the border added to images, so that their own border does not affect results
 TILE_BATCH = 8  # tiles processed at once
-Part = tuple[slice, slice]  # rows and columns of an image
-WHOLE: Part = (slice(None), slice(None))
 
 
 class NonlocalDenoiser(nn.Module):
@@ -117,7 +116,7 @@ class NonlocalDenoiser(nn.Module):
         image = noisy.to(dtype)
         return as_given(image - self.estimate_in_tiles(image, levels, turns), noisy)
 
-    def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Part = WHOLE) -> Tensor:
+    def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Inner = EVERYWHERE) -> Tensor:
         """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype.
 
         Values outside ``inner`` may be any.
@@ -220,7 +219,9 @@ def join_colours(planes: Tensor, channels: int) -> Tensor:
     return torch.einsum("cp,bphw->bchw", torch.linalg.inv(_mixture(planes)), planes)
 
 
-def in_tiles(image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], Tensor], inner: Part = WHOLE) -> Tensor:
+def in_tiles(
+    image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], Tensor], inner: Inner = EVERYWHERE
+) -> Tensor:
     """Apply a function to an image (B, C, H, W) and its noise in overlapping tiles, or at once if the image is small.
 
     Tiles are ``STEP`` pixels apart, starting at the upper left corner. Their weights fall to 0 in the outermost pixels,
