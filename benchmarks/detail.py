@@ -30,9 +30,12 @@ from benchmarks.photographs import pictures
 from benchmarks.unsharp import gaussian
 from nlfilter_torch import enhance
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.colour import balanced_change, edit_luminance, move_luminance
+from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.parameters import DETAIL
+from nlfilter_torch.edits.pixels import Fitted, part_of
 from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.source import InMemory
+from nlfilter_torch.edits.viewing import within_limits
 from nlfilter_torch.operator.features import reduce_channels
 
 CHOSEN_ON = ("astronaut", "coffee", "chelsea", "rocket")
@@ -124,10 +127,10 @@ class Scene:
 def ours(image: Tensor) -> Strength:
     """The detail edit for any strength from a single filter run: it is linear in the sliders before the limits."""
     change = luminance(enhance(image, torch.tensor([2.0, 2.0, 2.0, 1.0]), limits="none")) - luminance(image)
+    source = InMemory(image)
 
     def edit(strength: float) -> Tensor:
-        moved = strength * change
-        return move_luminance(image, *balanced_change(image, moved))
+        return source.all(within_limits(source, Fitted(part_of(strength * change)), "soft"))
 
     return edit
 

@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import defocus
+from nlfilter_torch.edits.defocus import ROWS, convolve
 from tests.problems import box, colour
 
 
@@ -62,3 +63,14 @@ def test_odd_pixels_of_the_subject_do_not_bring_the_background_into_focus() -> N
 def test_flat_images_stay_flat() -> None:
     flat = torch.full((1, 3, 24, 30), 0.3)
     torch.testing.assert_close(defocus(flat, box(4, 4, size=(24, 30))), flat, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("height", [7, ROWS, 3 * ROWS + 11])
+@pytest.mark.parametrize("radius", [1, 4, 60])
+def test_convolution_in_parts_is_that_of_the_whole(height: int, radius: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    planes = torch.rand(2, 1, height, 30, generator=generator, dtype=torch.float64)
+    kernel = torch.rand(2 * radius + 1, 2 * radius + 1, generator=generator, dtype=torch.float64)
+    kernel = kernel + kernel.flip(0, 1)
+    wanted = F.conv2d(planes, kernel[None, None], padding=radius)
+    torch.testing.assert_close(convolve(planes, kernel), wanted, atol=1e-10, rtol=0)

@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
+from nlfilter_torch.edits.pixels import in_strips, strips_of
+from nlfilter_torch.edits.source import InMemory
 from tests.problems import box, noise, paint
 
 GREY = 0.2 + 0.6 * noise(2, 1, 20, 22, dtype=torch.float32)
@@ -47,6 +49,32 @@ def test_edits_of_a_batch_are_those_of_its_images(name: str) -> None:
     image, edit = EDITS[name]
     image = image.double()
     torch.testing.assert_close(edit(image), torch.cat([edit(image[:1]), edit(image[1:])]), atol=1e-5, rtol=0)
+
+
+@each_edit
+def test_edits_of_a_picture_in_strips_are_those_of_the_whole(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    image, edit = EDITS[name]
+    image = image.double()
+    wanted, pieces = edit(image), []
+
+    def rows(image: torch.Tensor) -> int:
+        pieces.append(image.shape)
+        return 7
+
+    monkeypatch.setattr("nlfilter_torch.edits.pixels._rows_at_once", rows)
+    torch.testing.assert_close(edit(image), wanted, atol=1e-12, rtol=0)
+    assert pieces
+
+
+def test_pictures_are_divided_if_they_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = torch.rand(1, 3, 40, 50)
+    source = InMemory(image)
+    assert strips_of(source) == [source]
+    monkeypatch.setattr("nlfilter_torch.edits.pixels.STRIP", 300 // torch.get_num_threads())
+    parts = strips_of(source)
+    assert torch.equal(torch.cat([part.image for part in parts], dim=2), image)
+    assert [(part.first, part.width) for part in parts] == [(300 * i, 50) for i in range(7)]
+    assert torch.equal(in_strips(lambda x: (x + 1,), image)[0], image + 1)
 
 
 @each_edit

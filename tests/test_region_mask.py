@@ -184,7 +184,7 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
     height, width, count = 6, 7, 42
     image, rough = noise(1, 3, height, width), noise(1, 1, height, width, seed=1)
     front, back = box(1, 1, 2, 2, size=(height, width)).double(), box(4, 4, 1, 2, size=(height, width)).double()
-    functions = matting.solve_linear(image, torch.full_like(rough, 0.5), rough, front, back)
+    functions = matting.solve_linear(matting.linear_models(image), torch.full_like(rough, 0.5), rough, front, back)
     pixels = image[0].flatten(1).T.numpy()
     rows, columns = np.divmod(np.arange(count), width)
     near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= matting.WINDOW_RADIUS

@@ -9,16 +9,12 @@ import torch.nn.functional as F
 
 from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.colour import (
-    balance_of,
-    balanced_change,
-    change_luminance,
-    limited_change,
-    move_luminance,
-)
 from nlfilter_torch.edits.detail import limit_by_activity, split_sliders
+from nlfilter_torch.edits.limits import Limits
+from nlfilter_torch.edits.pixels import Fitted, part_of
 from nlfilter_torch.edits.resizing import resize, resized
-from nlfilter_torch.edits.viewing import viewed_size
+from nlfilter_torch.edits.source import InMemory
+from nlfilter_torch.edits.viewing import viewed_size, within_limits
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled import stream_detail
 from tests.problems import colour, luminance
@@ -42,33 +38,22 @@ def drawn(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return image, torch.randn(2, 1, 40, 40, generator=generator, dtype=torch.float64)
 
 
-def balanced(image: torch.Tensor, change: torch.Tensor, brighter: float = 0.0) -> torch.Tensor:
-    return move_luminance(image, *balanced_change(image, change, brighter))
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_a_whole_image_is_balanced_as_its_parts_are(channels: int) -> None:
-    image, change = drawn()
-    image = image[:, :channels]
-    balance = balance_of(lambda function: function(image, change).mean((2, 3), keepdim=True), 0.05)
-    for found, expected in zip(
-        balanced_change(image, change, 0.05), limited_change(image, change, balance), strict=True
-    ):
-        if found is None or expected is None:
-            assert found is expected is None
-        else:
-            torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+def changed(
+    image: torch.Tensor, change: torch.Tensor, limits: Limits = "soft", brighter: float | None = None
+) -> torch.Tensor:
+    source = InMemory(image)
+    return source.all(within_limits(source, Fitted(part_of(change)), limits, brighter))
 
 
 def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
     image, change = drawn()
-    for found in (change_luminance(image, change), balanced(image, change)):
+    for found in (changed(image, change), changed(image, change, brighter=0.0)):
         levels = (255 * found).round()
         assert not bool(((levels <= 0) & (image > 0)).any())  # no channel clips that did not before
         assert not bool(((levels >= 255) & (image < 1)).any())
         assert found.min() >= -1e-12
         assert found.max() <= 1 + 1e-12
-    found = change_luminance(image, change)
+    found = changed(image, change)
     moved = luminance(found) - luminance(image)
     assert bool((moved * change >= -1e-12).all())
     assert bool((moved.abs() <= change.abs() + 1e-12).all())
@@ -76,18 +61,18 @@ def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
     assert bool((torch.linalg.cross(before, after, dim=1).abs() < 1e-7).all())  # hues are kept
     assert bool((after.norm(dim=1) <= before.norm(dim=1) + 1e-6).all())
     middle = torch.full((1, 3, 4, 4), 0.5, dtype=torch.float64)
-    torch.testing.assert_close(change_luminance(middle, middle[:, :1] * 0.002), middle + 0.001, atol=2e-6, rtol=0)
+    torch.testing.assert_close(changed(middle, middle[:, :1] * 0.002), middle + 0.001, atol=2e-6, rtol=0)
     still = torch.zeros_like(change)
-    assert torch.equal(change_luminance(image, still), image)
-    assert torch.equal(balanced(image, still), image)
-    assert torch.equal(change_luminance(image, change, "none"), image + change)
+    assert torch.equal(changed(image, still), image)
+    assert torch.equal(changed(image, still, brighter=0.0), image)
+    assert torch.equal(changed(image, change, "none"), image + change)
 
 
 @pytest.mark.parametrize(("rest", "change"), [((87, 160), -0.055), ((170, 90), 0.05)])
 def test_a_channel_near_its_end_causes_no_edge(rest: tuple[int, int], change: float) -> None:
     ends = [5, 4, 3, 2, 1, 0] if change < 0 else [250, 251, 252, 253, 254, 255]
     sky = torch.tensor([[end, *rest] for end in ends]).T.reshape(1, 3, 1, 6) / 255  # a smooth saturated area
-    moved = luminance(change_luminance(sky, torch.full((1, 1, 1, 6), change)) - sky).flatten() * 255
+    moved = luminance(changed(sky, torch.full((1, 1, 1, 6), change)) - sky).flatten() * 255
     assert moved.abs().min() > 5
     assert moved.diff().abs().max() < 1
 
@@ -101,10 +86,10 @@ def test_balance_keeps_mean_brightness_and_chroma(channels: int) -> None:
         grey = luminance(x) if channels == 3 else x
         return torch.stack([grey.mean((1, 2, 3)), (x - grey).norm(dim=1).mean((1, 2))])
 
-    alone = means(change_luminance(image, change))
+    alone = means(changed(image, change))
     assert (alone[0] - means(image)[0]).abs().min() > 0.004
     for brighter in (0.0, 0.05):
-        found = means(balanced(image, change, brighter))
+        found = means(changed(image, change, brighter=brighter))
         torch.testing.assert_close(found[0], (1 + brighter) * means(image)[0], atol=2e-6, rtol=0)
         torch.testing.assert_close(found[1], means(image)[1], atol=2e-6, rtol=0)
 
@@ -124,9 +109,9 @@ def test_limits_have_exact_gradients() -> None:
     generator = torch.Generator().manual_seed(1)
     image = torch.rand(1, 3, 4, 5, generator=generator, dtype=torch.float64, requires_grad=True)
     change = torch.randn(1, 1, 4, 5, generator=generator, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(change_luminance, (image, change))
+    assert torch.autograd.gradcheck(changed, (image, change))
     still = torch.zeros(1, 1, 4, 5, dtype=torch.float64, requires_grad=True)
-    change_luminance(image.detach(), still).sum().backward()
+    changed(image.detach(), still).sum().backward()
     assert still.grad is not None
     torch.testing.assert_close(still.grad, torch.full_like(still, 3.0))  # gradients can move sliders away from 1
 
@@ -143,7 +128,7 @@ def test_soft_limits_do_not_clip_and_none_is_the_plain_sum(name: str) -> None:
     chroma = [x - luminance(x) for x in (hard, image)]
     torch.testing.assert_close(chroma[0], chroma[1], atol=1e-5, rtol=0)  # the change is the same in all channels
     change = luminance(hard) - luminance(image)
-    limited = balanced(image, change)
+    limited = changed(image, change, brighter=0.0)
     torch.testing.assert_close(limited, soft, atol=1e-5, rtol=0)
     with pytest.raises(ValueError, match="limits must be one of 'soft', 'none', got 'hard'"):
         EDITS[name](image, limits="hard")

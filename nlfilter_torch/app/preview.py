@@ -17,16 +17,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
-from nlfilter_torch.edits.colour import balanced_change, in_strips, move_luminance, nearby_or_far
+from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
+from nlfilter_torch.edits.pixels import Fitted, Pixels, part_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size
+from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size, within_limits
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
@@ -92,7 +93,7 @@ class Preview:
         self.photograph = photograph
         self.pixels = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
         self._layers: Layers | None = None
-        self._source = InMemory(self.pixels, {}, self.stride)  # with the filter of the masks
+        self._source = InMemory(self.pixels, {})  # with the filter of the masks
         self._compared_by: Key = ()  # the settings of that filter
         self._mask: tuple[Key, Tensor] | None = None
         self._active: tuple[tuple[int, int], Tensor] | None = None
@@ -156,7 +157,7 @@ class Preview:
         if self._mask is None or self._mask[0] != key:
             fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
             if (detail["tolerance"], fewer) != self._compared_by:
-                self._source, self._compared_by = InMemory(self.pixels, {}, self.stride), (detail["tolerance"], fewer)
+                self._source, self._compared_by = InMemory(self.pixels, {}), (detail["tolerance"], fewer)
             (inner,), others = scribbles_of(detail, self.size)
             names = ("mask_bandwidth", "reach")
             bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
@@ -206,26 +207,22 @@ class Preview:
         return self._viewed(step) >= self.size
 
     def _blend(self, detail: Step) -> Tensor:
-        layers, mask = self.layers(detail).layers, self.mask(detail)
+        mask = self.mask(detail)
+        layers, active = part_of(self.layers(detail).layers), part_of(self._activity(detail))
 
-        def changes(alpha: tuple[float, ...]) -> Tensor:
-            return torch.cat([weigh_layers(layers, part) for part in split_sliders(torch.tensor(alpha) - 1)], dim=1)
+        def changes(of: Tensor, alpha: tuple[float, ...]) -> Tensor:
+            return torch.cat([weigh_layers(of, part) for part in split_sliders(torch.tensor(alpha) - 1)], dim=1)
 
-        found = changes(detail["alpha"])
-        if mask is not None:
-            found = torch.lerp(found, changes(detail.sliders_inside), mask)
-        change = limit_by_activity(found, self._activity(detail), detail["threshold"] / 255)
+        def change(pixels: Pixels) -> Tensor:
+            some = layers(pixels)
+            found = changes(some, detail["alpha"])
+            if mask is not None:
+                found = torch.lerp(found, changes(some, detail.sliders_inside), part_of(mask)(pixels))
+            return limit_by_activity(found, active(pixels), detail["threshold"] / 255)
+
         rows = [detail["alpha"], detail.sliders_inside]
         brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
-        limits, saturation = detail["limits"], None
-        if limits == "soft":
-            change, saturation = balanced_change(self.pixels, change, brighter)
-
-        def moved(image: Tensor, change: Tensor, saturation: Tensor | None = None) -> tuple[Tensor, ...]:
-            return (move_luminance(image, change, saturation, limits),)
-
-        planes = (self.pixels, change) if saturation is None else (self.pixels, change, saturation)
-        return in_strips(moved, *planes)[0]
+        return self._source.all(within_limits(self._source, Fitted(change), detail["limits"], brighter))
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """The edit of a step on the picture before it; slow unless its filter is cached."""

@@ -247,7 +247,7 @@ class Session:
                 if pixels is None:
                     found = self._fitted(recipe, report).reduced(self.preview.size, report)
                 else:
-                    found = resize(pixels, self.preview.size).clamp(0, 1)
+                    found = resize(pixels.clamp(0, 1), self.preview.size).clamp(0, 1)  # a file holds no more
                 self._at_rest = recipe.acting, found
             return self._at_rest[1]
 

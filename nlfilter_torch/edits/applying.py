@@ -127,7 +127,7 @@ def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step],
     The filter is computed once, for the first of them. ``stride`` is the sampling step of the image relative to the
     photograph.
     """
-    source = InMemory(image.to(working_dtype(image)), {}, stride)
+    source = InMemory(image.to(working_dtype(image)), {})
 
     def edit(step: Step) -> Tensor:
         fitted = fit_step(step, source, *scribbles_of(step, source.size), stride=stride)

@@ -25,6 +25,7 @@ from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, 
 from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
+from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, edited, luminance
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
@@ -191,11 +192,12 @@ def fit_colorize(
         planes = scribbles.weighted(regions.squeeze(2)).planes(viewed)
         pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
-        return _coloured(source, viewed, lambda _: chroma)
+        return _coloured(source, viewed, part_of(chroma))
     step = block_size(small)
     guide = viewed.reduced(luminance, step)
     # Without green, which follows from red and blue.
-    local = LocalValues.of(guide, step, small[1], scribbles.places, scribbles.weights, wanted[:, ::2])
+    marks = [scribbles.places, scribbles.weights, wanted[:, ::2]]
+    local = viewed.kept("local", [guide, *marks], lambda: LocalValues.of(guide, step, small[1], *marks))
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
@@ -223,7 +225,7 @@ def fit_colorize(
 
 def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
     """A picture in the chroma (B, 3, h, w) of its reduction; the edges of that follow those of its luminance."""
-    if source is viewed and source.stride == 1:
+    if source is viewed:
         return Fitted(lambda some: merge_luminance(luminance(some), chroma(some)))
 
     def twice(some: Any) -> Tensor:

@@ -20,6 +20,7 @@ Aperture = Literal["disc", "gaussian"]
 # than a sharp part of the background, so uncertain pixels stay sharp and the reach is larger than for other regions.
 BLURRED, SHARP, REACH = 0.15, 0.4, 0.72
 SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
+ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multiples of this, which makes it fast
 
 
 @full_precision
@@ -124,7 +125,7 @@ def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture)
         aperture: see :func:`defocus`.
     """
     behind = (1 - focus).square() + SUBJECT_WEIGHT  # SUBJECT_WEIGHT matters only where there is no background nearby
-    sums = _convolve(torch.cat([image * behind, behind], dim=1), _kernel(radius, aperture).to(image))
+    sums = convolve(torch.cat([image * behind, behind], dim=1), _kernel(radius, aperture).to(image))
     blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
     return torch.where(focus == 1, image, blurred)
 
@@ -146,10 +147,21 @@ def _kernel(radius: float, aperture: Aperture) -> Tensor:
     return kernel / kernel.sum()
 
 
-def _convolve(planes: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve planes (B, C, H, W) with a symmetric kernel (k, k), with zeros outside the image."""
+def convolve(planes: Tensor, kernel: Tensor) -> Tensor:
+    """Convolve planes (B, C, H, W) with a symmetric kernel (k, k), with zeros outside the image.
+
+    By Fourier transforms of some rows at a time, which stay in the cache.
+    """
     height, width = planes.shape[-2:]
-    half_width = kernel.shape[0] // 2
-    size = (height + 2 * half_width, width + 2 * half_width)
-    product = torch.fft.rfft2(planes, s=size) * torch.fft.rfft2(kernel, s=size)
-    return torch.fft.irfft2(product, s=size)[..., half_width : half_width + height, half_width : half_width + width]
+    half = kernel.shape[0] // 2
+    rows = min(height, max(ROWS, 8 * half))
+    size = tuple(math.ceil((length + 2 * half) / FAST) * FAST for length in (rows, width))
+    step = size[0] - 2 * half
+    spectrum, parts = torch.fft.rfft2(kernel, s=size), []
+    for first in range(0, height, step):
+        top = max(0, first - half)
+        some = planes[..., top : first + step + half, :]
+        found = torch.fft.irfft2(torch.fft.rfft2(some, s=size) * spectrum, s=size)
+        start = first - top + half
+        parts.append(found[..., start : start + min(step, height - first), half : half + width])
+    return torch.cat(parts, dim=-2)

@@ -16,7 +16,8 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import Limits, nearby_or_far
+from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.shared_parameters import FILTER

@@ -84,9 +84,12 @@ class LocalValues:
         rows = self._two_nearest(top, height, self.guide.shape[2], own)
         columns = self._two_nearest(left, width, self.guide.shape[3], own)
         total, weight = torch.zeros(()), torch.zeros(())
-        for row, row_share in rows:
-            for column, column_share in columns:
-                guide, values = (planes[:, :, row][..., column] for planes in (self.guide, self.values))
+        first = max(0, top // self.step - 1)  # of the rows of blocks that are used
+        blocks = torch.cat([self.guide, self.values], dim=1)[:, :, first : (top + height) // self.step + 2]
+        for column, column_share in columns:
+            near = blocks[..., column]  # rows of which are then copied whole
+            for row, row_share in rows:
+                guide, values = near[:, :, row - first].tensor_split([1], dim=1)
                 alike = torch.exp((own - guide).square() / -MAX_VARIANCE) + MIN_WEIGHT
                 share = row_share.unsqueeze(1) * column_share * alike
                 total, weight = total + share * values, weight + share

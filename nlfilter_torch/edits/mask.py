@@ -19,7 +19,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import LIGHTNESS, hundredths_of_lab, nearby
-from nlfilter_torch.edits.matting import linear_mask, solve_linear, solve_mask
+from nlfilter_torch.edits.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import block_means, enlarged
@@ -245,14 +245,23 @@ def fit_regions(
     operator = small.operator(Guide(options, region_guide, MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
     frame, colours = operator.at(places), small.colours(places)
-    rough = []
-    for marked in marks:
-        alike = likeness(marked.image, marked.weights[:, 0], colours, options["photometric_bandwidth"])
-        likely = sharpened(_regression(small, operator, marked, frame, 1 - alike, reach)(small))
-        by_colour = colour_likelihood(small.image, marked, colours, 1 - alike, options["photometric_bandwidth"])
+    rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
+    for number, marked in enumerate(marks):
+        unlike = 1 - likeness(marked.image, marked.weights[:, 0], colours, bandwidth)
+        likely = sharpened(_regression(small, operator, marked, frame, unlike, reach)(small))
+        by_colour = small.kept(
+            ("likelihood", number),
+            [marked.image, marked.weights, unlike, bandwidth],
+            partial(colour_likelihood, small.image, marked, colours, unlike, bandwidth),
+        )
         rough.append(likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0))
     front, back = (torch.cat([marked.planes(small)[:, k : k + 1] for marked in marks], dim=1) for k in (0, 1))
-    return Regions(small.image, step, fit_borders(small.image, torch.cat(rough, dim=1), front, back), both)
+    masks = [torch.cat(rough, dim=1), front, back]
+
+    def borders() -> Tensor:
+        return fit_borders(small.image, small.kept("models", [], lambda: linear_models(small.image)), *masks)
+
+    return Regions(small.image, step, small.kept("borders", masks, borders), both)
 
 
 def blocks_of(marked: Scribbles, small: Source, width: int, step: float) -> Scribbles:
@@ -344,11 +353,12 @@ def around(likely: Tensor) -> Tensor:
     return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), step, (0, 0), size)
 
 
-def fit_borders(image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
     """Linear functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
 
     Args:
         image: (B, C, H, W).
+        models: :func:`linear_models` of the image.
         rough: rough masks of the regions, (B, K, H, W).
         front: weights of the scribbles on the regions, (B, K, H, W).
         back: weights of the scribbles on their background, (B, K, H, W).
@@ -358,4 +368,4 @@ def fit_borders(image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Te
         ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE
     )
     start = solve_mask(image, target, ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE)
-    return solve_linear(image, start, rough, front, back)
+    return solve_linear(models, start, rough, front, back)

@@ -164,25 +164,29 @@ def window_means(planes: Tensor) -> Tensor:
     return planes
 
 
-def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+def linear_models(image: Tensor) -> list[LinearMasks]:
+    """Models of an image (B, C, H, W) on the levels of the second solve, finest first."""
+    levels = min(LINEAR_LEVELS - 1, pyramid_levels(min(image.shape[-2:])))
+    return [LinearMasks.of(colours) for colours in halved(image, levels)]
+
+
+def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
     """Solve the second problem for the functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit`.
 
     Args:
-        image: (B, C, H, W).
+        models: :func:`linear_models` of the image.
         start: initial masks, (B, K, H, W).
         rough: rough masks, (B, K, H, W); values near 0 or 1 have a higher confidence.
         front: weights of foreground scribbles, (B, K, H, W).
         back: weights of background scribbles, (B, K, H, W).
     """
     trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
-    levels = min(LINEAR_LEVELS - 1, pyramid_levels(min(image.shape[-2:])))
     certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
-    planes = torch.cat([image, trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
-    count = rough.shape[1]
+    planes = torch.cat([trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
     found: Tensor | None = None
-    for level, some in reversed(list(enumerate(halved(planes, levels)))):
-        colours, target, trust, first = some.split([image.shape[1], count, count, count], dim=1)
-        model = LinearMasks.of(colours)
+    levels = zip(models, halved(planes, len(models) - 1), strict=True)
+    for level, (model, some) in reversed(list(enumerate(levels))):
+        target, trust, first = some.chunk(3, dim=1)
         found = first if found is None else doubled(found, some)
         masks = [
             damped(model, a, 4**level * t, 4**level * c)
@@ -190,8 +194,8 @@ def solve_linear(image: Tensor, start: Tensor, rough: Tensor, front: Tensor, bac
         ]
         found = torch.cat(masks, dim=1)
     assert found is not None  # for mypy
-    functions = torch.stack([model.fit(mask.clamp(0.0, 1.0)) for mask in found.split(1, 1)], dim=1)
-    slopes, rest = functions.split([image.shape[1], 1], dim=2)
+    functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0)) for mask in found.split(1, 1)], dim=1)
+    slopes, rest = functions.tensor_split([-1], dim=2)
     return torch.cat([slopes, rest - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)
 
 
@@ -245,16 +249,15 @@ class Sides:
         share = ((image - self.outside) * across).mean(1, keepdim=True) / (
             contrast + MIN_SIDE_WEIGHT * HALF_TRUST_CONTRAST
         )
-        trust = (
-            self.known * contrast / (contrast + HALF_TRUST_CONTRAST**2) * (1 - (2 * mask - 1).pow(8))
-        )  # 0 and 1 are certain
+        decided = (2 * mask - 1).square().square().square()  # 0 and 1 are certain
+        trust = self.known * contrast / (contrast + HALF_TRUST_CONTRAST**2) * (1 - decided)
         return torch.lerp(mask, share.clamp(0.0, 1.0), trust)
 
 
 def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     """Colours on both sides of the borders of a mask (B, 1, H, W) of an image (B, C, H, W)."""
     (height, width), step = image.shape[-2:], 1 << pyramid_levels(min(image.shape[-2:]))
-    weights = torch.cat([mask, 1 - mask], dim=1).pow(4) + MIN_SIDE_WEIGHT  # (B, 2, H, W)
+    weights = torch.cat([mask, 1 - mask], dim=1).square().square() + MIN_SIDE_WEIGHT  # (B, 2, H, W)
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
     planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
     coarse = F.avg_pool2d(planes, step)

@@ -1,12 +1,16 @@
 """A set of pixels of a picture, and an edit as a function of such a set."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import block_length
 from nlfilter_torch.core.inner import Inner
+
+STRIP = 1 << 18  # pixels that a core computes at a time; with fewer, cores wait for each other if other programs run
 
 
 class Pixels(Protocol):
@@ -33,6 +37,52 @@ def corner(pixels: Pixels) -> tuple[int, int]:
 Planes = Callable[[Any], Tensor]  # values (B, C, h, W) at given pixels
 
 
+def part_of(planes: Tensor) -> Planes:
+    """Function that returns the part of planes (B, ..., H, W) of a picture at given pixels."""
+
+    def part(pixels: Pixels) -> Tensor:
+        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+        return planes[..., top : top + height, left : left + width]
+
+    return part
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """Some rows of a picture in memory."""
+
+    image: Tensor
+    first: int
+    width: int
+
+
+def strips_of(pixels: Pixels) -> list[Pixels]:
+    """Divide a picture into strips: pointwise work on megapixels is several times faster if its temporaries are cached.
+
+    A small one is not divided, nor one that is being compiled, since the compiler does this.
+    """
+    image, rows = pixels.image, _rows_at_once(pixels.image)
+    if rows >= image.shape[2]:
+        return [pixels]
+    parts = image.split(rows, dim=2)
+    return [Strip(part, i * rows * pixels.width, pixels.width) for i, part in enumerate(parts)]
+
+
+def in_strips(function: Callable[..., tuple[Tensor, ...]], *planes: Tensor) -> tuple[Tensor, ...]:
+    """Apply a pointwise function to the strips of images (B, C, H, W), see :func:`strips_of`."""
+    rows = _rows_at_once(planes[0])
+    if rows >= planes[0].shape[2]:
+        return function(*planes)
+    parts = [function(*some) for some in zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)]
+    return tuple(torch.cat(part, dim=2) for part in zip(*parts, strict=True))
+
+
+def _rows_at_once(image: Tensor) -> int:
+    if torch.compiler.is_compiling():
+        return image.shape[2]
+    return max(1, block_length(len(image), image.device, STRIP) // image.shape[3])
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """An edit fitted to a picture, which can be applied to any of its pixels.
@@ -50,3 +100,10 @@ class Fitted:
     finish: Callable[[Tensor, Tensor, Inner], Tensor] | None = None
     margin: int = 0
     step: int = 1
+
+    def then(self, function: Callable[[Tensor, Tensor], Tensor]) -> "Fitted":
+        """Apply a pointwise function of the image and of the result."""
+        finish = self.finish
+        if finish is None:
+            return Fitted(lambda pixels: function(pixels.image, self.pixels(pixels)))
+        return replace(self, finish=lambda image, planes, inner: function(image, finish(image, planes, inner)))

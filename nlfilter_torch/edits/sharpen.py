@@ -1,6 +1,5 @@
 """Sharpening with little noise gain: the middle sliders of a filter with a blurred guide. Paper: Fig. 6."""
 
-from functools import partial
 from typing import Any
 
 import torch
@@ -8,7 +7,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import Limits
+from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import SHARPEN
 from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change
@@ -84,15 +83,19 @@ def fit_sharpen(
     SHARPEN["guide_blur"].check_argument(guide_blur)
     SHARPEN["limits"].check_argument(limits)
     SHARPEN["viewing_size"].check_argument(viewing_size)
-    grey = partial(reduce_channels, guide_channels="luminance")  # blurs one channel instead of three
     middle = torch.as_tensor(amount, dtype=source.dtype).reshape(-1).expand(source.batch)
     still = torch.zeros_like(middle)
     sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, so that the filter gives the change
 
     def change(viewed: Source) -> Fitted:
         check_reach(guide_blur, "guide_blur", viewed.size)
-        operator = viewed.operator(Guide(options, transform=grey, blur=guide_blur))
+        operator = viewed.operator(Guide(options, transform=_grey, blur=guide_blur))
         changed = polynomial(operator, luminance, 3, None)
         return Fitted(lambda pixels: changed(pixels, sliders))
 
     return fit_change(source, change, luminance, viewing_size, limits)
+
+
+def _grey(image: Tensor) -> Tensor:
+    """Luminance of an image: one channel to blur instead of three."""
+    return reduce_channels(image, "luminance")

@@ -5,10 +5,10 @@ given these statistics. A :class:`Source` computes the sums: here for an image o
 :mod:`nlfilter_torch.tiled.source` for a picture that is read a few rows at a time.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.pixels import Fitted as Fitted
 from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
+from nlfilter_torch.edits.pixels import in_strips, part_of, strips_of
 from nlfilter_torch.edits.resizing import block_means, resize
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.filtering.filters import detail_layers, residual_change, weigh_layers
@@ -31,6 +32,7 @@ from nlfilter_torch.operator.spectrum import Response, RitzPairs, Spectrum, comp
 
 SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, where an edit allows it
 
+Kept = TypeVar("Kept")
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
 
@@ -123,10 +125,6 @@ class Source(Protocol):
     def whole(self) -> bool:
         """Whether all pixels are in memory."""
 
-    @property
-    def stride(self) -> float:
-        """Sampling step relative to the photograph, in pixels along each axis; 1 except for previews."""
-
     def operator(self, guide: Guide) -> Operator:
         """Build the filter of the picture."""
 
@@ -180,6 +178,15 @@ class Source(Protocol):
             MemoryError: if there is no room for ``floats`` numbers per pixel of the reduced picture.
         """
 
+    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+        """The result of a function of the picture and of given tensors; a preview keeps it for the next edit.
+
+        Args:
+            name: of the result.
+            given: tensors that it depends on.
+            compute: the function.
+        """
+
     def measured(self, function: Callable[["Source"], Tensor]) -> Tensor:
         """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""
 
@@ -189,15 +196,14 @@ class InMemory:
 
     Args:
         image: (B, C, H, W), float32 or float64.
-        cache: cache of its operators, by their options; None caches nothing.
-        stride: sampling step of the image relative to the photograph, in pixels along each axis.
+        cache: cache of its operators, by their options, and of what they compute; None caches nothing.
     """
 
     first = 0
     whole = True
 
-    def __init__(self, image: Tensor, cache: dict[Any, Any] | None = None, stride: float = 1) -> None:
-        self.image, self.cache, self.stride, self.dtype = image, cache, stride, image.dtype
+    def __init__(self, image: Tensor, cache: dict[Any, Any] | None = None) -> None:
+        self.image, self.cache, self.dtype = image, cache, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
 
@@ -246,6 +252,15 @@ class InMemory:
         """Planes of all pixels in another size."""
         return resize(planes(self), size)
 
+    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+        """The result of a function, from the cache if it was last computed from equal tensors."""
+        if self.cache is None:
+            return compute()
+        found = self.cache.get(name)
+        if found is None or not all(torch.equal(a, b) for a, b in zip(found[0], given, strict=True)):
+            found = self.cache[name] = (given, compute())
+        return cast(Kept, found[1])
+
     def blocks(self, step: float, floats: int) -> "InMemory":
         """Reduce the image by :func:`block_means`."""
         if step == 1:
@@ -262,17 +277,18 @@ class InMemory:
 
     def all(self, fitted: "Fitted") -> Tensor:
         """Apply an edit to all pixels."""
-        planes = fitted.pixels(self)
+        parts = [fitted.pixels(part) for part in strips_of(self)]
+        planes = parts[0] if len(parts) == 1 else torch.cat(parts, dim=2)
         return planes if fitted.finish is None else fitted.finish(self.image, planes, EVERYWHERE)
 
     def cached(self, fitted: "Fitted") -> "Fitted":
         """Compute the result of an edit and keep it in memory."""
-        planes = self.all(fitted)
-        return Fitted(lambda _: planes)
+        return Fitted(part_of(self.all(fitted)))
 
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means of a function of the image and of the result of an edit."""
-        return function(self.image, self.all(fitted)).mean((2, 3), keepdim=True)
+        (found,) = in_strips(lambda *some: (function(*some),), self.image, self.all(fitted))
+        return found.mean((2, 3), keepdim=True)
 
     def colours(self, places: Tensor) -> Tensor:
         """Colours of single pixels."""
@@ -324,17 +340,18 @@ class InMemoryOperator:
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Apply a function to the columns of all pixels."""
         found = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
-        planes = found.unflatten(2, self.source.size)
-        return lambda _: planes
+        return part_of(found.unflatten(2, self.source.size))
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Compute :func:`detail_layers`."""
-        layers = detail_layers(self.operator, planes(self.source), order=order)
-        return lambda _: layers
+        values = planes(self.source)
+        key = ("layers", self.operator, order)
+        return part_of(self.source.kept(key, [values], lambda: detail_layers(self.operator, values, order=order)))
 
     def coefficients(self, planes: Planes) -> Tensor:
         """Compute :meth:`Spectrum.coefficients`."""
-        return cast(Spectrum, self.pairs).coefficients(planes(self.source))
+        values, spectrum = planes(self.source), cast(Spectrum, self.pairs)
+        return self.source.kept(("coefficients", self.operator), [values], lambda: spectrum.coefficients(values))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""

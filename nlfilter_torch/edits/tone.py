@@ -7,7 +7,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import Limits, nearby_or_far
+from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import TONE
 from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
 from nlfilter_torch.edits.viewing import fit_change

@@ -9,8 +9,8 @@ factor are those of the small picture, whatever the size of the photograph.
 Detail too fine for the viewing size is changed like the coarser detail around it: what the small picture lacks is
 multiplied by the slope of the change over the brightness, from a regression over 5x5 pixels of the small picture. The
 finest parts of a texture are amplified (or smoothed) as much as the others; an edge, which is not detail, stays as
-sharp as it is. The mean of what this adds over a pixel of the small picture is
-subtracted, so that the result, when reduced, is the small result: the editor, which shows that, shows what is saved.
+sharp as it is. The mean of what this adds over a pixel of the small picture is subtracted, so that the result, when
+reduced, is nearly the small result, which the editor shows while a slider moves.
 """
 
 import math
@@ -23,7 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.colour import Balance, Limits, balance_of, change_luminance, limited_change, move_luminance
+from nlfilter_torch.edits.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
 from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes, corner
 from nlfilter_torch.edits.resizing import interpolation, resized
 from nlfilter_torch.operator.features import pad_border
@@ -52,10 +52,6 @@ class Reducible(Protocol):
     @property
     def size(self) -> tuple[int, int]:
         """(H, W)."""
-
-    @property
-    def stride(self) -> float:
-        """Sampling step relative to the photograph, in pixels along each axis."""
 
     def resized(self, size: tuple[int, int]) -> Any:
         """Reduce the picture to a smaller size."""
@@ -86,35 +82,43 @@ def fit_change(
         change: function that fits the change (B, 1 or C, h, w) to a source.
         planes: what is changed, luminance or all channels.
         size: the viewing size in megapixels; 0 is the size of the picture.
-        limits: those of :func:`change_luminance`.
+        limits: ``soft`` as :func:`limit`; ``none`` adds the change as it is.
         brighter: intended relative increase of the mean brightness, by default 0; None corrects neither mean brightness
             nor chroma.
     """
-
-    def balanced(of: Any, fitted: Fitted) -> tuple[Fitted, Balance | None]:
-        if limits == "none" or brighter is None:
-            return fitted, None
-        cached = of.cached(fitted)
-        return cached, balance_of(lambda function: of.mean_of(cached, function), brighter)
-
     small = viewed_size(source.size, size)
-    reduced: Any = source if small == source.size else source.resized(small)
-    fitted, balance = balanced(reduced, change(reduced))
-    if small == source.size and source.stride == 1:
-        if fitted.finish is None:
-            return Fitted(lambda pixels: change_luminance(pixels.image, fitted.pixels(pixels), limits, balance))
-        finish = fitted.finish
-        return Fitted(
-            fitted.pixels,
-            lambda image, found, inner: change_luminance(image, finish(image, found, inner), limits, balance),
-            fitted.margin,
-        )
-    before, after, saturation = reduced.all(Fitted(planes)), reduced.all(fitted), None
-    if limits == "soft":
-        after, saturation = limited_change(reduced.all(Fitted(lambda pixels: pixels.image)), after, balance)
+    if small == source.size:
+        return within_limits(source, change(source), limits, brighter)
+    reduced = source.resized(small)
+    fitted, balance = _limited(reduced, change(reduced), limits, brighter)
+    before, image = reduced.all(Fitted(planes)), reduced.all(Fitted(lambda pixels: pixels.image))
+    after, saturation = balanced(image, reduced.all(fitted), balance, limits)
     coarse = Coarse.of(before, after, saturation, limits)
     found = coarse.changes(source, planes)
     return Fitted(lambda pixels: coarse.change(pixels.image, *found(pixels)))
+
+
+def within_limits(source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | None = 0.0) -> Fitted:
+    """The edit that applies a change of brightness to a picture; arguments as those of :func:`fit_change`."""
+    fitted, balance = _limited(source, change, limits, brighter)
+
+    def changed(image: Tensor, moved: Tensor) -> Tensor:
+        return move_luminance(image, *balanced(image, moved, balance, limits))
+
+    return fitted.then(changed)
+
+
+def _limited(
+    source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | None
+) -> tuple[Fitted, Balance | None]:
+    """The change, limited, and the balance of the picture."""
+    if limits == "none":
+        return change, None
+    fitted = change.then(limit)
+    if brighter is None:
+        return fitted, None
+    cached = source.cached(fitted)
+    return cached, balance_of(lambda function: source.mean_of(cached, function), brighter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,7 @@ class Coarse:
         planes: (B, S, h, w): the planes before the change, the change, its slope over these planes and, for ``soft``
             limits of luminance, the change of saturation.
         count: number of channels of each of the first three.
-        limits: those of :func:`change_luminance`.
+        limits: those of :func:`fit_change`.
     """
 
     planes: Tensor
@@ -140,23 +144,13 @@ class Coarse:
 
     def changes(self, source: Reducible, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
         """Function from pixels to the changes of their ``planes`` and of their saturation."""
-        if source.size == (self.planes.shape[-2], self.planes.shape[-1]):
-            return lambda pixels: self.left(planes(pixels), source.stride)
         finer = self._of_larger(source, planes)
         return lambda pixels: finer._moved(planes(pixels), finer._at(pixels, source.size))
 
     def change(self, image: Tensor, moved: Tensor, saturation: Tensor) -> Tensor:
         """Apply a change of the planes and of the saturation to pixels of the picture."""
-        return move_luminance(image, moved, saturation if saturation.shape[1] else None, self.limits)
-
-    def left(self, planes: Tensor, stride: float) -> tuple[Tensor, Tensor]:
-        """Changes in a preview at the viewing size, as if it had been enlarged, changed and reduced again."""
-        found = enlarged_and_reduced(self.planes, stride)
-        changed = self.planes[:, self.count : 2 * self.count]
-        blurred, _, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
-        beyond = steepness * (planes - blurred)
-        moved = enlarged_and_reduced(_restored(changed - beyond, stride), stride) + beyond
-        return moved, found[:, 3 * self.count :]
+        changed = moved, saturation if saturation.shape[1] else None
+        return move_luminance(image, *(clamped(image, *changed) if self.limits == "soft" else changed))
 
     def _of_larger(self, source: Reducible, planes: Planes) -> "Coarse":
         """Correct the change so that its mean over blocks of a larger picture is the change of the small one.

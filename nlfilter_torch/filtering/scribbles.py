@@ -24,7 +24,7 @@ from nlfilter_torch.core.checks import (
     check_values,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.tall_skinny import moment
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
@@ -125,7 +125,10 @@ class FittedStrokes:
 
     def __call__(self, factor: Tensor) -> Tensor:
         """Compute values (B, C, n) of pixels with columns (B, M, n) of the unscaled factor."""
-        return self.coefficients.to(factor) @ factor + self.share.to(factor)
+        rows, share = self.coefficients.to(factor), self.share.to(factor)
+        if len(factor) == len(rows):
+            return spread(rows, factor) + share
+        return spread(rows.flatten(0, 1)[None], factor).unflatten(1, rows.shape[:2])[0] + share  # images, one factor
 
 
 def fit_strokes(

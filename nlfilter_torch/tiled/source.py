@@ -1,9 +1,10 @@
 """A picture that is read a few rows at a time as the source of an edit: sums in passes, output in tiles."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +12,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.pixels import corner
+from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.resizing import Read, block_means, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
-from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Pixels, Planes, Source
+from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Kept, Planes, Source
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
@@ -38,7 +39,6 @@ class Tiled:
 
     batch = 1
     whole = False
-    stride = 1
 
     def __init__(self, picture: Picture, passes: Passes, strokes: str = "strokes") -> None:
         self.picture, self.passes, self.strokes = picture, passes, strokes
@@ -209,13 +209,7 @@ class Tiled:
         """Compute the planes of an edit and keep them in memory, if small; else they are recomputed on every use."""
         if self.picture.pixels * self.channels * self.dtype.itemsize > CACHED_SHARE * self.passes.memory:
             return fitted
-        planes = self.all(fitted)
-
-        def part(pixels: Pixels) -> Tensor:
-            (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
-            return planes[:, :, top : top + height, left : left + width]
-
-        return Fitted(part)
+        return Fitted(part_of(self.all(fitted)))
 
     @torch.no_grad()
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
@@ -281,6 +275,10 @@ class Tiled:
             )
         return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
 
+    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+        """The result of a function, of which nothing is kept."""
+        return compute()
+
     @torch.no_grad()
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
         """Apply a measurement to the picture."""
@@ -300,14 +298,14 @@ class Tiled:
         width, step = self.size[1], self.passes.chunk_rows(self.size[1])
         features: dict[int, tuple[Tensor, ...]] = {}
 
-        def part_of(operator: TiledOperator, part: int) -> Tensor:
+        def features_of(operator: TiledOperator, part: int) -> Tensor:
             if id(operator) not in features:
                 features[id(operator)] = operator.features(tile).split(step * width, dim=2)
             return features[id(operator)][part]
 
         for part, image in enumerate(tile.inner.split(step, dim=2)):
             first = (tile.start + part * step) * width
-            yield TilePixels(image, lambda operator, part=part: part_of(operator, part), first, width)  # type: ignore[misc]
+            yield TilePixels(image, lambda operator, part=part: features_of(operator, part), first, width)  # type: ignore[misc]
 
     @full_precision
     def edited(self, fitted: Fitted, tile: Tile) -> Tensor:

@@ -29,6 +29,7 @@ RECIPES = {
     "recolor": Recipe((Step("recolor", (BLUE,)),)),
     "defocus": Recipe((Step("defocus", (IN,)),)),
     "abstract": LINES,
+    "beyond white": Recipe((Step("detail", alpha=(9.0, 5.0, 1.0), limits="none", landmarks=60),)),
     "two steps": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), landmarks=60), *LINES.steps)),
 }
 
