@@ -34,6 +34,7 @@ from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 REPEATS = 20
+MOVES = 9  # of the sliders of the other edits
 VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800
 SAVED = ("detail", "recolor", "denoise")
 
@@ -77,20 +78,23 @@ def in_the_library(path: Path) -> None:
 
     report("first stroke to mask", [milliseconds(lambda: stroke(0.3))])
     report("stroke to mask", [milliseconds(lambda i=i: stroke(0.3 + i / 100)) for i in range(REPEATS)])
-    for step, paint, entry, values in (
-        ("recolor", "#2040e0", "reach", (0.5, 0.6, 0.7)),
-        ("colorize", "#2040e0", "strength", (0.5, 0.6, 0.7)),
-        ("defocus", "in", "radius", (2.0, 3.0, 4.0)),
-        ("abstract", "", "power", (0.05, 0.15, 0.2)),
+    for step, paint, entry, first, last in (
+        ("tone", "", "contrast", 1.1, 1.3),
+        ("sharpen", "", "amount", 2.0, 4.0),
+        ("recolor", "#2040e0", "reach", 0.5, 0.7),
+        ("colorize", "#2040e0", "strength", 0.5, 0.7),
+        ("defocus", "in", "radius", 2.0, 4.0),
+        ("abstract", "", "power", 0.05, 0.2),
     ):
         session.load(Recipe())
+        values = [first + (last - first) * i / MOVES for i in range(MOVES + 1)]
         if paint:
             session.add_stroke(step, [(0.4 * size[1], 0.4 * size[0]), (0.5 * size[1], 0.4 * size[0])], 0.02, paint)
         else:
-            session.set(step, power=0.1)
+            session.set(step, **{entry: values[0]})
         report(f"{step}", [milliseconds(session.render)])
         times = []
-        for value in values:
+        for value in values[1:]:
             session.set(step, **{entry: value})
             times.append(milliseconds(session.render))
         report(f"{step}, {entry} changed", times)
