@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.composites import Composite, composites, setup
 from nlfilter_torch import defocus, recolor
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.edits.defocus import _convolve, _kernel
+from nlfilter_torch.edits.defocus import _kernel, convolve
 from nlfilter_torch.edits.matting import colours_beside
 from nlfilter_torch.edits.recolor import Recoloring
 
@@ -84,10 +84,10 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     probe = torch.cat([composite.image, composite.alpha], dim=1)
     found = defocus(composite.image, inside, radius=radius)
     kernel = _kernel(radius, "disc").float()
-    ones = _convolve(torch.ones_like(composite.alpha), kernel)
-    behind = _convolve(composite.background, kernel) / ones
+    ones = convolve(torch.ones_like(composite.alpha), kernel)
+    behind = convolve(composite.background, kernel) / ones
     wanted = composite.alpha * composite.object + (1 - composite.alpha) * behind
-    blurred = _convolve(composite.image, kernel) / ones
+    blurred = convolve(composite.image, kernel) / ones
     step = (composite.image - blurred).abs().mean(1, keepdim=True)
     sharp = ((found - blurred).abs().mean(1, keepdim=True) / step.clamp(min=1e-6)).clamp(0, 1)
     core, ground = composite.alpha > 0.98, composite.alpha < 0.02
