@@ -71,7 +71,7 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
     from joblib.externals.loky import get_reusable_executor
 
     # With one, joblib would work in this process, which must outlive the work; a second one stays idle then.
-    interrupted = False
+    done = False
     options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
     try:
         with (
@@ -80,11 +80,10 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
         ):
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
             yield Workers(workers)
-    except KeyboardInterrupt:
-        interrupted = True  # which joblib does not handle everywhere: its workers would go on
-        raise
+        done = True
     finally:
-        get_reusable_executor().shutdown(kill_workers=interrupted)
+        # After an interrupt, which reaches us as other errors too, workers would go on, and be waited for.
+        get_reusable_executor().shutdown(kill_workers=not done)
 
 
 def _of_dask(address: str) -> Iterator[Workers]:
