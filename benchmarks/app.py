@@ -70,7 +70,8 @@ def in_the_library(path: Path) -> None:
 
     report("first slider: the operator and its layers", [milliseconds(lambda: slide(2.0))])
     report("slider to pixels", [milliseconds(lambda i=i: slide(1 + i / 10)) for i in range(REPEATS)])
-    report("pixels to JPEG", [milliseconds(lambda: drawing.picture(session.render())) for _ in range(REPEATS)])
+    pixels = session.render()
+    report("pixels to JPEG", [milliseconds(lambda: drawing.picture(pixels)) for _ in range(REPEATS)])
 
     def stroke(shift: float) -> None:
         session.add_stroke("detail", [(shift * size[1], 0.8 * size[0]), (0.6 * size[1], 0.85 * size[0])], 0.01, "in")

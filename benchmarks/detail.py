@@ -31,10 +31,10 @@ from benchmarks.unsharp import gaussian
 from nlfilter_torch import enhance
 from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.colour import edit_luminance
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.pixels import Fitted, part_of
 from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.viewing import within_limits
 from nlfilter_torch.operator.features import reduce_channels
 

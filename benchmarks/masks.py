@@ -19,8 +19,8 @@ from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import photograph
 from nlfilter_torch import region_mask
 from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.mask import fit_mask
-from nlfilter_torch.edits.source import InMemory
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)

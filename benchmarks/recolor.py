@@ -18,7 +18,7 @@ from torch import Tensor
 from benchmarks.composites import Composite, composites, setup
 from nlfilter_torch import defocus, recolor
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.edits.defocus import _kernel, convolve
+from nlfilter_torch.edits.defocus import blur_kernel, convolve
 from nlfilter_torch.edits.matting import colours_beside
 from nlfilter_torch.edits.recolor import Recoloring
 
@@ -83,7 +83,7 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     radius = RADIUS * min(composite.image.shape[-2:])
     probe = torch.cat([composite.image, composite.alpha], dim=1)
     found = defocus(composite.image, inside, radius=radius)
-    kernel = _kernel(radius, "disc").float()
+    kernel = blur_kernel(radius, "disc").float()
     ones = convolve(torch.ones_like(composite.alpha), kernel)
     behind = convolve(composite.background, kernel) / ones
     wanted = composite.alpha * composite.object + (1 - composite.alpha) * behind

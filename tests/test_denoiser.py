@@ -9,8 +9,8 @@ from torch import Tensor
 
 from benchmarks.train_denoiser import PlainDenoiser
 from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.noise import Noise, noise_of
-from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.nn import denoiser as module
 from nlfilter_torch.nn.denoiser import SIDE, STEP, TRAINED, in_tiles, join_colours, noise_map, split_colours
 from tests.problems import colour, picture, seeded

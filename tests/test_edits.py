@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
-from nlfilter_torch.edits.pixels import in_strips, strips_of
-from nlfilter_torch.edits.source import InMemory
+from nlfilter_torch.edits.in_memory import InMemory
+from nlfilter_torch.edits.pixels import Fitted, strips_of
 from tests.problems import box, noise, paint
 
 GREY = 0.2 + 0.6 * noise(2, 1, 20, 22, dtype=torch.float32)
@@ -74,7 +74,9 @@ def test_pictures_are_divided_if_they_are_large(monkeypatch: pytest.MonkeyPatch)
     parts = strips_of(source)
     assert torch.equal(torch.cat([part.image for part in parts], dim=2), image)
     assert [(part.first, part.width) for part in parts] == [(300 * i, 50) for i in range(7)]
-    assert torch.equal(in_strips(lambda x: (x + 1,), image)[0], image + 1)
+    assert torch.equal(
+        source.mean_of(Fitted(lambda part: part.image), torch.mul), image.square().mean((2, 3), keepdim=True)
+    )
 
 
 @each_edit

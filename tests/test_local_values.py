@@ -9,8 +9,9 @@ from torch import Tensor
 
 from nlfilter_torch import colorize
 from nlfilter_torch.edits import local_values
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.local_values import LocalValues, block_size
-from nlfilter_torch.edits.source import InMemory, luminance
+from nlfilter_torch.edits.source import luminance
 from nlfilter_torch.tiled import stream_colorize
 from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled

@@ -10,9 +10,9 @@ import torch
 from nlfilter_torch import nonlocal_operator, region_mask
 from nlfilter_torch.edits import mask as masks
 from nlfilter_torch.edits import matting
+from nlfilter_torch.edits.in_memory import InMemory, InMemoryOperator
 from nlfilter_torch.edits.resizing import enlarged
 from nlfilter_torch.edits.scribbled_colours import density, every_nth
-from nlfilter_torch.edits.source import InMemory, InMemoryOperator
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.detail import limit_by_activity, split_sliders
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.pixels import Fitted, part_of
 from nlfilter_torch.edits.resizing import resize, resized
-from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.viewing import viewed_size, within_limits
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled import stream_detail

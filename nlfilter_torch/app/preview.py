@@ -19,13 +19,13 @@ from torch import Tensor
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
 from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.mask import fit_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.pixels import Fitted, Pixels, part_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
-from nlfilter_torch.edits.source import InMemory
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size, within_limits
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers

@@ -11,8 +11,10 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count, check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.parameters import ABSTRACT
-from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, synthesize
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source
+from nlfilter_torch.edits.synthesis import synthesize
 from nlfilter_torch.edits.viewing import fit_change, viewed_size
 from nlfilter_torch.operator.features import blur, blur_margin
 

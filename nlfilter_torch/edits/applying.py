@@ -14,12 +14,13 @@ from nlfilter_torch.edits.colorize import fit_colorize
 from nlfilter_torch.edits.defocus import fit_defocus
 from nlfilter_torch.edits.denoise import fit_denoise
 from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.in_memory import InMemory, edited
 from nlfilter_torch.edits.look import fit_look_edit
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.shared_parameters import FILTER
 from nlfilter_torch.edits.sharpen import fit_sharpen
-from nlfilter_torch.edits.source import Fitted, InMemory, Source, edited
+from nlfilter_torch.edits.source import Fitted, Source
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.tone import fit_tone
 from nlfilter_torch.edits.viewing import viewed_size

@@ -22,12 +22,13 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.local_values import LocalValues, block_size
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
-from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, edited, luminance
+from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import fit_strokes

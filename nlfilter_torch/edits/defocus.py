@@ -10,9 +10,10 @@ from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
-from nlfilter_torch.edits.source import Fitted, Source, edited
+from nlfilter_torch.edits.source import Fitted, Source
 
 Aperture = Literal["disc", "gaussian"]
 
@@ -125,7 +126,7 @@ def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture)
         aperture: see :func:`defocus`.
     """
     behind = (1 - focus).square() + SUBJECT_WEIGHT  # SUBJECT_WEIGHT matters only where there is no background nearby
-    sums = convolve(torch.cat([image * behind, behind], dim=1), _kernel(radius, aperture).to(image))
+    sums = convolve(torch.cat([image * behind, behind], dim=1), blur_kernel(radius, aperture).to(image))
     blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
     return torch.where(focus == 1, image, blurred)
 
@@ -135,7 +136,7 @@ def _kernel_radius(radius: float, aperture: Aperture) -> int:
     return math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)
 
 
-def _kernel(radius: float, aperture: Aperture) -> Tensor:
+def blur_kernel(radius: float, aperture: Aperture) -> Tensor:
     """Compute a square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
     half_width = _kernel_radius(radius, aperture)
     axis = torch.arange(-half_width, half_width + 1, dtype=torch.float64)

@@ -15,9 +15,10 @@ from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_fake
 from nlfilter_torch.edits.colour import nearby
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
-from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source, edited
+from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, noise_map
 from nlfilter_torch.operator.build import nonlocal_operator

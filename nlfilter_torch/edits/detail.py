@@ -17,12 +17,14 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.shared_parameters import FILTER
-from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, luminance
 from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 

@@ -9,9 +9,10 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.detail import activity, limit_by_activity, split_sliders
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import DETAIL
-from nlfilter_torch.edits.source import Fitted, InMemory, Pixels, Source, luminance
+from nlfilter_torch.edits.source import Fitted, Pixels, Source, luminance
 from nlfilter_torch.edits.viewing import fit_change, viewed_size
 from nlfilter_torch.filtering.fitted import fit_filter
 from nlfilter_torch.operator.build import nonlocal_operator

@@ -100,8 +100,11 @@ def move_luminance(image: Tensor, moved: Tensor, saturation: Tensor | None) -> T
 
 def clamped(image: Tensor, moved: Tensor, saturation: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Clamp the result of :func:`balanced` for another size of the picture to the limits of this one."""
-    moved = _inside(_before(image, moved), moved)
-    return moved, None if saturation is None else torch.minimum(saturation, _share(image, moved))
+    if saturation is None:
+        return _inside(image, moved), None
+    luminance, chroma = split_luminance(image)
+    moved = _inside(luminance, moved)
+    return moved, torch.minimum(saturation, _share(image, luminance, chroma, moved))
 
 
 def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], brighter: float | Tensor = 0.0) -> Balance:
@@ -169,16 +172,16 @@ def _saturation(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The required decrease, from -1 to 0, and the possible increase, from 0 to 1, both (B, 1, H, W).
     """
-    share, luminance = _share(image, moved), reduce_channels(image, "luminance")
+    luminance, chroma = split_luminance(image)
+    share = _share(image, luminance, chroma, moved)
     relative = MAX_SATURATION_GAIN * (moved.abs() / luminance.clamp(min=MIN_LUMINANCE)).clamp(
         max=1 / MAX_SATURATION_GAIN
     )
     return share.clamp(max=0.0), torch.minimum(share.clamp(min=0.0), relative)
 
 
-def _share(image: Tensor, moved: Tensor) -> Tensor:
+def _share(image: Tensor, luminance: Tensor, chroma: Tensor, moved: Tensor) -> Tensor:
     """Largest relative change of chroma, at least -1, at which all channels stay within their limits, (B, 1, H, W)."""
-    luminance, chroma = split_luminance(image)
     after, up = luminance + moved, chroma > 0
     room = (torch.where(up, 1 - after, after) - _kept(torch.where(up, 1 - image, image))).clamp(min=0.0)
     share = (room / chroma.abs().clamp(min=EPSILON)).amin(1, keepdim=True) - 1

@@ -11,9 +11,11 @@ from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.pixels import corner
-from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, luminance
+from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
 from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change

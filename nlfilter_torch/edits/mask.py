@@ -19,6 +19,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import LIGHTNESS, hundredths_of_lab, nearby
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
@@ -26,7 +27,7 @@ from nlfilter_torch.edits.resizing import block_means, enlarged
 from nlfilter_torch.edits.scribbled_colours import colour_likelihood, frame_places, likeness
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
-from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source, edited
+from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.source import InMemory, Source
+from nlfilter_torch.edits.in_memory import InMemory
+from nlfilter_torch.edits.source import Source
 
 WINDOW_SIZE = 9  # side of a window in pixels
 NUM_WINDOWS = 6144

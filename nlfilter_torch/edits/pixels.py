@@ -68,15 +68,6 @@ def strips_of(pixels: Pixels) -> list[Pixels]:
     return [Strip(part, i * rows * pixels.width, pixels.width) for i, part in enumerate(parts)]
 
 
-def in_strips(function: Callable[..., tuple[Tensor, ...]], *planes: Tensor) -> tuple[Tensor, ...]:
-    """Apply a pointwise function to the strips of images (B, C, H, W), see :func:`strips_of`."""
-    rows = _rows_at_once(planes[0])
-    if rows >= planes[0].shape[2]:
-        return function(*planes)
-    parts = [function(*some) for some in zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)]
-    return tuple(torch.cat(part, dim=2) for part in zip(*parts, strict=True))
-
-
 def _rows_at_once(image: Tensor) -> int:
     if torch.compiler.is_compiling():
         return image.shape[2]

@@ -9,11 +9,12 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_photograph, check_tensor
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, region_means, split_luminance
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
 from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
-from nlfilter_torch.edits.source import Fitted, Source, edited
+from nlfilter_torch.edits.source import Fitted, Source
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not

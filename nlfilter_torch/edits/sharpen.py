@@ -7,9 +7,11 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import SHARPEN
-from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.source import Fitted, Guide, Source, luminance
+from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import reduce_channels
 

@@ -8,9 +8,11 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import TONE
-from nlfilter_torch.edits.source import Fitted, Guide, Source, edited, luminance, polynomial
+from nlfilter_torch.edits.source import Fitted, Guide, Source, luminance
+from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 
 

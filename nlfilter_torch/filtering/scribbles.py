@@ -125,10 +125,8 @@ class FittedStrokes:
 
     def __call__(self, factor: Tensor) -> Tensor:
         """Compute values (B, C, n) of pixels with columns (B, M, n) of the unscaled factor."""
-        rows, share = self.coefficients.to(factor), self.share.to(factor)
-        if len(factor) == len(rows):
-            return spread(rows, factor) + share
-        return spread(rows.flatten(0, 1)[None], factor).unflatten(1, rows.shape[:2])[0] + share  # images, one factor
+        rows = self.coefficients.to(factor)
+        return spread(rows, factor.expand(len(rows), -1, -1)) + self.share.to(factor)
 
 
 def fit_strokes(

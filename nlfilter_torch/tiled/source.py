@@ -12,10 +12,11 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.resizing import Read, block_means, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
-from nlfilter_torch.edits.source import Fitted, Guide, InMemory, Kept, Planes, Source
+from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
@@ -214,17 +215,8 @@ class Tiled:
     @torch.no_grad()
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means over all pixels, in a pass over the picture."""
-
-        def parts() -> Iterator[tuple[Tensor, Tensor]]:
-            for part, values in self.rows(fitted, plain=True):
-                image = self.picture.tile(part.start, part.stop, 0).pixels
-                yield image, torch.from_numpy(values).permute(2, 0, 1)[None].to(image)
-
-        def summed(part: tuple[Tensor, Tensor]) -> Tensor:
-            return function(*part).double().sum((2, 3), keepdim=True)
-
-        total = sum(in_order(summed, parts(), self.passes.workers(1)))
-        return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
+        total = sum(values.sum((0, 1), dtype=np.float64) for _, values in self.rows(fitted.then(function), plain=True))
+        return torch.as_tensor(total / self.picture.pixels).to(self.dtype).view(1, -1, 1, 1)
 
     @torch.no_grad()
     def mean(self, planes: Planes) -> Tensor:

@@ -94,7 +94,7 @@ def test_more_strokes_need_no_other_filter(name: str, session: Session, monkeypa
     wanted = apply_step(second, session.preview.pixels).clamp(0, 1)
     session.load(Recipe((first,)))
     session.render()
-    monkeypatch.setattr("nlfilter_torch.edits.source.nonlocal_operator", None)
+    monkeypatch.setattr("nlfilter_torch.edits.in_memory.nonlocal_operator", None)
     session.load(Recipe((second,)))
     assert torch.equal(session.render(), wanted)
 
@@ -116,7 +116,7 @@ def test_other_sliders_need_no_other_layers(session: Session, monkeypatch: pytes
         session.load(Recipe((step,)))
         session.render()
         with monkeypatch.context() as patch:
-            patch.setattr("nlfilter_torch.edits.source.detail_layers", None)
+            patch.setattr("nlfilter_torch.edits.in_memory.detail_layers", None)
             patch.setattr("nlfilter_torch.operator.spectrum.Spectrum.coefficients", None)
             session.set(step.edit, **change)
             assert torch.equal(session.render(), wanted)
@@ -288,7 +288,7 @@ def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: py
     inner, outer = mask_of((first,), size), mask_of((second,), size)
     wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
     assert torch.equal(preview.mask(Step("detail", (first,))), wanted[0])
-    monkeypatch.setattr("nlfilter_torch.edits.source.nonlocal_operator", None)
+    monkeypatch.setattr("nlfilter_torch.edits.in_memory.nonlocal_operator", None)
     assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=400)), wanted[1])
     assert not torch.equal(preview.mask(Step("detail", (first, second), reach=0.9)), wanted[1])
     with pytest.raises(TypeError):

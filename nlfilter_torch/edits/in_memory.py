@@ -1,0 +1,199 @@
+"""An image or a batch in memory as the source of an edit, with gradients."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
+from nlfilter_torch.core.inner import EVERYWHERE
+from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.edits.pixels import Fitted, Planes, part_of, strips_of
+from nlfilter_torch.edits.resizing import block_means, resize
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
+from nlfilter_torch.edits.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.scribbles import check_painted
+from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.operator import Columns, NonlocalOperator
+from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
+
+
+class InMemory:
+    """An image in memory, both as a source and as the set of all its pixels.
+
+    Args:
+        image: (B, C, H, W), float32 or float64.
+        cache: cache of its operators, by their options, and of what they compute; None caches nothing.
+    """
+
+    first = 0
+    whole = True
+
+    def __init__(self, image: Tensor, cache: dict[Any, Any] | None = None) -> None:
+        self.image, self.cache, self.dtype = image, cache, image.dtype
+        self.batch, self.channels, *size = image.shape
+        self.size, self.width = (size[0], size[1]), size[1]
+
+    def operator(self, guide: Guide) -> "InMemoryOperator":
+        """Build, or take from the cache, :func:`nonlocal_operator` of the guide."""
+        key = (
+            guide.transform,
+            guide.blur,
+            *((name, value) for name, value in sorted(guide.options.items()) if name != "generator"),
+        )
+        if self.cache is not None and key in self.cache:
+            return cast(InMemoryOperator, self.cache[key])
+        operator = InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
+        if self.cache is not None and not any(isinstance(value, Tensor) for value in guide.options.values()):
+            self.cache[key] = operator
+        return operator
+
+    def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
+        """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
+        named = [(mask, name, 1), *([] if colours is None else [(colours, "strokes", 3)])]
+        for tensor, called, channels in named:
+            check_image(tensor, called, channels=channels, batch=self.batch)
+            check_same_size(tensor, self.size, called, "image")
+        if needed:
+            check_painted(mask, name)
+        else:
+            check_unit_range(mask, name)
+        weights = mask.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)
+        some = torch.ones_like(weights[0, 0], dtype=torch.bool)
+        if not weights.requires_grad:  # pixels of weight 0 matter only to the derivative by the weights
+            some = (weights > 0).any(0).squeeze(0)
+        places = some.nonzero().squeeze(1)
+        image = self.image.flatten(2)[:, :, places]
+        shown = None
+        if colours is not None:
+            shown = colours.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)[:, :, places]
+        return Scribbles(places, weights[:, :, places], image, shown)
+
+    def resized(self, size: tuple[int, int]) -> "InMemory":
+        """Resize the image."""
+        if size == self.size:
+            return self
+        return InMemory(resize(self.image, size))
+
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Planes of all pixels in another size."""
+        return resize(planes(self), size)
+
+    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+        """The result of a function, from the cache if it was last computed from equal tensors."""
+        if self.cache is None:
+            return compute()
+        found = self.cache.get(name)
+        if found is None or not all(torch.equal(a, b) for a, b in zip(found[0], given, strict=True)):
+            found = self.cache[name] = (given, compute())
+        return cast(Kept, found[1])
+
+    def blocks(self, step: float, floats: int) -> "InMemory":
+        """Reduce the image by :func:`block_means`."""
+        if step == 1:
+            return self
+        cache = None if self.cache is None else self.cache.setdefault(("blocks", step), {})
+        return InMemory(block_means(self.image, step), cache)
+
+    def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
+        """Resize weights."""
+        check_same_size(weights, self.size, name, "image")
+        weights = weights.to(self.image)
+        ends = weights.detach().aminmax()  # undoes the overshoot of interpolation but leaves invalid weights invalid
+        return resize(weights, size).clamp(ends.min, ends.max)
+
+    def all(self, fitted: Fitted) -> Tensor:
+        """Apply an edit to all pixels."""
+        parts = [fitted.pixels(part) for part in strips_of(self)]
+        planes = parts[0] if len(parts) == 1 else torch.cat(parts, dim=2)
+        return planes if fitted.finish is None else fitted.finish(self.image, planes, EVERYWHERE)
+
+    def cached(self, fitted: Fitted) -> Fitted:
+        """Compute the result of an edit and keep it in memory."""
+        return Fitted(part_of(self.all(fitted)))
+
+    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means of a function of the image and of the result of an edit."""
+        return self.all(fitted.then(function)).mean((2, 3), keepdim=True)
+
+    def colours(self, places: Tensor) -> Tensor:
+        """Colours of single pixels."""
+        return self.image.flatten(2)[:, :, places]
+
+    def regions(self, masks: Tensor, name: str) -> list[Scribbles]:
+        """Read the scribbles of K regions from a tensor (B, K, H, W)."""
+        check_image(masks, name, batch=self.batch)
+        return [self.scribbles(mask, None, name) for mask in masks.split(1, dim=1)]
+
+    def mean(self, planes: Planes) -> Tensor:
+        """Means over all pixels."""
+        return planes(self).mean((2, 3), keepdim=True)
+
+    def reduced(self, planes: Planes, step: int) -> Tensor:
+        """Means over blocks of pixels."""
+        return block_means(planes(self), step)
+
+    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+        """Apply a measurement to the image."""
+        return function(self)
+
+
+@dataclass(frozen=True, eq=False)
+class InMemoryOperator:
+    """The operator of an image in memory; planes are computed at once, for all pixels.
+
+    Attributes:
+        operator: W.
+        source: the image.
+        sampled: whether the spectrum may be estimated from a sample of the pixels.
+    """
+
+    operator: NonlocalOperator
+    source: InMemory
+    sampled: bool = False
+
+    @cached_property
+    def pairs(self) -> RitzPairs:
+        """The spectrum; estimated from a sample, it has no values at pixels."""
+        count = self.operator.factor.shape[2]
+        if not self.sampled or count <= SAMPLE:
+            return self.operator.spectrum()
+        some = sampled_places(count).to(self.operator.factor.device)
+        of = Columns(self.operator.factor, self.operator.scaling, self.operator.remainder)
+        columns = Columns(of.factor[:, :, some], of.scaling[:, some], of.remainder[:, some])
+        return sampled_pairs([columns], count, of.factor.dtype)
+
+    def each(self, function: Callable[[Columns], Tensor]) -> Planes:
+        """Apply a function to the columns of all pixels."""
+        found = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
+        return part_of(found.unflatten(2, self.source.size))
+
+    def layers(self, planes: Planes, order: int) -> Planes:
+        """Compute :func:`detail_layers`."""
+        values = planes(self.source)
+        key = ("layers", self.operator, order)
+        return part_of(self.source.kept(key, [values], lambda: detail_layers(self.operator, values, order=order)))
+
+    def coefficients(self, planes: Planes) -> Tensor:
+        """Compute :meth:`Spectrum.coefficients`."""
+        values, spectrum = planes(self.source), cast(Spectrum, self.pairs)
+        return self.source.kept(("coefficients", self.operator), [values], lambda: spectrum.coefficients(values))
+
+    def mean(self, planes: Planes) -> Tensor:
+        """Means over all pixels."""
+        return planes(self.source).mean((2, 3))
+
+    def at(self, places: Tensor) -> Blocks:
+        """Columns of the factor at single pixels."""
+        columns = self.operator.factor[:, :, places]
+        return lambda: [columns]
+
+
+def edited(image: Tensor, fit: Callable[..., Fitted], *arguments: Any, **options: Any) -> Tensor:
+    """Fit an edit to an image in memory and apply it; the result has the image's dtype."""
+    source = InMemory(image.to(working_dtype(image)))
+    return source.all(fit(source, *arguments, **options)).to(image.dtype)
