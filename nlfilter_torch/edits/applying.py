@@ -1,7 +1,7 @@
 """Applying a step to an image, and caching what later steps of the same kind can reuse."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -125,13 +125,14 @@ def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None =
 def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step], Tensor]:
     """Return a function that applies steps with equal :func:`filter_key` to an image (1, C, H, W) in [0, 1].
 
-    The filter is computed once, for the first of them. ``stride`` is the sampling step of the image relative to the
-    photograph.
+    The filter is computed once, for the first of them, and strokes are rasterised once. ``stride`` is the sampling step
+    of the image relative to the photograph.
     """
     source = InMemory(image.to(working_dtype(image)), {})
+    colours, mask = lru_cache(maxsize=1)(paint), lru_cache(maxsize=2)(mask_of)
 
     def edit(step: Step) -> Tensor:
-        fitted = fit_step(step, source, *scribbles_of(step, source.size), stride=stride)
+        fitted = fit_step(step, source, *scribbles_of(step, source.size, colours, mask), stride=stride)
         return source.all(fitted).to(image.dtype)
 
     return edit

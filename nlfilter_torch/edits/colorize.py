@@ -193,11 +193,11 @@ def fit_colorize(
         planes = scribbles.weighted(regions.squeeze(2)).planes(viewed)
         pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
-        return _coloured(source, viewed, part_of(chroma))
+        return _coloured(source, viewed, part_of(chroma[:, ::2]))
     step = block_size(small)
     guide = viewed.reduced(luminance, step)
-    # Without green, which follows from red and blue.
-    marks = [scribbles.places, scribbles.weights, wanted[:, ::2]]
+    wanted = wanted[:, ::2]  # green follows from red and blue
+    marks = [scribbles.places, scribbles.weights, wanted]
     local = viewed.kept("local", [guide, *marks], lambda: LocalValues.of(guide, step, small[1], *marks))
     parts = []
     for stage in (FAR, NEAR):
@@ -219,20 +219,19 @@ def fit_colorize(
     def chroma_of(some: Any) -> Tensor:
         alike = far(some) + near(some)
         connected, influence = local(luminance(some), some.first)
-        return alike + LOCAL_WEIGHT * (with_green(connected) - influence * alike)
+        return alike + LOCAL_WEIGHT * (connected - influence * alike)
 
     return _coloured(source, viewed, chroma_of)
 
 
 def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
-    """A picture in the chroma (B, 3, h, w) of its reduction; the edges of that follow those of its luminance."""
+    """A picture in the chroma (B, 2, h, w), red and blue, of its reduction; edges follow those of its luminance."""
     if source is viewed:
-        return Fitted(lambda some: merge_luminance(luminance(some), chroma(some)))
+        return Fitted(lambda some: merge_luminance(luminance(some), with_green(chroma(some))))
 
     def twice(some: Any) -> Tensor:
         return luminance(some).expand(-1, 2, -1, -1)
 
     before = viewed.all(Fitted(twice))
-    found = viewed.all(Fitted(lambda some: chroma(some)[:, ::2]))  # without green
-    changes = Coarse.of(before, found, None, "none").changes(source, twice)
+    changes = Coarse.of(before, viewed.all(Fitted(chroma)), None, "none").changes(source, twice)
     return Fitted(lambda some: merge_luminance(luminance(some), with_green(changes(some)[0])))

@@ -62,10 +62,19 @@ def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:
 
     Clipping the channels would change luminance instead, which is more visible.
     """
-    # Headroom towards white where chroma is positive, towards black where it is negative.
-    room = torch.where(chroma > 0, 1 - luminance, luminance).clamp(min=0.0)
-    scale = (room / chroma.abs().clamp(min=1e-6)).amin(1, keepdim=True).clamp(max=1.0)
-    return luminance + scale * chroma
+    # Headroom towards white for the largest chroma, towards black for the smallest.
+    up, down = chroma.amax(1, keepdim=True).clamp(min=1e-6), -chroma.amin(1, keepdim=True).clamp(max=-1e-6)
+    scale = torch.minimum((1 - luminance).clamp(min=0.0) / up, luminance.clamp(min=0.0) / down).clamp(max=1.0)
+    return torch.addcmul(luminance, scale, chroma)
+
+
+def dot(one: Tensor, other: Tensor, dim: int = 1) -> Tensor:
+    """Sum of products along a short dimension, kept with length 1, in half the time of ``mul`` and ``sum``."""
+    (first, first_other), *rest = zip(one.split(1, dim), other.split(1, dim), strict=True)
+    total = first * first_other
+    for a, b in rest:
+        total = torch.addcmul(total, a, b)
+    return total
 
 
 def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:

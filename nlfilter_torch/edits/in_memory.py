@@ -96,8 +96,8 @@ class InMemory:
         """Reduce the image by :func:`block_means`."""
         if step == 1:
             return self
-        cache = None if self.cache is None else self.cache.setdefault(("blocks", step), {})
-        return InMemory(block_means(self.image, step), cache)
+        cache: dict[Any, Any] | None = None if self.cache is None else {}
+        return self.kept(("blocks", step), [], lambda: InMemory(block_means(self.image, step), cache))
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Resize weights."""

@@ -83,7 +83,7 @@ class LocalValues:
             return self.values[:, :, top : top + height, left : left + width]
         rows = self._two_nearest(top, height, self.guide.shape[2], own)
         columns = self._two_nearest(left, width, self.guide.shape[3], own)
-        total, weight = torch.zeros(()), torch.zeros(())
+        total, weight = self.values.new_zeros(()), self.values.new_zeros(())
         first = max(0, top // self.step - 1)  # of the rows of blocks that are used
         blocks = torch.cat([self.guide, self.values], dim=1)[:, :, first : (top + height) // self.step + 2]
         for column, column_share in columns:
@@ -92,7 +92,7 @@ class LocalValues:
                 guide, values = near[:, :, row - first].tensor_split([1], dim=1)
                 alike = torch.exp((own - guide).square() / -MAX_VARIANCE) + MIN_WEIGHT
                 share = row_share.unsqueeze(1) * column_share * alike
-                total, weight = total + share * values, weight + share
+                total, weight = torch.addcmul(total, share, values), weight + share
         return total / weight
 
     def _two_nearest(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.edits.colour import dot
 from nlfilter_torch.filtering.neighbours import SIDES, neighbour_weights
 
 STEPS = (2, 4, 8)  # Jacobi steps per level, finest first; the last number is for all coarser levels
@@ -109,11 +110,13 @@ class LinearMasks:
 
     Attributes:
         image: the image minus 0.5, (B, C, H, W).
-        mean: mean colour of the window around each pixel, (B, C, H, W).
+        share: 1 divided by the number of pixels of the window around each pixel, (1, 1, H, W).
+        mean: mean colour of that window, (B, C, H, W).
         inverse: inverse covariance of the colours in it, (B, C, C, H, W).
     """
 
     image: Tensor
+    share: Tensor
     mean: Tensor
     inverse: Tensor
 
@@ -122,22 +125,23 @@ class LinearMasks:
         """The model of an image (B, C, H, W)."""
         image = image - 0.5
         count = image.shape[1]
-        mean = window_means(image)
-        product = window_means((image.unsqueeze(1) * image.unsqueeze(2)).flatten(1, 2)).unflatten(1, (count, count))
+        share = 1 / window_sums(torch.ones_like(image[:1, :1]))
+        mean = share * window_sums(image)
+        products = (image.unsqueeze(1) * image.unsqueeze(2)).flatten(1, 2)
+        product = (share * window_sums(products)).unflatten(1, (count, count))
         covariance = (product - mean.unsqueeze(1) * mean.unsqueeze(2)).permute(0, 3, 4, 1, 2).double()
         inverse = torch.linalg.inv(covariance + NOISE * torch.eye(count).to(covariance))
-        return LinearMasks(image, mean, inverse.to(image).permute(0, 3, 4, 1, 2).contiguous())
+        return LinearMasks(image, share, mean, inverse.to(image).permute(0, 3, 4, 1, 2).contiguous())
 
     def fit(self, mask: Tensor) -> Tensor:
         """Fit the linear functions (B, C+1, H, W) of a mask (B, 1, H, W), averaged over all windows around a pixel.
 
         The last channel is the constant; the others multiply the colour minus 0.5.
         """
-        moments = window_means(torch.cat([mask, mask * self.image], dim=1))
-        mean = moments[:, :1]
-        slopes = (self.inverse * (moments[:, 1:] - self.mean * mean).unsqueeze(1)).sum(2)
-        rest = mean - (slopes * self.mean).sum(1, keepdim=True)
-        return window_means(torch.cat([slopes, rest], dim=1))
+        mean, product = (self.share * window_sums(torch.cat([mask, mask * self.image], dim=1))).tensor_split([1], dim=1)
+        covariance = torch.addcmul(product, mean, self.mean, value=-1)
+        slopes = dot(self.inverse, covariance.unsqueeze(1), dim=2).squeeze(2)
+        return self.share * window_sums(torch.cat([slopes, mean - dot(slopes, self.mean)], dim=1))
 
     def smoothed(self, mask: Tensor) -> Tensor:
         """The mask that the fitted functions give."""
@@ -146,21 +150,17 @@ class LinearMasks:
 
 def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
     """Mask (B, 1, H, W) that functions of :meth:`LinearMasks.fit` give for an image minus 0.5."""
-    return (functions[:, :-1] * image).sum(1, keepdim=True) + functions[:, -1:]
+    return dot(functions[:, :-1], image) + functions[:, -1:]
 
 
-def window_means(planes: Tensor) -> Tensor:
-    """Means over the window around each pixel, cut off at the borders of the picture."""
-    size = 2 * WINDOW_RADIUS + 1
-    for axis, pad in ((2, (0, 0, WINDOW_RADIUS, WINDOW_RADIUS)), (3, (WINDOW_RADIUS, WINDOW_RADIUS))):
-        length = planes.shape[axis]
-        padded = F.pad(planes, pad)
-        total = padded.narrow(axis, 0, length).clone()  # shifted sums: F.avg_pool2d takes several times as long
-        for shift in range(1, size):
-            total += padded.narrow(axis, shift, length)
-        place = torch.arange(length, device=planes.device)
-        count = (place + WINDOW_RADIUS).clamp(max=length - 1) - (place - WINDOW_RADIUS).clamp(min=0) + 1
-        planes = total.mul_(1 / count.to(planes).view(-1, *[1] * (3 - axis)))
+def window_sums(planes: Tensor) -> Tensor:
+    """Sums over the window around each pixel, cut off at the borders of the picture."""
+    for axis in (2, 3):
+        total, length = planes.clone(), planes.shape[axis]
+        for shift in range(1, min(WINDOW_RADIUS + 1, length)):  # F.avg_pool2d takes several times as long
+            total.narrow(axis, shift, length - shift).add_(planes.narrow(axis, 0, length - shift))
+            total.narrow(axis, 0, length - shift).add_(planes.narrow(axis, shift, length - shift))
+        planes = total
     return planes
 
 
@@ -227,35 +227,42 @@ def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> T
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """Colours on both sides of a border.
+    """Comparison of pixels with the mean colours of nearby pixels inside and outside a mask.
 
     Attributes:
-        inside: mean colour of nearby pixels inside the mask, (B, C, H, W).
-        outside: mean colour of nearby pixels outside it, (B, C, H, W).
-        known: confidence in both, (B, 1, H, W) in [0, 1]; low where nearly all nearby pixels are on one side.
+        mixture: linear function (B, C+1, H, W), see :func:`linear_mask`, from the colour of a pixel to the fraction of
+            the colour inside in it, if it is a mixture of both.
+        trust: confidence in that fraction, (B, 1, H, W) in [0, 1]; low where the two colours are similar, or nearly all
+            nearby pixels are on one side.
+        across: colour inside minus colour outside, (B, C, H, W), towards 0 where nearly all are on one side.
     """
 
-    inside: Tensor
-    outside: Tensor
-    known: Tensor
+    mixture: Tensor
+    trust: Tensor
+    across: Tensor
+
+    @staticmethod
+    def of(planes: Tensor) -> "Sides":
+        """Separate :attr:`planes`."""
+        count = (planes.shape[1] - 2) // 2
+        return Sides(*planes.split([count + 1, 1, count], dim=1))
+
+    @property
+    def planes(self) -> Tensor:
+        """All attributes, one below the other, (B, 2C+2, H, W)."""
+        return torch.cat([self.mixture, self.trust, self.across], dim=1)
 
     def refine(self, image: Tensor, mask: Tensor) -> Tensor:
         """Replace border values of a mask (B, 1, H, W) by the mixing ratio of the two colours in each pixel.
 
         Meant for plain colours on both sides; in textures it would produce patterns.
         """
-        across = self.inside - self.outside
-        contrast = across.square().mean(1, keepdim=True)
-        share = ((image - self.outside) * across).mean(1, keepdim=True) / (
-            contrast + MIN_SIDE_WEIGHT * HALF_TRUST_CONTRAST
-        )
         decided = (2 * mask - 1).square().square().square()  # 0 and 1 are certain
-        trust = self.known * contrast / (contrast + HALF_TRUST_CONTRAST**2) * (1 - decided)
-        return torch.lerp(mask, share.clamp(0.0, 1.0), trust)
+        return torch.lerp(mask, linear_mask(image, self.mixture).clamp(0.0, 1.0), self.trust * (1 - decided))
 
 
 def colours_beside(image: Tensor, mask: Tensor) -> Sides:
-    """Colours on both sides of the borders of a mask (B, 1, H, W) of an image (B, C, H, W)."""
+    """Compare an image (B, C, H, W) with the colours on both sides of the borders of a mask (B, 1, H, W)."""
     (height, width), step = image.shape[-2:], 1 << pyramid_levels(min(image.shape[-2:]))
     weights = torch.cat([mask, 1 - mask], dim=1).square().square() + MIN_SIDE_WEIGHT  # (B, 2, H, W)
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
@@ -265,13 +272,17 @@ def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     # Separable box sums; pixels outside the picture do not count.
     sums = F.avg_pool2d(coarse, (size, 1), 1, (SIDE_RADIUS, 0))
     sums = F.avg_pool2d(sums, (1, size), 1, (0, SIDE_RADIUS))
-    means = sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)  # (B, 2, C, h, w)
+    inside, outside = (sums[:, 2:].unflatten(1, (2, -1)) / sums[:, :2].unsqueeze(2)).unbind(1)  # (B, C, h, w)
     least = sums[:, :2].amin(1, keepdim=True)
-    found = torch.cat([means.flatten(1, 2), least / (least + HALF_TRUST_SHARE)], dim=1)
+    found = torch.cat([outside, inside - outside, least / (least + HALF_TRUST_SHARE)], dim=1)
     if step > 1:
         found = F.interpolate(found, scale_factor=step, mode="bilinear", align_corners=False)
     channels = image.shape[1]
-    return Sides(*found[..., :height, :width].split([channels, channels, 1], dim=1))
+    outside, across, known = found[..., :height, :width].split([channels, channels, 1], dim=1)
+    contrast = dot(across, across) / channels
+    slopes = across / (channels * (contrast + MIN_SIDE_WEIGHT * HALF_TRUST_CONTRAST))
+    mixture = torch.cat([slopes, -dot(outside, slopes)], dim=1)
+    return Sides(mixture, known * contrast / (contrast + HALF_TRUST_CONTRAST**2), known * across)
 
 
 def refine_mask(image: Tensor, mask: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_tensor
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, region_means, split_luminance
+from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, nearby, region_means, split_luminance
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
@@ -109,11 +109,10 @@ def fit_recolor(
     reduced = split_luminance(found.reduced)[1]
     beside = []
     for share in change.shares(found.reduced_masks()).split(1, dim=1):
-        sides = colours_beside(reduced, refine_mask(reduced, share))
-        beside.append(torch.cat([sides.inside, sides.outside, sides.known], dim=1))
+        beside.append(colours_beside(reduced, refine_mask(reduced, share)).planes)
 
     def recoloured(pixels: Any) -> Tensor:
-        sides = [Sides(*found.rows(planes, pixels).split([3, 3, 1], dim=1)) for planes in beside]
+        sides = [Sides.of(found.rows(planes, pixels)) for planes in beside]
         return change(pixels.image, found.masks(pixels), sides)
 
     return Fitted(recoloured)
@@ -148,23 +147,24 @@ class Recoloring:
         """Return the fraction of each pixel that takes each colour, (B, K, H, W), from masks (B, K, H, W)."""
         certain = ((masks - END_MARGIN) / (1 - 2 * END_MARGIN)).clamp(0.0, 1.0)
         shares = certain * self.valid[..., None, None]
-        return shares / shares.sum(1, keepdim=True).clamp(min=1.0)
+        return shares if shares.shape[1] == 1 else shares / shares.sum(1, keepdim=True).clamp(min=1.0)
 
     def __call__(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
         """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders."""
         shares = self.shares(masks)
         luminance, chroma = split_luminance(pixels)
-        change, total = torch.zeros_like(chroma), torch.zeros_like(luminance)
+        changed, total = chroma, torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
             sides = beside[k]
             share = sides.refine(chroma, shares[:, k : k + 1])
             # Chroma of the object's part of a mixed pixel; inside the object, that of the pixel.
-            object_chroma = chroma + sides.known * (1 - share) * (sides.inside - sides.outside)
+            object_chroma = torch.addcmul(chroma, 1 - share, sides.across)
             # The new colour takes the relative saturation of the old one, so that a white highlight stays white.
             squared_saturation = self.old[:, k].square().sum(1)[:, None, None, None]
-            product = (squared_saturation * object_chroma.square().sum(1, keepdim=True)).clamp(min=EPSILON).sqrt()
+            product = (squared_saturation * dot(object_chroma, object_chroma)).clamp(min=EPSILON).sqrt()
             relative = (product + GREY_CHROMA**2) / (squared_saturation + GREY_CHROMA**2)
-            change = change + share * (relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None] - object_chroma)
+            changed = torch.addcmul(changed, share * relative.clamp(0.0, 1.5), self.colours[:, k, :, None, None])
+            changed = torch.addcmul(changed, share, object_chroma, value=-1)
             total = total + share
         untouched = (total == 0).expand_as(pixels)
-        return torch.where(untouched, pixels, merge_luminance(luminance, chroma + change))
+        return torch.where(untouched, pixels, merge_luminance(luminance, changed))
