@@ -86,8 +86,10 @@ def in_the_library(path: Path) -> None:
         ("colorize", "#2040e0", "strength", 0.5, 0.7),
         ("defocus", "in", "radius", 2.0, 4.0),
         ("abstract", "", "power", 0.05, 0.2),
+        ("denoise", "", "strength", 0.95, 0.55),
+        ("look", "", "amount", 0.4, 1.2),
     ):
-        session.load(Recipe())
+        session.load(RECIPES[step] if step == "look" else Recipe())
         values = [first + (last - first) * i / MOVES for i in range(MOVES + 1)]
         if paint:
             session.add_stroke(step, [(0.4 * size[1], 0.4 * size[0]), (0.5 * size[1], 0.4 * size[0])], 0.02, paint)

@@ -9,8 +9,11 @@ filter of the step that is being changed, and the picture after each step.
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +21,7 @@ from torch import Tensor
 
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
 from nlfilter_torch.edits.colour import nearby_or_far
+from nlfilter_torch.edits.declaration import Edit
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.mask import fit_mask
@@ -63,6 +67,36 @@ def sampled_operator(
         landmarks=detail["sampling"],
         generator=seeded(),
     )
+
+
+def between_knots(declared: Edit, edit: Callable[[Step], Tensor], image: Tensor) -> Callable[[Step], Tensor]:
+    """Return an edit of an image that is computed only at the knots of its slider, if that has any.
+
+    Between two knots the pictures are interpolated linearly.
+    """
+    slow = [(p.name, p.slider.knots) for p in declared if p.slider is not None and p.slider.knots]
+    if not slow:
+        return edit
+    name, knots = slow[0]
+
+    @lru_cache(maxsize=4)
+    def computed(step: Step) -> Tensor:
+        return edit(step) if step.changes() else image
+
+    def with_value(step: Step, value: float) -> Step:
+        values: dict[str, Any] = {name: value}
+        return step.changed(**values)
+
+    def interpolated(step: Step) -> Tensor:
+        value = step[name]
+        if value in knots or value > knots[-1]:
+            return computed(step)
+        above = bisect_right(knots, value)
+        ends = knots[above - 1], knots[above]
+        low, high = (computed(with_value(step, end)) for end in ends)
+        return torch.lerp(low, high, (value - ends[0]) / (ends[1] - ends[0]))
+
+    return interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +266,8 @@ class Preview:
         if keep:
             self._filter = None  # first, since two of them would take twice the memory
         # A reduced photograph goes a little beyond its range, also where saving reduces it.
-        edit = prepare(step, image.clamp(0, 1) if before else image, stride=self.stride)
+        given = image.clamp(0, 1) if before else image
+        edit = between_knots(step.declared, prepare(step, given, stride=self.stride), given)
         if keep:
             self._filter = (key, edit)
         return edit

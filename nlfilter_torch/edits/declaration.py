@@ -46,6 +46,8 @@ class Slider:
         step: difference between adjacent values.
         none: value that stands for None, if there is one.
         live: whether the picture is updated while the slider moves, not only when it is released.
+        knots: ascending values at which the preview computes an edit that is too slow to follow the slider; between
+            them it interpolates. Empty for other edits.
     """
 
     label: str
@@ -54,6 +56,7 @@ class Slider:
     step: float
     none: float | None = None
     live: bool = True
+    knots: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -200,8 +200,11 @@ def fit_look_edit(
 
 def _local_change(source: Source, strengths: Tensor) -> Planes:
     """The change (B, C, h, W) by local tone curves."""
-    curves = LocalCurves.of(source.size, lambda step: source.reduced(lambda pixels: ramps(pixels.image), step))
-    weighed = curves.weighed(strengths)
+
+    def compute() -> LocalCurves:
+        return LocalCurves.of(source.size, lambda step: source.reduced(lambda pixels: ramps(pixels.image), step))
+
+    weighed = source.kept("local curves", [], compute).weighed(strengths)
     return lambda pixels: weighed.rectangle(pixels.image, corner(pixels)).sum(1)
 
 

@@ -82,7 +82,7 @@ LOOK = Edit(
             "amount",
             1.0,
             "How much of the look: 0 none, 1 all of it, 2 twice as much.",
-            slider=Slider("Amount", 0, 2, 0.05, live=False),
+            slider=Slider("Amount", 0, 2, 0.05),
         ),
         VIEWING_SIZE,
         *WITHOUT_SHADING,

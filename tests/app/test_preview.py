@@ -122,6 +122,19 @@ def test_other_sliders_need_no_other_layers(session: Session, monkeypatch: pytes
             assert torch.equal(session.render(), wanted)
 
 
+def test_slow_edits_are_computed_at_knots_only(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = session.preview.pixels
+    exact = {strength: apply_step(Step("denoise", strength=strength), image) for strength in (0.5, 1.0, 2.0, 3.0)}
+    exact[0.0] = image
+    between = {0.7: (0.5, 1.0, 0.4), 1.25: (1.0, 2.0, 0.25), 0.1: (0.0, 0.5, 0.2)}
+    expected = exact | {at: torch.lerp(exact[low], exact[high], share) for at, (low, high, share) in between.items()}
+    events = counted(monkeypatch)["denoise"]
+    for strength in (0.5, 1.0, 2.0, *between, 3.0):
+        session.set("denoise", strength=strength)
+        assert difference(session.render(), expected[strength]) < 1e-3
+    assert events == ["filter", *["edit"] * 4]
+
+
 def test_another_tolerance_or_picture_needs_another_filter(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     events = counted(monkeypatch)["recolor"]
     session.load(Recipe((PAIRS["recolor"][0],)))
