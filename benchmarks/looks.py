@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sparse
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageEnhance, ImageFilter
+from PIL import Image, ImageEnhance, ImageFilter, ImageOps
 from scipy.sparse.linalg import cg
 from skimage import exposure, filters
 from torch import Tensor
@@ -121,6 +121,7 @@ EDITS: dict[str, tuple[str, Edit]] = {
     "saturation (Pillow)": ("global", pillow(lambda x: ImageEnhance.Color(x).enhance(1.6))),
     "saturation in HSV (OpenCV)": ("global", more_saturated),
     "contrast (Pillow)": ("global", pillow(lambda x: ImageEnhance.Contrast(x).enhance(1.4))),
+    "automatic contrast (Pillow)": ("global", pillow(ImageOps.autocontrast)),
     "warmth (NumPy)": ("global", warm),
     "sepia (OpenCV)": ("global", lambda rgb: cv2.transform(rgb, SEPIA)),
     "mixture (all three)": ("global", mixed),

@@ -23,6 +23,7 @@ BENT = tuple((i / 16) ** 0.7 for i in range(17))
 VIVID = (1.3, 1.2, 1.1, 1.05, 1.0)
 BANDS = (1.5, 1.0, 1.3, 1.0, 1.0, 0.8, 1.1)
 TEXTURE = (1.4, 0.8, 1.2, 1.0, 1.1, 0.9)
+STRETCH = (0.3, 0.4, -0.2)
 LOCAL = (0.2, 0.3, -0.1, 0.2, 0.1, -0.1, 0.2, 0.1)
 
 
@@ -84,6 +85,9 @@ def test_local_contrast_is_the_clipped_histogram_of_the_tiles_around(scaled: boo
     found = apply_look(image, local=strengths) - image
     weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(3, 1, 1)
     light = (image[0].amax(0) if scaled else (image[0] * weights).sum(0)).numpy()
+    value = light
+    if scaled:
+        light = (light - light.min()) / (light.max() - light.min())
     hats = np.maximum(1 - np.abs(light * 32 - np.arange(33)[:, None, None]), 0)
 
     def inside(tile: int, length: int) -> np.ndarray:  # how much of each pixel is in it
@@ -106,10 +110,33 @@ def test_local_contrast_is_the_clipped_histogram_of_the_tiles_around(scaled: boo
             for j in {int(place[1]), min(int(place[1]) + 1, 7)}:
                 blended += (1 - abs(place[0] - i)) * (1 - abs(place[1] - j)) * curve(i, j)
         change = np.interp(light[row, column], np.linspace(0, 1, 33), blended)
-        colours = image[0, :, row, column] / light[row, column] if scaled else torch.ones(3)
+        colours = image[0, :, row, column] / value[row, column] if scaled else torch.ones(3)
         assert found[0, :, row, column].tolist() == pytest.approx((change * colours).tolist(), abs=1e-6)
     even = torch.full((1, 3, 5, 40), 0.5)  # tiles of less than a pixel
     assert torch.isfinite(apply_look(even, local=LOCAL)).all()
+
+
+def test_automatic_levels_reach_from_black_to_white() -> None:
+    dull = CAT * 0.4 + 0.2
+    weights = torch.tensor([0.299, 0.587, 0.114]).view(3, 1, 1)
+    for kind, tone in enumerate((lambda x: (x * weights).sum(1), lambda x: x.amax(1), lambda x: x)):
+        strengths = [0.0] * 3
+        strengths[kind] = 1.0
+        found = tone(apply_look(dull, stretch=strengths))
+        low, high = tone(dull).min(), tone(dull).max()
+        if kind == 2:
+            low, high = (torch.stack([of(x) for x in dull[0]]).view(3, 1, 1) for of in (torch.min, torch.max))
+        assert torch.allclose(found, (tone(dull) - low) / (high - low), atol=1e-5)
+    value = apply_look(dull, stretch=(0.0, 1.0, 0.0))
+    assert torch.allclose(value * dull.amax(1, True), dull * value.amax(1, True), atol=1e-5)  # hue and saturation stay
+    grey = apply_look(dull[:, :1], stretch=(0.0, 0.0, 1.0))
+    assert [float(grey.min()), float(grey.max())] == pytest.approx([0, 1], abs=1e-5)
+
+
+def test_automatic_levels_leave_flat_pictures_alone() -> None:
+    for even in (torch.zeros(1, 3, 9, 9), torch.full((1, 3, 9, 9), 0.7)):
+        assert torch.equal(apply_look(even, stretch=STRETCH), even)
+        assert torch.isfinite(apply_look(even, local=LOCAL)).all()
 
 
 @pytest.mark.parametrize("viewing", [0.0, 0.004])
@@ -117,7 +144,7 @@ def test_local_contrast_is_the_clipped_histogram_of_the_tiles_around(scaled: boo
 def test_tiles_are_the_image_in_memory(viewing: float, channels: int, tmp_path: Path) -> None:
     step = Step(
         "look", alpha=ALPHA, bands=BANDS, texture=TEXTURE, red=BENT, green=BENT, blue=BENT, matrix=SEPIA,
-        saturation=VIVID, local=LOCAL, amount=0.8, landmarks=30, viewing_size=viewing,
+        saturation=VIVID, stretch=STRETCH, local=LOCAL, amount=0.8, landmarks=30, viewing_size=viewing,
     )  # fmt: skip
     image = CAT[:, :channels]
     whole = apply_step(step, image)
@@ -155,6 +182,11 @@ def test_gradients_reach_image_and_look() -> None:
 
     with torch.no_grad():
         image.add_(1e-3)  # away from the knots of the curve, where it has no derivative
+    assert torch.autograd.gradcheck(
+        lambda image, levels: apply_look(image, stretch=levels),
+        (image, torch.tensor(STRETCH, dtype=torch.float64, requires_grad=True)),
+        fast_mode=True,
+    )
     assert torch.autograd.gradcheck(look, (image, bands, curve, matrix, vivid, local, texture), fast_mode=True)
     apply_look(image, alpha=alpha, num_landmarks=20).square().mean().backward()
     assert alpha.grad is not None
@@ -201,6 +233,7 @@ def test_the_layer_takes_what_was_found() -> None:
         ({"texture": (1.0,)}, "texture must have the shape"),
         ({"alpha": (1.0,)}, "alpha must have the shape"),
         ({"local": (1.0,)}, "local must have the shape"),
+        ({"stretch": (1.0,)}, "stretch must have the shape"),
     ],
 )
 def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: str) -> None:

@@ -273,7 +273,8 @@ FUNCTIONS = {
         FILTER
         | {"alpha": lambda scene: 4 * scene.noise(scene.order + 1), "bands": lambda scene: 2 * scene.noise(7)}
         | {"matrix": lambda scene: scene.noise(9), "amount": _number(0, 2)}
-        | {"local": lambda scene: scene.noise(4)},
+        | {"texture": lambda scene: 2 * scene.noise(6), "saturation": lambda scene: 2 * scene.noise(5)}
+        | {"stretch": lambda scene: scene.noise(3), "local": lambda scene: scene.noise(8)},
     ),
     "fit_look": Function(
         _fitted_look,

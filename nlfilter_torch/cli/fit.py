@@ -51,6 +51,7 @@ CALLED = {
     "curves": "a tone curve for each channel",
     "matrix": "colours",
     "saturation": "saturation",
+    "stretch": "automatic levels",
     "local": "local contrast",
 }
 

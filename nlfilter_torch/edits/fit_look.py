@@ -49,7 +49,7 @@ class FittedLook:
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
         parts: what it consists of: ``alpha``, ``bands``, ``texture``, ``tone`` (one curve) or ``curves``, ``matrix``,
-            ``saturation`` and ``local``.
+            ``saturation``, ``stretch`` and ``local``.
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
         explained: the same two for every choice of parts that was tried.
@@ -73,7 +73,7 @@ class FittedLook:
         curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands", "texture")}
-        rest = {name: torch.tensor(self.step[name]) for name in ("saturation", "local")}
+        rest = {name: torch.tensor(self.step[name]) for name in ("saturation", "stretch", "local")}
         return {**named, "curves": curves, "matrix": matrix, **rest}
 
     def to_json(self) -> str:
@@ -103,7 +103,7 @@ def fit_look(
             in some pairs. Read once. A frame of one colour around an edited photograph is left out.
         parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs),
             ``texture`` (these without edges), ``curves``,
-            ``matrix``, ``saturation`` and ``local`` (local contrast).
+            ``matrix``, ``saturation``, ``stretch`` (automatic levels) and ``local`` (local contrast).
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -206,6 +206,7 @@ class _Region:
             blue=blue,
             matrix=_rounded(matrix.flatten()),
             saturation=_rounded(1 + values["saturation"][0]),
+            stretch=_rounded(values["stretch"][0]),
             local=_rounded(values["local"][0]),
         )
 

@@ -17,6 +17,7 @@ from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.scribbles import check_painted
+from nlfilter_torch.filtering.stretch import ends_of
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
@@ -132,6 +133,10 @@ class InMemory:
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
         return planes(self).mean((2, 3), keepdim=True)
+
+    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        """Least and largest values over all pixels."""
+        return ends_of(planes(self))
 
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of pixels."""

@@ -1,4 +1,4 @@
-"""A look: sliders of detail and blurs, tone curves, colours and local contrast, as found by :func:`fit_look`."""
+"""A look: sliders of detail and blurs, tone curves, colours, levels, local contrast, as found by :func:`fit_look`."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -19,6 +19,7 @@ from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
 from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
+from nlfilter_torch.filtering.stretch import Stretch, tones
 from nlfilter_torch.operator.features import reduce_channels
 
 Numbers = Tensor | Sequence[float]
@@ -36,6 +37,7 @@ def apply_look(
     blue: Numbers = LOOK.defaults["blue"],
     matrix: Numbers = LOOK.defaults["matrix"],
     saturation: Numbers = LOOK.defaults["saturation"],
+    stretch: Numbers = LOOK.defaults["stretch"],
     local: Numbers = LOOK.defaults["local"],
     amount: float | Tensor = LOOK.defaults["amount"],
     viewing_size: float = LOOK.defaults["viewing_size"],
@@ -58,6 +60,9 @@ def apply_look(
         matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
         saturation: how many times as far each channel is to be from the largest one of its pixel, (K,) or (B, K), for
             colours whose saturation in HSV is at equal steps from 0 to 1.
+        stretch: how much of the change that stretches brightness, from the darkest to the lightest pixel of the picture
+            to the range from 0 to 1, is added: of luminance, for all channels alike; of the largest channel, which
+            scales colours; and of each channel for itself, (3,) or (B, 3); 0 is none.
         local: how much of the change that equalises the histogram around each pixel is added, under limits of contrast
             of 1.5, 2, 3 and 5: four strengths for luminance, and four for the largest channel, whose change scales
             colours, (8,) or (B, 8); 0 is none. Histograms are those of 8 x 8 tiles of the picture.
@@ -94,6 +99,7 @@ def apply_look(
         blue=blue,
         matrix=matrix,
         saturation=saturation,
+        stretch=stretch,
         local=local,
         amount=amount,
         viewing_size=viewing_size,
@@ -115,6 +121,7 @@ def fit_look_edit(
     blue: Numbers,
     matrix: Numbers,
     saturation: Numbers,
+    stretch: Numbers,
     local: Numbers,
     amount: float | Tensor,
     viewing_size: float,
@@ -128,9 +135,9 @@ def fit_look_edit(
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
     LOOK["amount"].check_argument(amount, source.batch)
     LOOK["viewing_size"].check_argument(viewing_size)
-    given = {"alpha": alpha, "bands": bands, "texture": texture, "saturation": saturation, "local": local}
-    given |= {"red": red, "green": green, "blue": blue}
-    sliders, gains, textured, factors, strengths, *channels = (
+    given = {"alpha": alpha, "bands": bands, "texture": texture, "saturation": saturation}
+    given |= {"stretch": stretch, "local": local, "red": red, "green": green, "blue": blue}
+    sliders, gains, textured, factors, levels, strengths, *channels = (
         _numbers(value, name, source) for name, value in given.items()
     )
     if len({channel.shape[-1] for channel in channels}) > 1:
@@ -143,7 +150,7 @@ def fit_look_edit(
         raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
     colours = colours.unflatten(-1, (3, 3))
     parts = {"alpha": sliders, "bands": gains, "texture": textured, "curves": curves, "matrix": colours}
-    parts |= {"saturation": factors, "local": strengths}
+    parts |= {"saturation": factors, "stretch": levels, "local": strengths}
     for name, value in parts.items():
         check_part(value, name, source.batch)
     strength = torch.as_tensor(amount).to(source.dtype).reshape(-1, 1, 1, 1)
@@ -175,7 +182,7 @@ def fit_look_edit(
 
     fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
 
-    equalized = _local_change(source, strengths) if acts(strengths, 0.0) else None
+    brightened = _change_of_brightness(source, levels, strengths)
 
     def result(image: Tensor, moved: Tensor) -> Tensor:
         coloured = image.expand(-1, 3, -1, -1)
@@ -184,28 +191,42 @@ def fit_look_edit(
         return image + strength * (moved - image + shown)
 
     def planes(pixels: Pixels) -> Tensor:
-        """The change of some pixels, and that of local contrast as further planes."""
+        """The change of some pixels, and that of their brightness as further planes."""
         moved = fitted.pixels(pixels)
-        return moved if equalized is None else torch.cat([moved, equalized(pixels)], dim=1)
+        return moved if brightened is None else torch.cat([moved, brightened(pixels)], dim=1)
 
     def finished(image: Tensor, found: Tensor, inner: Inner) -> Tensor:
-        moved, local = (found, None) if equalized is None else found.tensor_split([-image.shape[1]], dim=1)
+        moved, light = (found, None) if brightened is None else found.tensor_split([-image.shape[1]], dim=1)
         shown = result(image, moved if fitted.finish is None else fitted.finish(image, moved, inner))
-        return shown if local is None else shown + strength * local
+        return shown if light is None else shown + strength * light
 
     if fitted.finish is None:
         return Fitted(lambda pixels: finished(pixels.image, planes(pixels), EVERYWHERE))
     return Fitted(planes, finished, fitted.margin)
 
 
-def _local_change(source: Source, strengths: Tensor) -> Planes:
-    """The change (B, C, h, W) by local tone curves."""
+def _change_of_brightness(source: Source, levels: Tensor, strengths: Tensor) -> Planes | None:
+    """The change (B, C, h, W) by automatic levels and local tone curves, or None if there is none."""
+    if not acts(levels, 0.0) and not acts(strengths, 0.0):
+        return None
 
-    def compute() -> LocalCurves:
-        return LocalCurves.of(source.size, lambda step: source.reduced(lambda pixels: ramps(pixels.image), step))
+    stretch = source.kept(
+        "range of brightness", [], lambda: Stretch.of(source.ends(lambda pixels: tones(pixels.image)))
+    )
+    if not acts(strengths, 0.0):
+        return lambda pixels: stretch.change(pixels.image, levels)
 
-    weighed = source.kept("local curves", [], compute).weighed(strengths)
-    return lambda pixels: weighed.rectangle(pixels.image, corner(pixels)).sum(1)
+    def curves() -> LocalCurves:
+        ramped = partial(source.reduced, lambda pixels: ramps(pixels.image, stretch))
+        return LocalCurves.of(source.size, stretch, ramped)
+
+    weighed = source.kept("local curves", [], curves).weighed(strengths)
+
+    def change(pixels: Pixels) -> Tensor:
+        found = weighed.rectangle(pixels.image, corner(pixels)).sum(1)
+        return found + stretch.change(pixels.image, levels) if acts(levels, 0.0) else found
+
+    return change
 
 
 def _numbers(value: Numbers, name: str, source: Source) -> Tensor:

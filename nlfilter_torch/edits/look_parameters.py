@@ -68,6 +68,17 @@ LOOK = Edit(
             metavar="A,B,...,E",
         ),
         sliders(
+            "stretch",
+            (0.0,) * 3,
+            "Automatic levels: how much of the change that stretches brightness from the darkest to the lightest pixel "
+            "to black and white is added: of luminance, of the largest channel with colours in proportion, and of each "
+            "channel for itself. 0 is none.",
+            unit="",
+            idle=(0.0,) * 3,
+            metavar="A,B,C",
+            length=3,
+        ),
+        sliders(
             "local",
             (0.0,) * 8,
             "Local contrast: how much of the change that equalises the histogram around each pixel is added, under "

@@ -16,7 +16,7 @@ from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
 from nlfilter_torch.filtering.local_tone import LocalCurves
-from nlfilter_torch.filtering.look import bands_of, local_curves, textures_of
+from nlfilter_torch.filtering.look import bands_of, local_curves, range_of, textures_of
 from nlfilter_torch.filtering.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
 from nlfilter_torch.operator.build import nonlocal_operator, sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -34,6 +34,7 @@ class SomePixels:
         after: (3, P).
         bands: of the photograph before the edit, (3, 7, P).
         texture: of it, (6, P).
+        stretch: changes by automatic levels, (3, 3, P).
         local: changes by local tone curves, (3, 8, P).
         layers: of its luminance, (k+1, P).
         weights: (3, P).
@@ -44,6 +45,7 @@ class SomePixels:
     after: Tensor
     bands: Tensor
     texture: Tensor
+    stretch: Tensor
     local: Tensor
     layers: Tensor
     weights: Tensor
@@ -52,12 +54,12 @@ class SomePixels:
         """Sums over parts (P',) of them."""
         found = []
         for some in parts:
-            before, bands, texture, local, layers, after, weights = (
+            before, bands, texture, stretch, local, layers = (
                 values[..., some]
-                for values in (self.before, self.bands, self.texture, self.local, self.layers, self.after, self.weights)
+                for values in (self.before, self.bands, self.texture, self.stretch, self.local, self.layers)
             )
-            columns = columns_of(before, bands, texture, local, layers, layout)
-            found.append(sums_of(columns, after - before, weights))
+            columns = columns_of(before, bands, texture, stretch, local, layers, layout)
+            found.append(sums_of(columns, self.after[..., some] - before, self.weights[..., some]))
         return found
 
 
@@ -87,6 +89,7 @@ class EditedPhotograph:
         free = ((after > 0) & (after < 1)).to(dtype) * inside_frame(before, after).to(dtype)
         size = (before.shape[-2], before.shape[-1])
         self.size = viewed_size(size, step["viewing_size"])
+        self.stretch = range_of(before[None])  # not of its reduction, which has fewer extremes
         levels = after * 255
         #: Half the step between the values of the edited photograph, or 0.
         self.rounding = HALF_LEVEL if bool(((levels - levels.round()).abs() < OFF_LEVEL).all()) else 0.0
@@ -119,7 +122,7 @@ class EditedPhotograph:
     @cached_property
     def local(self) -> LocalCurves:
         """Local tone curves before the edit."""
-        return local_curves(self.image)
+        return local_curves(self.image, self.stretch)
 
     @cached_property
     def layers(self) -> Tensor:
@@ -166,4 +169,5 @@ class EditedPhotograph:
         rows, columns = places // self.size[1], places % self.size[1]
         before, after = self.before[:, places], self.after[:, places]
         local = self.local.at(before[None], rows, columns)[0].transpose(0, 1)
-        return SomePixels(places, before, after, bands, texture, local, layers, weights[:, places] * share)
+        stretch = self.stretch.changes(before[None, :, None])[0, :, :, 0].transpose(0, 1)
+        return SomePixels(places, before, after, bands, texture, stretch, local, layers, weights[:, places] * share)

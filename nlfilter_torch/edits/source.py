@@ -156,6 +156,9 @@ class Source(Protocol):
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
+    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        """Least and largest values (B, C, 1, 1) over all pixels."""
+
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means (B, C, H / step, W / step), sizes rounded up, over blocks of ``step`` x ``step`` pixels."""
 

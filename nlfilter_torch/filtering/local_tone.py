@@ -3,7 +3,7 @@
 After Zuiderveld, "Contrast Limited Adaptive Histogram Equalization" (1994): clipped histograms of 8 x 8 tiles give
 curves, and a pixel takes its value from the curves of the four nearest tiles. Here histograms are of hat functions, so
 that curves are continuous in the picture. What curves of luminance change is added to every channel; curves of the
-largest channel (value in HSV) scale colours.
+largest channel (value in HSV), which is stretched to the whole range first, scale colours.
 """
 
 from collections.abc import Callable
@@ -14,35 +14,34 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.filtering.stretch import DARKEST, Stretch, brightness
 
 LIMITS = (1.5, 2.0, 3.0, 5.0)  # times as much of a shade as in an even histogram that counts at most: slopes of curves
 STRENGTHS = 2 * len(LIMITS)  # of luminance, and of the largest channel
 SHADES = 33
 TILES = 8  # along both sides
 FINE = 16  # blocks along the short side of a tile that histograms are first taken of
-DARKEST = 1 / 255  # largest channel that colours are divided by
 
 
-def brightness(image: Tensor) -> Tensor:
-    """Luminance and largest channel (B, 2, H, W) of an image (B, C, H, W)."""
-    return torch.cat([reduce_channels(image, "luminance").mean(1, keepdim=True), image.amax(1, keepdim=True)], dim=1)
-
-
-def ramps(image: Tensor) -> Tensor:
-    """How far both kinds of :func:`brightness` are from each shade to the next, 0 to 1: (B, 2 (K - 1), H, W)."""
-    light = brightness(image) * (SHADES - 1)
+def ramps(image: Tensor, stretch: Stretch) -> Tensor:
+    """How far luminance and the stretched largest channel are from each shade to the next, (B, 2 (K - 1), H, W)."""
+    light = _stretched(brightness(image), stretch) * (SHADES - 1)
     return torch.stack([light.clamp(k, k + 1) - k for k in range(SHADES - 1)], dim=2).flatten(1, 2)
 
 
-def mean_ramps(image: Tensor, step: int) -> Tensor:
+def mean_ramps(image: Tensor, stretch: Stretch, step: int) -> Tensor:
     """Means of :func:`ramps` over blocks of ``step`` x ``step`` pixels, with one shade in memory at a time."""
-    light = brightness(image) * (SHADES - 1)
+    light = _stretched(brightness(image), stretch) * (SHADES - 1)
     means = [
         F.avg_pool2d(light.clamp(k, k + 1), step, ceil_mode=True, count_include_pad=False) - k
         for k in range(SHADES - 1)
     ]
     return torch.stack(means, dim=2).flatten(1, 2)
+
+
+def _stretched(light: Tensor, stretch: Stretch) -> Tensor:
+    """Both kinds of :func:`brightness`, (B, 2, H, W), of which the largest channel is stretched."""
+    return torch.cat([light[:, :1], stretch.largest(light[:, 1:])], dim=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +51,20 @@ class LocalCurves:
     Attributes:
         changes: of K shades of luminance and of the largest channel, by S curves, (B, 2, S, K, TILES, TILES).
         size: (H, W) of the picture.
+        stretch: range of its brightness.
     """
 
     changes: Tensor
     size: tuple[int, int]
+    stretch: Stretch
 
     @staticmethod
-    def of(size: tuple[int, int], reduced: Callable[[int], Tensor]) -> "LocalCurves":
+    def of(size: tuple[int, int], stretch: Stretch, reduced: Callable[[int], Tensor]) -> "LocalCurves":
         """The curves of a picture of a size (H, W), one for each of :data:`LIMITS`.
 
         Args:
             size: of the picture.
+            stretch: range of its brightness.
             reduced: means of its :func:`ramps` over blocks of so many pixels, (B, 2 (K - 1), h, w).
         """
         step = max(1, min(size) // (TILES * FINE))
@@ -77,12 +79,12 @@ class LocalCurves:
             most = histogram.clamp(max=limit / SHADES)
             shared = most + (1 - most.sum(2, keepdim=True)) / SHADES
             changes.append(shared.cumsum(2) - shared / 2 - straight)
-        return LocalCurves(torch.stack(changes, dim=2), size)
+        return LocalCurves(torch.stack(changes, dim=2), size, stretch)
 
     def weighed(self, strength: Tensor) -> "LocalCurves":
         """One curve: the sum of all, each as strong as (2 S,) or (B, 2 S) says."""
         weights = strength.to(self.changes).reshape(-1, 2, len(LIMITS), 1, 1, 1)
-        return LocalCurves((weights * self.changes).sum(2, keepdim=True), self.size)
+        return LocalCurves((weights * self.changes).sum(2, keepdim=True), self.size, self.stretch)
 
     def rectangle(self, image: Tensor, corner: tuple[int, int]) -> Tensor:
         """Changes (B, 2 S, C, h, w) of an image (B, C, h, w), whose first pixel is in that row and column."""
@@ -96,9 +98,10 @@ class LocalCurves:
 
     def at(self, image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """Changes (B, 2 S, C, P) of some pixels (B, C, P), in rows and columns (P,)."""
-        light = brightness(image.unsqueeze(2)).squeeze(2)
-        added, scaled = self._changes_of(light, rows, columns).unbind(1)
-        colours = (image / light[:, 1:].clamp(min=DARKEST)).unsqueeze(1)
+        light = brightness(image.unsqueeze(2))
+        places = _stretched(light, self.stretch).squeeze(2)
+        added, scaled = self._changes_of(places, rows, columns).unbind(1)
+        colours = (image / light[:, 1:, 0].clamp(min=DARKEST)).unsqueeze(1)
         added = added.unsqueeze(2).expand(-1, -1, image.shape[1], -1)
         return torch.cat([added, scaled.unsqueeze(2) * colours], dim=1)
 

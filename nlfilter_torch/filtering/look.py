@@ -1,4 +1,4 @@
-"""A look: sliders of the filter, of blurs and of texture, tone curves, colours and local contrast, added up.
+"""A look: sliders of the filter, of blurs and of texture, tone curves, colours, levels and local contrast, added up.
 
 Each part gives a change of the image, and the result is the image plus all changes, so that it is linear in every
 parameter but the image: looks are fitted to edits by least squares.
@@ -13,6 +13,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_image, check_tensor
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.filtering.local_tone import STRENGTHS, LocalCurves, mean_ramps
+from nlfilter_torch.filtering.stretch import KINDS, Stretch, ends_of, tones
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 
@@ -20,9 +21,9 @@ BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
 DARKEST = 1 / 255  # that has a saturation
-NAMES = ("alpha", "bands", "texture", "curves", "matrix", "saturation", "local")
+NAMES = ("alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local")
 #: Of one image.
-DIMENSIONS = {"alpha": 1, "bands": 1, "texture": 1, "curves": 2, "matrix": 2, "saturation": 1, "local": 1}
+DIMENSIONS = {name: 2 if name in ("curves", "matrix") else 1 for name in NAMES}
 
 
 def filter_look(
@@ -34,6 +35,7 @@ def filter_look(
     curves: Tensor | None = None,
     matrix: Tensor | None = None,
     saturation: Tensor | None = None,
+    stretch: Tensor | None = None,
     local: Tensor | None = None,
     operator: NonlocalOperator | None = None,
 ) -> Tensor:
@@ -51,6 +53,9 @@ def filter_look(
             image itself.
         saturation: (K,) or (B, K), how many times as far each channel is to be from the largest one of its pixel, for
             colours whose saturation in HSV is at K equal steps from 0 to 1.
+        stretch: (3,) or (B, 3), how much of the change that stretches brightness from the darkest to the lightest pixel
+            to the range from 0 to 1 is added: of luminance, for all channels alike; of the largest channel, for colours
+            in proportion; and of each channel for itself.
         local: (8,) or (B, 8), how much of the change that equalises histograms of the surroundings is added, under four
             limits of contrast, :data:`~nlfilter_torch.filtering.local_tone.LIMITS`: of luminance, for all channels
             alike, and then of the largest channel, for colours in proportion.
@@ -69,7 +74,7 @@ def filter_look(
         True
     """
     check_image(image, "image", channels=3)
-    parts = dict(zip(NAMES, (alpha, bands, texture, curves, matrix, saturation, local), strict=True))
+    parts = dict(zip(NAMES, (alpha, bands, texture, curves, matrix, saturation, stretch, local), strict=True))
     given = {name: value for name, value in parts.items() if value is not None}
     for name, value in given.items():
         check_part(value, name, image.shape[0])
@@ -79,8 +84,10 @@ def filter_look(
         result = result + band_change(image, bands, mean)
     if texture is not None:
         result = result + texture_change(image, texture)
+    if stretch is not None:
+        result = result + range_of(image).change(image, stretch)
     if local is not None:
-        result = result + local_curves(image).weighed(local).rectangle(image, (0, 0)).sum(1)
+        result = result + local_curves(image, range_of(image)).weighed(local).rectangle(image, (0, 0)).sum(1)
     if alpha is not None:
         if operator is None:
             raise ValueError("operator must be given where alpha is, got None; make it with nonlocal_operator")
@@ -98,6 +105,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         "curves": "(3, K)",
         "matrix": "(3, 3)",
         "saturation": "(K,)",
+        "stretch": f"({KINDS},)",
         "local": f"({STRENGTHS},)",
     }
     shape, one = tuple(value.shape), DIMENSIONS[name]
@@ -109,6 +117,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         "curves": lambda: last[0] == 3 and last[1] >= 2,
         "matrix": lambda: last == (3, 3),
         "saturation": lambda: last[0] >= 2,
+        "stretch": lambda: last == (KINDS,),
         "local": lambda: last == (STRENGTHS,),
     }
     if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
@@ -122,9 +131,14 @@ def acts(gains: Tensor, idle: float = 1.0) -> bool:
     return gains.requires_grad or bool((gains != idle).any())
 
 
-def local_curves(image: Tensor) -> LocalCurves:
-    """Local tone curves of an image (B, 3, H, W)."""
-    return LocalCurves.of((image.shape[-2], image.shape[-1]), partial(mean_ramps, image))
+def range_of(image: Tensor) -> Stretch:
+    """Range of the brightness of an image (B, 3, H, W)."""
+    return Stretch.of(ends_of(tones(image)))
+
+
+def local_curves(image: Tensor, stretch: Stretch) -> LocalCurves:
+    """Local tone curves of an image (B, 3, H, W) whose brightness has that range."""
+    return LocalCurves.of((image.shape[-2], image.shape[-1]), stretch, partial(mean_ramps, image, stretch))
 
 
 def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None, saturation: Tensor | None) -> Tensor:

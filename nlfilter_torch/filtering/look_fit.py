@@ -2,9 +2,9 @@
 
 A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
 channel a tone curve's hat functions, the three colours, the distance from the largest of them at each saturation, the
-bands of blurs, the changes by local tone curves and the layers of the filter. Which parts a look has, and how strong a
-ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the picture if there is one. A
-curve is kept from falling by a least-squares problem with bounds.
+bands of blurs, the changes by automatic levels and by local tone curves, and the layers of the filter. Which parts a
+look has, and how strong a ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the
+picture if there is one. A curve is kept from falling by a least-squares problem with bounds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.local_tone import STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, below_largest, saturation_hats
+from nlfilter_torch.filtering.stretch import KINDS
 
 Parts = tuple[str, ...]
 
@@ -31,14 +32,15 @@ CHOICES: tuple[Parts, ...] = (
     ("tone", "matrix"),
     ("bands", "matrix"),
     ("curves",),
+    ("stretch",),
     ("local",),
+    ("stretch", "local"),
     ("bands", "texture"),
     ("tone", "bands"),
-    ("tone", "local"),
     ("alpha", "bands"),
     ("curves", "matrix", "saturation"),
     ("tone", "matrix", "bands"),
-    ("tone", "bands", "local"),
+    ("stretch", "bands", "local"),
     ("alpha", "bands", "texture"),
     ("alpha", "bands", "local"),
     ("tone", "matrix", "bands", "local"),
@@ -87,6 +89,7 @@ class Layout:
             "saturation": self.factors,
             "bands": BLURS + 1,
             "texture": BLURS,
+            "stretch": KINDS,
             "local": STRENGTHS,
             "alpha": self.sliders,
         }
@@ -158,13 +161,16 @@ def sample(weights: Tensor) -> Tensor:
     return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
 
 
-def columns_of(image: Tensor, bands: Tensor, texture: Tensor, local: Tensor, layers: Tensor, layout: Layout) -> Tensor:
+def columns_of(
+    image: Tensor, bands: Tensor, texture: Tensor, stretch: Tensor, local: Tensor, layers: Tensor, layout: Layout
+) -> Tensor:
     """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
         image: pixels (3, P) before the edit.
         bands: of them, (3, 7, P).
         texture: of them, (6, P).
+        stretch: changes by automatic levels, (3, 3, P).
         local: changes by local tone curves, (3, 8, P).
         layers: of luminance, (k+1, P).
         layout: of the columns.
@@ -175,7 +181,8 @@ def columns_of(image: Tensor, bands: Tensor, texture: Tensor, local: Tensor, lay
     spread = [values.double().expand(3, -1, -1) for values in (colours, texture, layers)]
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    return torch.cat([hats, spread[0], below, bands.double(), spread[1], local.double(), spread[2]], dim=1)
+    own = [values.double() for values in (bands, stretch, local)]
+    return torch.cat([hats, spread[0], below, own[0], spread[1], *own[1:], spread[2]], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:

@@ -10,6 +10,7 @@ from nlfilter_torch.core.checks import check_count, check_image
 from nlfilter_torch.filtering.local_tone import STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
 from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
+from nlfilter_torch.filtering.stretch import KINDS
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -23,8 +24,8 @@ class Look(nn.Module):
 
     Args:
         parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``texture`` (6,), ``curves`` (3, K),
-            ``matrix`` (3, 3), ``saturation`` (K,) and ``local`` (8,), as from :meth:`FittedLook.tensors`. Omitted parts
-            start from the identity.
+            ``matrix`` (3, 3), ``saturation`` (K,), ``stretch`` (3,) and ``local`` (8,), as from
+            :meth:`FittedLook.tensors`. Omitted parts start from the identity.
         learn: names of the parts to learn; the others are buffers.
         knots: K, for curves that start from the identity.
         **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
@@ -46,6 +47,7 @@ class Look(nn.Module):
     curves: Tensor
     matrix: Tensor
     saturation: Tensor
+    stretch: Tensor
     local: Tensor
 
     def __init__(
@@ -68,6 +70,7 @@ class Look(nn.Module):
             "curves": torch.linspace(0, 1, knots).expand(3, -1),
             "matrix": torch.eye(3),
             "saturation": torch.ones(5),
+            "stretch": torch.zeros(KINDS),
             "local": torch.zeros(STRENGTHS),
         } | given
         for name, value in start.items():
@@ -99,6 +102,7 @@ class Look(nn.Module):
         for name in ("bands", "texture"):
             if not acts(used[name]):
                 del used[name]
-        if not acts(used["local"], 0.0):
-            del used["local"]
+        for name in ("stretch", "local"):
+            if not acts(used[name], 0.0):
+                del used[name]
         return filter_look(image, operator=operator, **used)

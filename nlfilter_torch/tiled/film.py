@@ -160,6 +160,15 @@ class Frame(Tiled):
             lambda: average([Tiled.mean_of(other, fitted, function) for other in self.each_reference()])
         )
 
+    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        """Means of the least and largest values of the references."""
+
+        def found() -> tuple[Tensor, Tensor]:
+            least, largest = zip(*(Tiled.ends(other, planes) for other in self.each_reference()), strict=True)
+            return average(least), average(largest)
+
+        return self.cached_result(found)
+
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
         """The mean of a measurement over the references."""
         return self.cached_result(lambda: average([function(other) for other in self.each_reference()]))

@@ -17,6 +17,7 @@ from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.resizing import Read, block_means, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
+from nlfilter_torch.filtering.stretch import ends_of
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
@@ -229,6 +230,17 @@ class Tiled:
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
 
     @torch.no_grad()
+    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        """Least and largest values over all pixels."""
+
+        def part(tile: Tile) -> tuple[Tensor, Tensor]:
+            return ends_of(planes(self.pixels_of(tile)))
+
+        parts = list(self._map_tiles(part, 0, self.picture.statistics_rows, "Finding black and white"))
+        least, largest = (torch.cat(values, dim=2) for values in zip(*parts, strict=True))
+        return least.amin(2, keepdim=True), largest.amax(2, keepdim=True)
+
+    @torch.no_grad()
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of ``step`` pixels in both directions."""
         rows = max(1, self.picture.statistics_rows // step) * step
@@ -257,7 +269,7 @@ class Tiled:
         """The picture, reduced by means over blocks of an integer number of pixels along each axis, in memory.
 
         Raises:
-            MemoryError: if ``floats`` num_features for each of its pixels do not fit.
+            MemoryError: if ``floats`` numbers for each of its pixels do not fit.
         """
         needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
         if needed > self.passes.memory:
