@@ -28,17 +28,21 @@ def resized(
         rows: rows of the result, all by default.
         columns: columns of the result, all by default.
     """
-    return torch.cat([part() for part in resized_parts(read, size, wanted, rows, columns)], dim=2)
+    parts = resized_parts(lambda start, stop: partial(read, start, stop), size, wanted, rows, columns)
+    return torch.cat([part() for part in parts], dim=2)
 
 
 def resized_parts(
-    read: Read,
+    read: Callable[[int, int], Callable[[], Tensor]],
     size: tuple[int, int],
     wanted: tuple[int, int],
     rows: range | None = None,
     columns: range | None = None,
 ) -> Iterator[Callable[[], Tensor]]:
-    """Yield parts of :func:`resized`, a few rows each: rows are read here, and resized when the part is called."""
+    """Yield parts of :func:`resized`, a few rows each.
+
+    Rows are read here; the function that ``read`` returns for them is called when the part is.
+    """
     rows = range(wanted[0]) if rows is None else rows
     across = None if columns is None else interpolation(columns, size[1], wanted[1])
     for start in range(rows.start, rows.stop, BLOCK):
@@ -46,8 +50,9 @@ def resized_parts(
         yield partial(_part, read(used.start, used.stop), weights, across, wanted[1])
 
 
-def _part(planes: Tensor, weights: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
+def _part(rows: Callable[[], Tensor], weights: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
     """Interpolate rows from the rows of the picture that they depend on, and weights."""
+    planes = rows()
     if across is None:
         planes = F.interpolate(planes, (planes.shape[2], width), mode="bicubic", antialias=True)
     else:

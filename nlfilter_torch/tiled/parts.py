@@ -121,14 +121,13 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
         Rectangle(range(start, min(start + step, rows.stop)), around.columns)
         for start in range(rows.start, rows.stop, step)
     ]
-    landmarks = max((operator.kernel.landmarks.shape[2] for operator in tiled.operators), default=1)
     for operator in tiled.operators:
         operator.prepare()  # before several workers need it
 
     def planes_of(strip: Rectangle) -> Tensor:
         return fitted.pixels(pixels_of_part(tiled, strip))
 
-    planes = torch.cat(list(in_order(planes_of, strips, tiled.passes.workers(landmarks))), dim=2)
+    planes = torch.cat(list(in_order(planes_of, strips, tiled.passes.workers(tiled.num_landmarks))), dim=2)
     if fitted.finish is None:
         return planes
     inner = part.inside(around)

@@ -1,7 +1,8 @@
 """Pictures read a few rows at a time: memory maps, zarr arrays, tifffile files, anything that can be sliced."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -54,15 +55,24 @@ class Tile:
 
     Attributes:
         start: index of the first of them.
-        pixels: (1, C, h, W), C = 1 or 3, with the rows of the halo. Integers are scaled to [0, 1].
+        convert: computes :attr:`pixels`, in the thread that first needs them.
         halo: number of additional rows at the top and at the bottom.
         stored: (h, W, S), the rows themselves as they are stored.
     """
 
     start: int
-    pixels: Tensor
+    convert: Callable[[], Tensor]
     halo: tuple[int, int]
     stored: NDArray[Any]
+
+    @cached_property
+    def pixels(self) -> Tensor:
+        """The pixels (1, C, h, W), C = 1 or 3, with the rows of the halo. Integers are scaled to [0, 1].
+
+        Raises:
+            ValueError: if they are not finite.
+        """
+        return self.convert()
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -113,7 +123,7 @@ class Picture:
         """Read the rows from ``start`` to ``stop`` and up to ``margin`` more on both sides.
 
         Raises:
-            ValueError: if the source returns rows of another shape than declared, or floats that are not finite.
+            ValueError: if the source returns rows of another shape than declared.
         """
         first, last = max(start - margin, 0), min(stop + margin, self.size[0])
         stored = np.asarray(self.source[first:last])
@@ -124,6 +134,11 @@ class Picture:
                 f"{stored.shape} for {wanted}; make sure that nothing writes to it"
             )
         stored = stored.reshape(last - first, self.size[1], self.samples)
+        halo = (start - first, last - stop)
+        return Tile(start, partial(self._converted, stored), halo, stored[halo[0] : last - first - halo[1]])
+
+    def _converted(self, stored: NDArray[Any]) -> Tensor:
+        """The colours (1, C, h, W) of rows (h, W, S)."""
         values: NDArray[np.floating[Any]] = stored[..., : self.colours].astype(
             np.float64 if self.kind == "float64" else np.float32
         )
@@ -131,9 +146,7 @@ class Picture:
             values = values / np.float32(WHITE[self.kind])
         elif not np.isfinite(values).all():
             raise ValueError(f"{self.name} holds NaN or infinite pixels; replace them first")
-        planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
-        halo = (start - first, last - stop)
-        return Tile(start, planes, halo, stored[halo[0] : last - first - halo[1]])
+        return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
 
     def tiles(self, margin: int, rows: int) -> Iterator[Tile]:
         """Yield all rows, in tiles of ``rows``."""
@@ -188,12 +201,16 @@ class GuidePicture(Picture):
         stop = tile.start + tile.stored.shape[0]
         halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
         if self.stored is not None:
-            return Tile(tile.start, self.stored[:, :, tile.start - halo[0] : stop + halo[1]], halo, tile.stored)
+            seen = self.stored[:, :, tile.start - halo[0] : stop + halo[1]]
+            return Tile(tile.start, lambda: seen, halo, tile.stored)
         around = tuple(min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
-        rows = tile.pixels.shape[2]
-        image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]
-        seen = self.guide(image)[:, :, around[0] - halo[0] : image.shape[2] - around[1] + halo[1]]
-        return Tile(tile.start, seen, halo, tile.stored)
+
+        def guide() -> Tensor:
+            rows = tile.pixels.shape[2]
+            image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]
+            return self.guide(image)[:, :, around[0] - halo[0] : image.shape[2] - around[1] + halo[1]]
+
+        return Tile(tile.start, guide, halo, tile.stored)
 
 
 def stored_as(values: Tensor, kind: str) -> NDArray[Any]:

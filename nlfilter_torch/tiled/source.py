@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.pixels import part_of
-from nlfilter_torch.edits.resizing import Read, block_means, resized_parts
+from nlfilter_torch.edits.resizing import block_means, resized, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
 from nlfilter_torch.filtering.stretch import ends_of
@@ -159,24 +160,14 @@ class Tiled:
     @torch.no_grad()
     def resized(self, size: tuple[int, int]) -> "Tiled":
         """The picture in a smaller size, in memory, as another tiled source."""
-
-        def read(start: int, stop: int) -> Tensor:
-            self.passes.report("Reducing", start, self.size[0])
-            return self.picture.tile(start, stop, 0).pixels
-
-        planes = self._resized(read, size)[0].permute(1, 2, 0).numpy()
+        planes = self._resized(lambda tile: tile.pixels, size)[0].permute(1, 2, 0).numpy()
         passes = replace(self.plain, tile_rows=None)
         return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
 
     @torch.no_grad()
     def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
         """Planes (1, C, h, w) of all pixels in a smaller size."""
-
-        def read(start: int, stop: int) -> Tensor:
-            self.passes.report("Reducing", start, self.size[0])
-            return planes(self.pixels_of(self.picture.tile(start, stop, 0)))
-
-        return self._resized(read, size)
+        return self._resized(lambda tile: planes(self.pixels_of(tile)), size)
 
     @torch.no_grad()
     def resized_weights(self, weights: RowSource, size: tuple[int, int], name: str) -> RowSource:
@@ -194,11 +185,16 @@ class Tiled:
             ends.extend((float(rows.min()), float(rows.max())))
             return rows
 
-        found = self._resized(read, size)  # fills the list
+        found = resized(read, self.size, size)  # fills the list
         return found.clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
 
-    def _resized(self, read: Read, size: tuple[int, int]) -> Tensor:
-        """Resize rows, which ``read`` returns in the size of the picture."""
+    def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
+        """Resize planes of tiles, which are computed by several threads."""
+
+        def read(start: int, stop: int) -> Callable[[], Tensor]:
+            self.passes.report("Reducing", start, self.size[0])
+            return partial(planes, self.picture.tile(start, stop, 0))
+
         parts = resized_parts(read, self.size, size)
         return torch.cat(list(in_order(lambda part: part(), parts, self.passes.workers(1))), dim=2)
 
@@ -299,7 +295,7 @@ class Tiled:
         The height of tiles therefore does not affect results, although the rounding of a matrix product depends on its
         shape.
         """
-        width, step = self.size[1], self.passes.chunk_rows(self.size[1])
+        width, step = self.size[1], self.passes.chunk_rows(self.size[1], self.num_landmarks)
         features: dict[int, tuple[Tensor, ...]] = {}
 
         def features_of(operator: TiledOperator, part: int) -> Tensor:
@@ -315,6 +311,11 @@ class Tiled:
     def edited(self, fitted: Fitted, tile: Tile) -> Tensor:
         """The planes (1, C, h, W) that an edit computes from a tile, before ``finish``."""
         return torch.cat([fitted.pixels(part) for part in self.parts_of(tile)], dim=2)
+
+    @property
+    def num_landmarks(self) -> int:
+        """The most landmarks of a filter that an edit has fitted to the picture; 0 without one."""
+        return max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=0)
 
     @property
     def margin(self) -> int:
@@ -340,11 +341,9 @@ class Tiled:
             plain: whether rows are in the dtype of the computation, without transparency.
         """
         passes = replace(self.plain, processes=None) if plain else self.passes  # for an edit that is being fitted
-        landmarks = max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=1)
-        rows = self.passes.tile_rows or (
-            self.fitting_rows(0, landmarks) if self.operators else TILE_PIXELS // self.size[1]
-        )
-        together, workers = self.passes.chunk_rows(self.size[1]), self.passes.workers(landmarks)
+        landmarks = self.num_landmarks
+        rows = self.passes.tile_rows or (self.fitting_rows(0, landmarks) if landmarks else TILE_PIXELS // self.size[1])
+        together, workers = self.passes.chunk_rows(self.size[1], landmarks), self.passes.workers(landmarks)
         rows = max(1, rows // together) * together
         with single_threaded(workers):
             for operator in self.operators:

@@ -20,7 +20,8 @@ from nlfilter_torch.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
-CHUNK_PIXELS, LARGE_MEMORY = 1 << 14, 1 << 28  # pixels computed together, for speed, if that many bytes may be used
+# Pixels that are computed together, for speed, with columns of a filter and without, if that many bytes may be used.
+CHUNK_PIXELS, PLAIN_CHUNK_PIXELS, LARGE_MEMORY = 1 << 14, 1 << 16, 1 << 28
 Statistics = Literal["sample", "full"]
 TileEdit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
 
@@ -75,15 +76,19 @@ class Passes:
         """The options in another process, which reports nothing."""
         return self.__dict__ | {"report": in_silence, "processes": None}
 
-    def chunk_rows(self, width: int) -> int:
-        """Number of rows that are always computed together; the height of a tile is a multiple of it."""
-        return max(1, (CHUNK_PIXELS if self.memory >= LARGE_MEMORY else 1) // width)
+    def chunk_rows(self, width: int, num_landmarks: int) -> int:
+        """Number of rows that are always computed together; the height of a tile is a multiple of it.
+
+        Without a filter, ``num_landmarks`` is 0.
+        """
+        pixels = CHUNK_PIXELS if num_landmarks else PLAIN_CHUNK_PIXELS
+        return max(1, (pixels if self.memory >= LARGE_MEMORY else 1) // width)
 
     def workers(self, num_landmarks: int) -> int:
         """Number of tiles computed at once, each by its own thread: as many as memory allows."""
         if self.memory < LARGE_MEMORY:
             return 1
-        return max(1, min(self.threads, self.memory // (4 * factor_bytes(CHUNK_PIXELS, num_landmarks))))
+        return max(1, min(self.threads, self.memory // (4 * factor_bytes(CHUNK_PIXELS, max(1, num_landmarks)))))
 
     def stores_guide(self, guide_bytes: int) -> bool:
         """Whether a guide of ``guide_bytes`` bytes is kept from one pass to the next."""
@@ -215,7 +220,7 @@ def fill(target: RowTarget, rows: Rows) -> None:
 def bytes_needed(picture: Picture, passes: Passes, num_features: int, num_landmarks: int, extra_floats: int = 0) -> int:
     """Smallest memory in bytes for statistics and for rows; arguments as in :func:`rows_that_fit`."""
     size = picture.dtype.itemsize
-    workers, rows = passes.workers(num_landmarks), passes.chunk_rows(picture.size[1])
+    workers, rows = passes.workers(num_landmarks), passes.chunk_rows(picture.size[1], num_landmarks)
     factors = workers * factor_bytes(rows * picture.size[1], num_landmarks) // 4
     # First the pilot, with copies of its features and its factor; later the factors of both samples, and blocks.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
@@ -254,7 +259,7 @@ def rows_that_fit(
             f"{passes.memory / 1e6:.0f} MB may be used; allow more, or use fewer landmarks"
         )
     at_once = passes.workers(num_landmarks) if passes.processes is None else passes.processes.on_this_machine
-    tiles, together = 1 + max(1, at_once), passes.chunk_rows(picture.size[1]) * picture.size[1]
+    tiles, together = 1 + max(1, at_once), passes.chunk_rows(picture.size[1], num_landmarks) * picture.size[1]
     taken = picture.dtype.itemsize * extra_floats + (tiles - 1) * factor_bytes(together, num_landmarks)
     return max(1, min((passes.memory - taken) // (tiles * row), TILE_PIXELS // picture.size[1]))
 

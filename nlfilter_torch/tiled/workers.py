@@ -23,7 +23,8 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
 
     Args:
         function: called by several threads at once.
-        items: one more of them is in memory than there are workers.
+        items: up to twice as many as there are workers, and one more, are in memory, so that no worker waits for
+            another one that is slower.
         workers: number of threads, which share torch's threads for operations; 1 runs in the calling thread.
     """
     call = torch.no_grad()(function)
@@ -45,7 +46,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
         waiting: deque[Future[Result]] = deque()
         for item in items:
             waiting.append(pool.submit(call, item))
-            if len(waiting) > workers:
+            if len(waiting) > 2 * workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
