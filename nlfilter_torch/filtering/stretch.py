@@ -1,7 +1,7 @@
 """Automatic levels: brightness stretched to the whole range, from the darkest to the lightest pixel of a picture.
 
 There are three kinds: of luminance, which changes all channels alike; of the largest channel (value in HSV), which
-scales colours; and of each channel for itself. As in other programs, a single pixel can decide.
+scales colours; and of each channel for itself. As in other programs, single outliers set the range.
 """
 
 from dataclasses import dataclass
