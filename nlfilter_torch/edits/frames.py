@@ -10,10 +10,10 @@ from nlfilter_torch.core.checks import check_alpha, check_image, check_photograp
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.detail import activity, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.limits import Limits
+from nlfilter_torch.edits.limits import Balance, Limits
 from nlfilter_torch.edits.parameters import DETAIL
 from nlfilter_torch.edits.source import Fitted, Pixels, Source, luminance
-from nlfilter_torch.edits.viewing import fit_change, viewed_size
+from nlfilter_torch.edits.viewing import balance, fit_change, viewed_size
 from nlfilter_torch.filtering.fitted import fit_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
@@ -83,9 +83,9 @@ def filter_frames(
     DETAIL["viewing_size"].check_argument(viewing_size)
     # References are stacked vertically to one image, at the cost of a few patches across the seams.
     viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
-    reduced = [InMemory(frame.to(working_dtype(frame))).resized(viewed).image for frame in references]
-    grey = reduce_channels(torch.cat(reduced, dim=2), "luminance")
-    filtered = torch.cat(reduced, dim=2) if channels == "all" else grey
+    stacked = torch.cat([InMemory(f.to(working_dtype(f))).resized(viewed).image for f in references], dim=2)
+    grey = reduce_channels(stacked, "luminance")
+    filtered = stacked if channels == "all" else grey
     fitted = fit_filter(nonlocal_operator(grey, **options), filtered, order=alpha.shape[-1] - 1)
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
 
@@ -103,11 +103,18 @@ def filter_frames(
 
         return Fitted(of, lambda image, found, _: limit_by_activity(found, activity(image), threshold))
 
-    brighter = alpha[-1] - 1
+    whole = InMemory(stacked)
+
+    def common() -> Balance | None:
+        """The balance of all frames; if each had its own, the brightness of the film would flicker."""
+        return balance(whole, change(whole), limits, alpha[-1] - 1)
+
+    known = None if alpha.requires_grad else common()  # a gradient needs a graph for each frame
 
     def edit(frame: Tensor) -> Tensor:
         check_image(frame, "frames")
         source = InMemory(frame.to(working_dtype(frame)))
+        brighter = common() if alpha.requires_grad else known
         return source.all(fit_change(source, change, planes, viewing_size, limits, brighter=brighter)).to(frame.dtype)
 
     return map(edit, frames)

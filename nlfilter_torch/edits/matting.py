@@ -27,10 +27,10 @@ SIDE_RADIUS = 4  # radius over which the colours on each side of a border are av
 HALF_TRUST_SHARE = 0.02  # share of nearby pixels on one side at which the colour of that side is half trusted
 MIN_SIDE_WEIGHT = 1e-4  # smallest weight of a pixel on either side
 REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
-WINDOW_RADIUS, NOISE = 2, 1e-5  # radius of the windows in which masks are linear in colour; variance of noise
-LINEAR_LEVELS, LINEAR_STEPS = 2, 8  # of the second solve: levels of the pyramid, steps on each
+WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
+LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # of the second solve: levels of the pyramid, steps on each
 END_MARGIN = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
-SLOWEST = 0.03  # smallest eigenvalue that the steps of the second solve damp
+SLOWEST = 0.005  # smallest eigenvalue that the steps of the second solve damp
 # Confidence of the second solve in a rough mask of 0 or 1, and in scribbles.
 LINEAR_ROUGH_CONFIDENCE, LINEAR_SCRIBBLE_CONFIDENCE = 3e-3, 10.0
 

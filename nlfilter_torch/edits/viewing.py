@@ -73,7 +73,7 @@ def fit_change(
     size: float,
     limits: Limits,
     *,
-    brighter: float | Tensor | None = 0.0,
+    brighter: float | Tensor | Balance | None = 0.0,
 ) -> Fitted:
     """Fit an edit of a picture that is given by a change of its brightness at the viewing size.
 
@@ -83,8 +83,8 @@ def fit_change(
         planes: what is changed, luminance or all channels.
         size: the viewing size in megapixels; 0 is the size of the picture.
         limits: ``soft`` as :func:`limit`; ``none`` adds the change as it is.
-        brighter: intended relative increase of the mean brightness, by default 0; None corrects neither mean brightness
-            nor chroma.
+        brighter: intended relative increase of the mean brightness, by default 0; or the :func:`balance` of another
+            picture; None corrects neither mean brightness nor chroma.
     """
     small = viewed_size(source.size, size)
     if small == source.size:
@@ -98,7 +98,9 @@ def fit_change(
     return Fitted(lambda pixels: coarse.change(pixels.image, *found(pixels)))
 
 
-def within_limits(source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | None = 0.0) -> Fitted:
+def within_limits(
+    source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None = 0.0
+) -> Fitted:
     """The edit that applies a change of brightness to a picture; arguments as those of :func:`fit_change`."""
     fitted, balance = _limited(source, change, limits, brighter)
 
@@ -108,15 +110,20 @@ def within_limits(source: Reducible, change: Fitted, limits: Limits, brighter: f
     return fitted.then(changed)
 
 
+def balance(source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor) -> Balance | None:
+    """The balance of a picture under a change of its brightness; arguments as those of :func:`fit_change`."""
+    return _limited(source, change, limits, brighter)[1]
+
+
 def _limited(
-    source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | None
+    source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None
 ) -> tuple[Fitted, Balance | None]:
     """The change, limited, and the balance of the picture."""
     if limits == "none":
         return change, None
     fitted = change.then(limit)
-    if brighter is None:
-        return fitted, None
+    if brighter is None or isinstance(brighter, Balance):
+        return fitted, brighter
     cached = source.cached(fitted)
     return cached, balance_of(lambda function: source.mean_of(cached, function), brighter)
 
