@@ -44,6 +44,15 @@ def test_a_line_between_equal_greys_keeps_their_colours_apart() -> None:
     assert (redder[:, 32:] < 0).float().mean() > 0.97
 
 
+def test_shadows_and_highlights_of_a_coloured_object_get_less_chroma_than_its_midtones() -> None:
+    grey = torch.linspace(0.0, 1.0, 60).expand(1, 1, 40, 60)
+    dot = box(20, 30, 2, 2, size=(40, 60))
+    chroma = split_luminance(colorize(grey, paint(0.6, 0.5, 0.3, dot), dot, num_landmarks=40))[1][0].norm(dim=0)
+    assert chroma[20, 30] > 0.9 * chroma.max()
+    assert (chroma[:, [4, 55]] < 0.7 * chroma[:, 30:31]).all()
+    assert (chroma[:, [4, 55]] > 0.01).all()
+
+
 def test_one_pixel_and_all_pixels_may_be_painted() -> None:
     image = colour("chelsea", 40, 60)
     dot = box(20, 30, 1, 1, size=(40, 60))

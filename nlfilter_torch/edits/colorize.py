@@ -2,7 +2,8 @@
 
 Two estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart;
 :class:`LocalValues` relates pixels that are connected without an edge between them. Their errors are in different
-places, so that the mean is better than either.
+places, so that the mean is better than either. Both extend chroma relative to :func:`usual_chroma`, since shadows and
+highlights of an object have less than its midtones.
 """
 
 import math
@@ -32,6 +33,7 @@ from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source,
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
 from nlfilter_torch.filtering.masks import segment_mask
 from nlfilter_torch.filtering.scribbles import fit_strokes
+from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.spectrum import Spectrum
 
 Method = Literal["regression", "kmeans"]
@@ -60,6 +62,7 @@ class Stage:
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
 LOCAL_WEIGHT = 0.5  # weight of the local values on a stroke
+LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 
 
 @full_precision
@@ -82,8 +85,8 @@ def colorize(
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
     distances, then the residual near the strokes. Chroma propagated between neighbouring pixels up to edges is blended
-    in, with equal weight where strokes determine it. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides
-    the image into one segment per colour.
+    in, with equal weight where strokes determine it. Shadows and highlights get less chroma than midtones of the same
+    object. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides the image into one segment per colour.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
@@ -196,7 +199,7 @@ def fit_colorize(
         return _coloured(source, viewed, part_of(chroma[:, ::2]))
     step = block_size(small)
     guide = viewed.reduced(luminance, step)
-    wanted = wanted[:, ::2]  # green follows from red and blue
+    wanted = wanted[:, ::2] / usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)  # green follows from red and blue
     marks = [scribbles.places, scribbles.weights, wanted]
     local = viewed.kept("local", [guide, *marks], lambda: LocalValues.of(guide, step, small[1], *marks))
     parts = []
@@ -218,10 +221,17 @@ def fit_colorize(
 
     def chroma_of(some: Any) -> Tensor:
         alike = far(some) + near(some)
-        connected, influence = local(luminance(some), some.first)
-        return alike + LOCAL_WEIGHT * (connected - influence * alike)
+        own = luminance(some)
+        connected, influence = local(own, some.first)
+        return (alike + LOCAL_WEIGHT * (connected - influence * alike)) * usual_chroma(own)
 
     return _coloured(source, viewed, chroma_of)
+
+
+def usual_chroma(image: Tensor) -> Tensor:
+    """Usual chroma of pixels (B, 1 or 3, H, W) of one colour, (B, 1, H, W): largest halfway from black to white."""
+    own = reduce_channels(image, "luminance")
+    return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
 
 
 def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
