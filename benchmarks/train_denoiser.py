@@ -10,8 +10,9 @@ curve.png              the loss on validation crops;
 state.pt               the state of the training: the same command resumes a stopped training, and a larger number of
                        steps continues a finished one.
 
-``--plain`` trains the same network with a further convolution in place of the filter, for comparison. Equal arguments
-give equal weights on the same machine with the same number of threads.
+``--start FILE`` starts from trained weights, and raises the learning rate again. ``--plain`` trains the same network
+with a further convolution in place of the filter, for comparison. Equal arguments give equal weights on the same
+machine with the same number of threads.
 """
 
 import argparse
@@ -25,12 +26,15 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
+from safetensors import safe_open
+from safetensors.torch import save as as_bytes
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import Crops
 from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.nn.denoiser import PLANES, WIDTH, NonlocalDenoiser
+from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.plotting import save_figure
 
 BATCH = 6  # crops in a step
@@ -40,7 +44,7 @@ ADAM_RATE = 2e-3  # of Adam, for all other weights
 BANDWIDTH_RATE = 5.0  # factor on ADAM_RATE for bandwidths, which are scalars learned as logarithms
 EXPECTED = 0.55  # exponent with which the error of a denoiser grows with the noise
 WARM_UP = 200  # steps over which the learning rate rises
-FALL = 0.4  # final share of the steps, over which the rate falls to zero along half a cosine
+FALL = 0.4  # final share of the steps, over which the learning rate falls to zero along half a cosine
 LARGEST_GRADIENT = 0.5  # norm to which gradients are clipped
 MEAN_OVER = 500  # time constant of the running mean of the weights, in steps
 EVERY = 500  # steps between printed lines, points of the curve and saved states
@@ -73,11 +77,11 @@ def loss_of(denoised: Tensor, clean: Tensor, noisy: Tensor) -> Tensor:
     return (errors(denoised, clean) / (1 + errors(noisy, clean)) ** EXPECTED).mean()
 
 
-def rate_at(step: int, steps: int) -> float:
+def rate_at(step: int, steps: int, fall: float = FALL) -> float:
     """Learning rate at a step, relative to the full rate."""
     if step < WARM_UP:
         return (step + 1) / WARM_UP
-    passed = max(0.0, (step / steps - (1 - FALL)) / FALL)
+    passed = max(0.0, (step / steps - (1 - fall)) / fall)
     return 0.5 + 0.5 * float(torch.cos(torch.tensor(torch.pi * min(1.0, passed))))
 
 
@@ -102,12 +106,25 @@ class Training:
         side: of crops, in pixels.
         half: whether convolutions run in bfloat16.
         rate: of Muon, for kernels of convolutions.
+        start: file of the initial weights; None draws them.
+        fall: final share of the steps, over which the learning rate falls to zero.
     """
 
     def __init__(
-        self, seed: int, *, plain: bool = False, side: int = SIDE, half: bool = False, rate: float = RATE
+        self,
+        seed: int,
+        *,
+        plain: bool = False,
+        side: int = SIDE,
+        half: bool = False,
+        rate: float = RATE,
+        start: Path | None = None,
+        fall: float = FALL,
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed).to(memory_format=torch.channels_last)
+        if start is not None:
+            shapes = {name: tuple(value.shape) for name, value in self.model.named_parameters()}
+            self.model.load_state_dict(read_weights(start, shapes))
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
         named = dict(self.model.named_parameters())
         bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []
@@ -125,7 +142,7 @@ class Training:
             torch.optim.Adam([{"params": others}, {"params": bandwidths}], lr=rate),
         ]
         self.rates = (rate, ADAM_RATE, BANDWIDTH_RATE * ADAM_RATE)
-        self.half = half
+        self.half, self.fall = half, fall
         self.crops = Crops(side, seed)
         aside = Crops(side, ASIDE_SEED)
         self.aside = [aside.batch(ASIDE, grey=grey) for grey in (True, False)]
@@ -144,7 +161,7 @@ class Training:
         number = len(self.losses)
         groups = [group for optimizer in self.optimizers for group in optimizer.param_groups]
         for group, rate in zip(groups, self.rates, strict=True):
-            group["lr"] = rate * rate_at(number, steps)
+            group["lr"] = rate * rate_at(number, steps, self.fall)
         clean, noisy, told = self.crops.batch(BATCH, grey=number % 2 == 0)
         loss = loss_of(self.denoise(self.model, noisy, told), clean, noisy)
         self.model.zero_grad()
@@ -206,8 +223,6 @@ class Training:
 
 def save(folder: Path, training: Training, figures: dict[str, Any]) -> None:
     """Write weights, results and the curve, each file atomically."""
-    from safetensors.torch import save as as_bytes
-
     weights = {name: value.contiguous() for name, value in training.mean.module.state_dict().items()}
     with open_beside(folder / "denoiser.safetensors") as stream:
         stream.write(as_bytes(weights, {name: str(value) for name, value in figures.items()}))
@@ -233,6 +248,10 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--side", type=int, default=SIDE, help="of crops, in pixels; default %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of weights, crops and noise; default %(default)s")
     parser.add_argument("--rate", type=float, default=RATE, help="of Muon, for convolutions; default %(default)s")
+    parser.add_argument(
+        "--fall", type=float, default=FALL, help="final share of the steps, with a falling rate; default %(default)s"
+    )
+    parser.add_argument("--start", type=Path, metavar="FILE", help="initial weights; default: drawn at random")
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
     parser.add_argument(
         "--half", action="store_true", help="convolutions in bfloat16, fast where the processor has AMX"
@@ -247,6 +266,10 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--seed must not be negative, got {options.seed}; 0 will do")
     if not 0 < options.rate < 1:
         parser.error(f"--rate must be between 0 and 1, got {options.rate}; {RATE} does well")
+    if not 0 < options.fall <= 1:
+        parser.error(f"--fall must be above 0 and at most 1, got {options.fall}; {FALL} does well")
+    if options.start is not None and not options.start.is_file():
+        parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
     if options.out.exists() and not options.out.is_dir():
         parser.error(f"--out must be a folder, got the file {options.out}; name another")
     return options
@@ -256,7 +279,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train, and save the results."""
     options = read_options(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    training = Training(options.seed, plain=options.plain, side=options.side, half=options.half, rate=options.rate)
+    training = Training(
+        options.seed,
+        plain=options.plain,
+        side=options.side,
+        half=options.half,
+        rate=options.rate,
+        start=options.start,
+        fall=options.fall,
+    )
     state = options.out / "state.pt"
     if state.exists():
         training.load(torch.load(state, weights_only=True))
@@ -264,8 +295,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parameters = sum(parameter.numel() for parameter in training.model.parameters())
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
     training.run(options.steps, options.out)
-    figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "plain", "half")}
+    figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "plain", "half")}
     figures |= {"weights": parameters, "seconds": round(training.seconds), "loss": round(training.curve[-1], 4)}
+    if options.start is not None:
+        with safe_open(options.start, "pt") as weights:
+            figures["start"] = weights.metadata()
     save(options.out, training, figures)
     print(f"{options.out / 'denoiser.safetensors'}: {figures['loss']} grey levels on crops set aside")
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from benchmarks import denoising, denoising_tables, train_denoiser
 from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
@@ -71,6 +72,24 @@ def test_the_command_writes_weights_figures_and_a_curve_and_goes_on(
     assert "taken up at step 2" in capsys.readouterr().out
     second = NonlocalDenoiser.trained(folder / "denoiser.safetensors")
     assert not torch.equal(first.guide.weight, second.guide.weight)
+
+
+@pytest.mark.parametrize("more", [[], ["--plain"]])
+def test_a_training_starts_from_weights_of_another(more: list[str], tmp_path: Path) -> None:
+    main(["--steps", "2", "--side", "16", "--out", str(tmp_path / "first"), *more])
+    start = tmp_path / "first" / "denoiser.safetensors"
+    begun = Training(1, side=16, start=start, plain=bool(more))
+    for name, value in load_file(start).items():
+        torch.testing.assert_close(begun.model.state_dict()[name], value, rtol=0, atol=0)
+    main(["--steps", "1", "--side", "20", "--start", str(start), "--out", str(tmp_path), *more])
+    figures = json.loads((tmp_path / "denoiser.json").read_text())
+    assert (figures["start"]["side"], figures["start"]["steps"], figures["side"]) == ("16", "2", 20)
+
+
+def test_a_larger_share_of_the_steps_has_a_falling_rate() -> None:
+    rates = [rate_at(step, 1000, 0.75) for step in range(1000)]
+    assert rates[250] == 1 > rates[252]
+    assert rates[-1] < 1e-4
 
 
 def test_the_rate_rises_stays_and_falls() -> None:
@@ -174,6 +193,8 @@ def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> 
         (["--side", "130"], "--side must be 16 to 128, got 130"),
         (["--seed", "-1"], "--seed must not be negative, got -1"),
         (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
+        (["--fall", "0"], "--fall must be above 0 and at most 1, got 0"),
+        (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
         (["--steps", "many"], "--steps: invalid int value: 'many'"),
     ],
 )

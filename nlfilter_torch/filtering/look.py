@@ -121,9 +121,8 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
         "local": lambda: last == (STRENGTHS,),
     }
     if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
-        raise ValueError(
-            f"{name} must have the shape {shapes[name]}, or that for each of {batch} images, got {shape}; reshape it"
-        )
+        each = f", or that for each of {batch} images" if batch > 1 else ""
+        raise ValueError(f"{name} must have the shape {shapes[name]}{each}, got {shape}; reshape it, or add values")
 
 
 def acts(gains: Tensor, idle: float = 1.0) -> bool:
