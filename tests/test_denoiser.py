@@ -188,10 +188,10 @@ def test_gradients_of_float64_are_those_of_differences() -> None:
     point = image.clone().requires_grad_()
     (weights * model(point, 0.1)).sum().backward()
     assert point.grad is not None
-    step = 1e-6
+    step = 1e-8  # small, since a pixel near the border of two clusters may change to the other
     with torch.no_grad():
         ends = [(weights * model(image + sign * step * direction, 0.1)).sum() for sign in (1, -1)]
-    assert float((point.grad * direction).sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=2e-3)
+    assert float((point.grad * direction).sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-5)
 
 
 def test_precisions() -> None:
