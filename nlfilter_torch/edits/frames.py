@@ -105,16 +105,16 @@ def filter_frames(
 
     whole = InMemory(stacked)
 
-    def common() -> Balance | None:
+    def shared_balance() -> Balance | None:
         """The balance of all frames; if each had its own, the brightness of the film would flicker."""
         return balance(whole, change(whole), limits, alpha[-1] - 1)
 
-    known = None if alpha.requires_grad else common()  # a gradient needs a graph for each frame
+    constant = None if alpha.requires_grad else shared_balance()  # a gradient needs a graph for each frame
 
     def edit(frame: Tensor) -> Tensor:
         check_image(frame, "frames")
         source = InMemory(frame.to(working_dtype(frame)))
-        brighter = common() if alpha.requires_grad else known
+        brighter = shared_balance() if alpha.requires_grad else constant
         return source.all(fit_change(source, change, planes, viewing_size, limits, brighter=brighter)).to(frame.dtype)
 
     return map(edit, frames)
