@@ -2,8 +2,8 @@
 
 Two estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart;
 :class:`LocalValues` relates pixels that are connected without an edge between them. Their errors are in different
-places, so that the mean is better than either. Both extend chroma relative to :func:`usual_chroma`, since shadows and
-highlights of an object have less than its midtones.
+places, so that the mean is better than either. The regression extends chroma relative to :func:`usual_chroma`, since
+shadows and highlights of an object have less than its midtones.
 """
 
 import math
@@ -199,9 +199,10 @@ def fit_colorize(
         return _coloured(source, viewed, part_of(chroma[:, ::2]))
     step = block_size(small)
     guide = viewed.reduced(luminance, step)
-    wanted = wanted[:, ::2] / usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)  # green follows from red and blue
+    wanted = wanted[:, ::2]  # green follows from red and blue
     marks = [scribbles.places, scribbles.weights, wanted]
     local = viewed.kept("local", [guide, *marks], lambda: LocalValues.of(guide, step, small[1], *marks))
+    wanted = wanted / usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
@@ -220,10 +221,10 @@ def fit_colorize(
     far, near = parts
 
     def chroma_of(some: Any) -> Tensor:
-        alike = far(some) + near(some)
         own = luminance(some)
+        alike = (far(some) + near(some)) * usual_chroma(own)
         connected, influence = local(own, some.first)
-        return (alike + LOCAL_WEIGHT * (connected - influence * alike)) * usual_chroma(own)
+        return alike + LOCAL_WEIGHT * (connected - influence * alike)
 
     return _coloured(source, viewed, chroma_of)
 

@@ -1,9 +1,9 @@
 """Propagation of values from scribbles to neighbouring pixels, up to changes of luminance.
 
 The values solve a linear system over the eight neighbours of each pixel, as in Levin, Lischinski and Weiss,
-"Colorization using Optimization" (2004), with these differences: the system is symmetric; the local variance of
-luminance that scales the differences has an upper limit, since it is large at edges; and the influence of scribbles
-falls to zero far from them and behind edges.
+"Colorization using Optimization" (2004), with these differences: the system is symmetric; differences in luminance are
+not relative to the local variance, which is large at edges; and the influence of scribbles falls to zero far from them
+and behind edges.
 
 The system is solved on the picture reduced to about :data:`SOLVED` pixels, so that its cost does not grow with the
 size. The values of a pixel are then a mean over the four nearest blocks, weighted by similarity of luminance. They
@@ -14,18 +14,16 @@ import math
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.filtering.neighbours import neighbour_weights, solve_neighbours
-from nlfilter_torch.operator.features import pad_border
 
 SOLVED = 1 << 14  # pixels
-# Limits of the variance that squared differences of luminance are divided by, and least weight of a neighbour.
-MIN_VARIANCE, MAX_VARIANCE, MIN_WEIGHT = 0.007**2, 0.042**2, 1e-5
+SAME = 0.007  # difference in luminance at which the weight of a neighbour falls to a quarter
+SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference of a pixel from a block, and least weight of a block
 SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
 # Distance at which the influence falls to 1/e in flat areas, relative to the square root of the area.
-DECAY_DISTANCE = 1.0
+DECAY_DISTANCE = 2.0
 TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-10}
 
 
@@ -57,9 +55,7 @@ class LocalValues:
         sums = sums.unflatten(2, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
         anchor = sums[:, -1:] + 3 / (DECAY_DISTANCE**2 * rows * columns)
-        links = neighbour_weights(
-            guide, lambda squared: torch.exp(-squared) + MIN_WEIGHT, variance=local_variance(guide)
-        )
+        links = neighbour_weights(guide, lambda squared: (1 + squared / SAME**2) ** -2)
         solved = solve_neighbours(links, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
         return LocalValues(solved, guide, step, width)
 
@@ -90,7 +86,7 @@ class LocalValues:
             near = blocks[..., column]  # rows of which are then copied whole
             for row, row_share in rows:
                 guide, values = near[:, :, row - first].tensor_split([1], dim=1)
-                alike = torch.exp((own - guide).square() / -MAX_VARIANCE) + MIN_WEIGHT
+                alike = torch.exp((own - guide).square() / -(SAME_BLOCK**2)) + MIN_WEIGHT
                 share = row_share.unsqueeze(1) * column_share * alike
                 total, weight = torch.addcmul(total, share, values), weight + share
         return total / weight
@@ -107,10 +103,3 @@ class LocalValues:
 def block_size(size: tuple[int, int]) -> int:
     """Side in pixels of the blocks of a picture (H, W)."""
     return max(1, round(math.sqrt(size[0] * size[1] / SOLVED)))
-
-
-def local_variance(guide: Tensor) -> Tensor:
-    """Variance over 3x3 pixels, clamped to the limits, (B, 1, H, W)."""
-    moments = F.avg_pool2d(pad_border(torch.cat([guide, guide.square()], dim=1), 1), 3, stride=1)
-    mean, square = moments.split(1, dim=1)
-    return (square - mean.square()).clamp(MIN_VARIANCE, MAX_VARIANCE)

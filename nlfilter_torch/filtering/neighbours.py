@@ -35,14 +35,12 @@ SIDES = tuple(_sides(offset) for offset in OFFSETS)
 PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from pixels with such a neighbour to all pixels
 
 
-def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor], *, variance: Tensor | None = None) -> Tensor:
+def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tensor:
     """Compute weights between neighbours from their squared distances.
 
     Args:
         guide: (B, C, H, W).
         weight: function of squared distances (B, h, w), summed over the channels.
-        variance: (B, 1, H, W), positive; squared distances are divided by the geometric mean of the variances of both
-            pixels. None means 1.
 
     Returns:
         (B, 4, H, W): weights of each pixel with its neighbour at each of :data:`OFFSETS`, 0 where there is none.
@@ -50,8 +48,6 @@ def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor], *, vari
     weights = []
     for (here, there), padding in zip(SIDES, PADDING, strict=True):
         distance = (guide[..., *here] - guide[..., *there]).square().sum(1)
-        if variance is not None:
-            distance = distance / (variance[:, 0, *here] * variance[:, 0, *there]).sqrt()
         weights.append(F.pad(weight(distance), padding))
     return torch.stack(weights, dim=1)
 
