@@ -205,6 +205,20 @@ def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch
     np.testing.assert_allclose(found.flatten(), stretched, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["coffee", "chelsea", "astronaut"])
+def test_the_second_solve_is_the_same_in_float32(name: str) -> None:
+    image = (255 * colour(name, 110, 130)).round() / 255
+    front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
+    rough = region_mask(image, front, back, num_landmarks=40)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        some, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
+        functions = matting.solve_linear(matting.linear_models(some), *masks)
+        assert functions.dtype == dtype
+        found.append(matting.linear_mask(some - 0.5, functions[:, 0]))
+    torch.testing.assert_close(found[0].double(), found[1], atol=2e-3, rtol=0)
+
+
 @pytest.mark.parametrize("step", [1, 3])
 def test_rows_of_enlarged_blocks_are_those_of_the_whole(step: int) -> None:
     blocks = noise(1, 2, 7, 5)

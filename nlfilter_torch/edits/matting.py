@@ -27,7 +27,7 @@ SIDE_RADIUS = 4  # radius over which the colours on each side of a border are av
 HALF_TRUST_SHARE = 0.02  # share of nearby pixels on one side at which the colour of that side is half trusted
 MIN_SIDE_WEIGHT = 1e-4  # smallest weight of a pixel on either side
 REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
-WINDOW_RADIUS, NOISE = 2, 1e-5  # radius of the windows in which masks are linear in colour; variance of noise
+WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
 LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # of the second solve: levels of the pyramid, steps on each
 END_MARGIN = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
 SLOWEST = 0.005  # smallest eigenvalue that the steps of the second solve damp
@@ -108,6 +108,9 @@ def jacobi(found: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps:
 class LinearMasks:
     """Masks that are a linear function of colour in every window of a picture; windows overlap.
 
+    In flat windows the functions are steep, so that float32 would not be exact: small rounding errors of the sums over
+    a window are divided by the variance of its colours.
+
     Attributes:
         image: the image minus 0.5, (B, C, H, W).
         share: 1 divided by the number of pixels of the window around each pixel, (1, 1, H, W).
@@ -122,16 +125,20 @@ class LinearMasks:
 
     @staticmethod
     def of(image: Tensor) -> "LinearMasks":
-        """The model of an image (B, C, H, W)."""
-        image = image - 0.5
+        """The model of an image (B, C, H, W), in float64."""
+        image = image.double() - 0.5
         count = image.shape[1]
         share = 1 / window_sums(torch.ones_like(image[:1, :1]))
         mean = share * window_sums(image)
         products = (image.unsqueeze(1) * image.unsqueeze(2)).flatten(1, 2)
         product = (share * window_sums(products)).unflatten(1, (count, count))
-        covariance = (product - mean.unsqueeze(1) * mean.unsqueeze(2)).permute(0, 3, 4, 1, 2).double()
+        covariance = (product - mean.unsqueeze(1) * mean.unsqueeze(2)).permute(0, 3, 4, 1, 2)
         inverse = torch.linalg.inv(covariance + NOISE * torch.eye(count).to(covariance))
-        return LinearMasks(image, share, mean, inverse.to(image).permute(0, 3, 4, 1, 2).contiguous())
+        return LinearMasks(image, share, mean, inverse.permute(0, 3, 4, 1, 2).contiguous())
+
+    def to(self, like: Tensor) -> "LinearMasks":
+        """The model in the dtype of a tensor."""
+        return LinearMasks(self.image.to(like), self.share.to(like), self.mean.to(like), self.inverse.to(like))
 
     def fit(self, mask: Tensor) -> Tensor:
         """Fit the linear functions (B, C+1, H, W) of a mask (B, 1, H, W), averaged over all windows around a pixel.
@@ -194,16 +201,17 @@ def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front:
         ]
         found = torch.cat(masks, dim=1)
     assert found is not None  # for mypy
-    functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0)) for mask in found.split(1, 1)], dim=1)
+    functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in found.split(1, 1)], dim=1)
     slopes, rest = functions.tensor_split([-1], dim=2)
-    return torch.cat([slopes, rest - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)
+    return (torch.cat([slopes, rest - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)).to(found)
 
 
 def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
     """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S being :meth:`LinearMasks.smoothed`.
 
     The eigenvalues of the preconditioned system lie in [0, 1]; error components with an eigenvalue below
-    :data:`SLOWEST` are left to coarser levels.
+    :data:`SLOWEST` are left to coarser levels. Only the first residual is computed in float64: the others follow from
+    it by steps that get smaller, and so do their rounding errors.
 
     Args:
         model: the linear model of the picture.
@@ -212,16 +220,15 @@ def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> T
         trust: c, the confidence.
     """
     middle, half = (1 + SLOWEST) / 2, (1 - SLOWEST) / 2
-    ratio, step = half / middle, torch.zeros(())
-    for number in range(LINEAR_STEPS):
-        residual = (model.smoothed(mask) + target) / (1 + trust) - mask
-        if number == 0:
-            step = residual / middle
-        else:
-            following = 1 / (2 * middle / half - ratio)
-            step = following * ratio * step + 2 * following / half * residual
-            ratio = following
-        mask = mask + step
+    residual = ((model.smoothed(mask.double()) + target) / (1 + trust) - mask).to(mask)
+    model, damping = model.to(mask), 1 / (1 + trust)
+    ratio, step = half / middle, residual / middle
+    mask = mask + step
+    for _ in range(LINEAR_STEPS - 1):
+        residual = residual + damping * model.smoothed(step) - step
+        following = 1 / (2 * middle / half - ratio)
+        step = following * ratio * step + 2 * following / half * residual
+        ratio, mask = following, mask + step
     return mask
 
 
