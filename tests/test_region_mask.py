@@ -219,17 +219,22 @@ def test_the_second_solve_is_the_same_in_float32(name: str) -> None:
     torch.testing.assert_close(found[0].double(), found[1], atol=2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("step", [1, 3])
-def test_rows_of_enlarged_blocks_are_those_of_the_whole(step: int) -> None:
+@pytest.mark.parametrize("step", [1, 3, 2.5])
+def test_parts_of_enlarged_blocks_are_those_of_the_whole(step: float) -> None:
     blocks = noise(1, 2, 7, 5)
-    whole = enlarged(blocks, step, (0, 0), (7 * step - step // 2, 5 * step - step // 2))
-    for first, count in ((0, 4), (3, 3), (5, 2 * step)):
-        rows = enlarged(blocks, step, (first, 0), (count, whole.shape[3]))
-        torch.testing.assert_close(rows, whole[:, :, first : first + count][:, :, : rows.shape[2]])
-        part = enlarged(blocks, step, (first, first), (count, 4))
-        torch.testing.assert_close(part, rows[..., first:][..., : part.shape[3]])
-    middles = whole[:, :, step // 2 :: step, step // 2 :: step]
-    torch.testing.assert_close(middles, blocks[:, :, : middles.shape[2], : middles.shape[3]])
+    height, width = int(7 * step), int(5 * step)
+    whole = enlarged(blocks, step, (0, 0), (height, width))
+    for row, column, h, w in ((0, 0, 4, width), (3, 2, 3, 1), (5, 1, height - 5, width - 1), (height - 1, 0, 1, 2)):
+        part = enlarged(blocks, step, (row, column), (h, w))
+        torch.testing.assert_close(part, whole[:, :, row : row + h, column : column + w])
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_enlarged_blocks_are_interpolated_bilinearly(step: int) -> None:
+    blocks = noise(1, 2, 7, 5)
+    whole = enlarged(blocks, step, (0, 0), (7 * step, 5 * step))
+    expected = torch.nn.functional.interpolate(blocks, scale_factor=step, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(whole, expected)
 
 
 def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,23 +122,25 @@ def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[i
         corner: row and column of the first pixel of the part.
         size: (h, w) of the part.
     """
-    if step != round(step):
-        across = (
-            _linear_weights(first, n, step, m) for first, n, m in zip(corner, size, blocks.shape[-2:], strict=True)
-        )
-        rows, columns = (weights.to(blocks) for weights in across)
-        return rows @ blocks @ columns.mT
-    step = round(step)
-    low, left = (max(0, first // step - 1) for first in corner)
-    high, right = ((first + count - 1) // step + 2 for first, count in zip(corner, size, strict=True))
-    part = blocks[:, :, low:high, left:right]
-    if step > 1:
-        part = F.interpolate(part, scale_factor=step, mode="bilinear", align_corners=False)
-    return part[:, :, corner[0] - low * step :, corner[1] - left * step :][:, :, : size[0], : size[1]]
+    above, below, share_below = _nearest_blocks(corner[0], size[0], step, blocks.shape[2])
+    left, right, share_right = _nearest_blocks(corner[1], size[1], step, blocks.shape[3])
+    first, last = int(above[0]), int(below[-1])
+    used = blocks[:, :, first : last + 1]
+    columns = _interpolated(used, 3, left, right, share_right)
+    return _interpolated(columns, 2, above - first, below - first, share_below.unsqueeze(1))
 
 
-def _linear_weights(first: int, count: int, step: float, blocks: int) -> Tensor:
-    """Weights (count, blocks) of the blocks along an axis for ``count`` pixels from ``first`` on."""
+def _nearest_blocks(first: int, count: int, step: float, blocks: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices of the two blocks nearest to each of ``count`` pixels from ``first`` on, and weights of the second ones.
+
+    Pixels beyond the centre of the first or the last block take its value.
+    """
     position = ((torch.arange(first, first + count, dtype=torch.float64) + 0.5) / step - 0.5).clamp(0, blocks - 1)
-    distance = (position.unsqueeze(1) - torch.arange(blocks, dtype=torch.float64)).abs()
-    return (1 - distance).clamp(min=0.0)
+    before = position.long()
+    return before, (before + 1).clamp(max=blocks - 1), position - before
+
+
+def _interpolated(values: Tensor, axis: int, before: Tensor, after: Tensor, share: Tensor) -> Tensor:
+    device = values.device
+    start, end = (values.index_select(axis, indices.to(device)) for indices in (before, after))
+    return start.lerp_(end, share.to(values))
