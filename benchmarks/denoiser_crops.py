@@ -42,10 +42,13 @@ class Crops:
     Args:
         side: of the crops, in pixels.
         seed: of all random numbers.
+        textured: share of crops with an added texture.
+        turned: share of crops that are turned by any angle and stretched, not only by right angles.
     """
 
-    def __init__(self, side: int, seed: int) -> None:
+    def __init__(self, side: int, seed: int, *, textured: float = 0.0, turned: float = 0.0) -> None:
         self.side, self.generator = side, torch.Generator().manual_seed(seed)
+        self.textured, self.turned = textured, turned
         self.pictures: list[Tensor] = []
         weights = []
         for name, weight in PICTURES.items():
@@ -81,6 +84,8 @@ class Crops:
         crop = self._pattern() if self._chance(0.08) else self._cut()
         if self._chance(0.15):
             crop = self._blend(crop, self._cut())
+        if self.textured and self._chance(self.textured):
+            crop = self._add_texture(crop)
         crop = self._as_grey(crop) if grey else self._as_colour(crop)
         if self._chance(0.4):
             crop = crop.clamp(0, 1) ** self._number(0.6, 1.5)
@@ -92,9 +97,28 @@ class Crops:
     def _cut(self) -> Tensor:
         """A crop (C, side, side), rotated and mirrored at random."""
         picture = self.pictures[int(torch.multinomial(self.weights, 1, generator=self.generator))]
-        row, column = (self._below(length - self.side + 1) for length in picture.shape[-2:])
-        crop = torch.rot90(picture[:, row : row + self.side, column : column + self.side], self._below(4), (1, 2))
+        if self.turned and self._chance(self.turned):
+            crop = self._turn(picture)
+        else:
+            row, column = (self._below(length - self.side + 1) for length in picture.shape[-2:])
+            crop = torch.rot90(picture[:, row : row + self.side, column : column + self.side], self._below(4), (1, 2))
         return crop.flip(2) if self._chance(0.5) else crop
+
+    def _turn(self, picture: Tensor) -> Tensor:
+        """A crop at any angle, reduced by up to a half, and by up to a quarter more along one of its sides."""
+        angle, stretch = self._number(0, 2 * math.pi), self._number(-0.12, 0.12)
+        reduction = math.exp(self._number(0, math.log(2)))
+        down, across = (torch.tensor([math.cos(turn), math.sin(turn)]) for turn in (angle, angle + math.pi / 2))
+        offsets = (torch.arange(self.side) - (self.side - 1) / 2) * reduction
+        places = (offsets * math.exp(stretch))[:, None, None] * down + (offsets / math.exp(stretch))[:, None] * across
+        half = places.abs().amax((0, 1))  # (rows, columns)
+        sides = torch.tensor(picture.shape[-2:])
+        room = (sides - 1 - 2 * half).clamp(min=0.0)
+        places = places + half.clamp(max=(sides - 1) / 2) + room * self._random(2)
+        grid = (2 * places / (sides - 1) - 1).flip(2)[None]
+        # Bicubic interpolation between pixels twice as far apart as the crop's aliases little: photographs are smooth.
+        crop = F.grid_sample(picture[None], grid, mode="bicubic", padding_mode="reflection", align_corners=True)
+        return crop[0].clamp(0, 1)
 
     def _blend(self, first: Tensor, second: Tensor) -> Tensor:
         """Blend two crops, or put them side by side with a soft or sharp border."""
@@ -121,6 +145,35 @@ class Crops:
         else:
             return (0.5 + 0.25 * smooth).clamp(0, 1)
         return torch.lerp(colours[0], colours[1], share)
+
+    def _add_texture(self, crop: Tensor) -> Tensor:
+        """Add a texture like grass, gravel or grain of wood, everywhere or in part of the crop."""
+        texture = self._texture(1)
+        if self._chance(0.5):
+            colours = self._number() * self._texture(3) if self._chance(0.3) else 0.0
+            texture = (0.3 + self._random(3, 1, 1)) * texture + colours
+        if self._chance(0.5):
+            texture = texture * (self._smooth(1, 2 + self._below(3)) * self._number(2, 20) + 0.5).clamp(0, 1)
+        contrast = math.exp(self._number(math.log(2 / 255), math.log(40 / 255)))
+        return (crop + contrast * texture).clamp(0, 1)
+
+    def _texture(self, planes: int) -> Tensor:
+        """Gaussian textures (planes, side, side) of unit variance, with one random spectrum.
+
+        They may be coarse or fine, striped, and longer in one direction than in the other.
+        """
+        rows, columns = torch.fft.fftfreq(self.side)[:, None], torch.fft.rfftfreq(self.side)
+        angle = self._number(0, math.pi)
+        along = columns * math.cos(angle) + rows * math.sin(angle)
+        across = rows * math.cos(angle) - columns * math.sin(angle)
+        middle = self._number(0.05, 0.45) if self._chance(0.4) else 0.0
+        width = math.exp(self._number(math.log(0.03), math.log(0.7)))
+        longer = math.exp(self._number(0, math.log(10))) if self._chance(0.6) else 1.0
+        distance = ((along.abs() - middle).square() + (longer * across).square()) / width**2
+        spectrum = torch.fft.rfft2(torch.randn(planes, self.side, self.side, generator=self.generator))
+        shape = (self.side, self.side)
+        texture: Tensor = torch.fft.irfft2(spectrum * (1 + distance) ** -self._number(0.5, 2), shape)
+        return (texture - texture.mean((1, 2), keepdim=True)) / texture.std((1, 2), keepdim=True).clamp(min=1e-6)
 
     def _smooth(self, planes: int, count: int) -> Tensor:
         """Smooth random planes (planes, side, side), interpolated from ``count`` x ``count`` standard normal values."""

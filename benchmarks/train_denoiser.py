@@ -40,8 +40,8 @@ from nlfilter_torch.plotting import save_figure
 BATCH = 6  # crops in a step
 SIDE = 64  # pixels of a crop
 RATE = 4e-3  # of Muon, for the kernels of the convolutions
-ADAM_RATE = 2e-3  # of Adam, for all other weights
-BANDWIDTH_RATE = 5.0  # factor on ADAM_RATE for bandwidths, which are scalars learned as logarithms
+ADAM_RATE = 0.5  # of Adam, for all other weights, relative to that of Muon
+BANDWIDTH_RATE = 2.5  # of Adam, for bandwidths, which are scalars learned as logarithms, likewise
 EXPECTED = 0.55  # exponent with which the error of a denoiser grows with the noise
 WARM_UP = 200  # steps over which the learning rate rises
 FALL = 0.4  # final share of the steps, over which the learning rate falls to zero along half a cosine
@@ -105,9 +105,11 @@ class Training:
         plain: whether to train the network without the filter.
         side: of crops, in pixels.
         half: whether convolutions run in bfloat16.
-        rate: of Muon, for kernels of convolutions.
+        rate: of Muon, for kernels of convolutions; those of Adam are in proportion.
         start: file of the initial weights; None draws them.
         fall: final share of the steps, over which the learning rate falls to zero.
+        textured: share of crops with an added texture.
+        turned: share of crops that are turned by any angle and stretched.
     """
 
     def __init__(
@@ -120,6 +122,8 @@ class Training:
         rate: float = RATE,
         start: Path | None = None,
         fall: float = FALL,
+        textured: float = 0.0,
+        turned: float = 0.0,
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed).to(memory_format=torch.channels_last)
         if start is not None:
@@ -141,10 +145,10 @@ class Training:
             ),
             torch.optim.Adam([{"params": others}, {"params": bandwidths}], lr=rate),
         ]
-        self.rates = (rate, ADAM_RATE, BANDWIDTH_RATE * ADAM_RATE)
+        self.rates = (rate, ADAM_RATE * rate, BANDWIDTH_RATE * rate)
         self.half, self.fall = half, fall
-        self.crops = Crops(side, seed)
-        aside = Crops(side, ASIDE_SEED)
+        self.crops = Crops(side, seed, textured=textured, turned=turned)
+        aside = Crops(side, ASIDE_SEED, textured=textured, turned=turned)
         self.aside = [aside.batch(ASIDE, grey=grey) for grey in (True, False)]
         self.losses: list[float] = []
         self.curve: list[float] = []
@@ -252,6 +256,12 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--fall", type=float, default=FALL, help="final share of the steps, with a falling rate; default %(default)s"
     )
     parser.add_argument("--start", type=Path, metavar="FILE", help="initial weights; default: drawn at random")
+    parser.add_argument(
+        "--textured", type=float, default=0.0, help="share of crops with an added texture; default %(default)s"
+    )
+    parser.add_argument(
+        "--turned", type=float, default=0.0, help="share of crops turned by any angle; default %(default)s"
+    )
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
     parser.add_argument(
         "--half", action="store_true", help="convolutions in bfloat16, fast where the processor has AMX"
@@ -268,6 +278,10 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rate must be between 0 and 1, got {options.rate}; {RATE} does well")
     if not 0 < options.fall <= 1:
         parser.error(f"--fall must be above 0 and at most 1, got {options.fall}; {FALL} does well")
+    for name in ("textured", "turned"):
+        share = getattr(options, name)
+        if not 0 <= share <= 1:
+            parser.error(f"--{name} must be 0 to 1, got {share}; it is a share of the crops")
     if options.start is not None and not options.start.is_file():
         parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
     if options.out.exists() and not options.out.is_dir():
@@ -287,6 +301,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rate=options.rate,
         start=options.start,
         fall=options.fall,
+        textured=options.textured,
+        turned=options.turned,
     )
     state = options.out / "state.pt"
     if state.exists():
@@ -294,7 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"taken up at step {len(training.losses)}")
     parameters = sum(parameter.numel() for parameter in training.model.parameters())
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
-    figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "plain", "half")}
+    figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "textured", "turned", "plain", "half")}
     if options.start is not None:
         with safe_open(options.start, "pt") as weights:
             figures["start"] = weights.metadata()
