@@ -310,7 +310,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"taken up at step {len(training.losses)}")
     parameters = sum(parameter.numel() for parameter in training.model.parameters())
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
-    figures = {name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "textured", "turned", "plain", "half")}
+    figures = {
+        name: getattr(options, name)
+        for name in ("steps", "side", "seed", "rate", "fall", "textured", "turned", "plain", "half")
+    }
     if options.start is not None:
         with safe_open(options.start, "pt") as weights:
             figures["start"] = weights.metadata()

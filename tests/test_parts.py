@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from nlfilter_torch.edits.applying import fit_step
+from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled import recipe as whole_edit
@@ -58,7 +59,8 @@ def test_a_part_is_that_of_the_whole(
 ) -> None:
     if "sample" in options:  # and in blocks, like a large picture
         monkeypatch.setattr("nlfilter_torch.edits.mask.SOLVED", 2000)
-        monkeypatch.setattr("nlfilter_torch.edits.local_values.SOLVED", 2000)
+        for kind, links in (("ABSOLUTE", ABSOLUTE), ("RELATIVE", RELATIVE)):
+            monkeypatch.setattr(f"nlfilter_torch.edits.colorize.{kind}", replace(links, pixels=2000))
         monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP_PIXELS", 1000)
     source, passes = rows_of(cat(5)), Passes("float32", folder=tmp_path, **options)
     wanted = whole(EDITS[name], source, passes)

@@ -1,9 +1,10 @@
 """Colouring of a grey photograph from a few strokes of colour. Paper: Sec. V-B, Fig. 16.
 
-Two estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart;
-:class:`LocalValues` relates pixels that are connected without an edge between them. Their errors are in different
-places, so that the mean is better than either. The regression extends chroma relative to :func:`usual_chroma`, since
-shadows and highlights of an object have less than its midtones.
+Three estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart; two
+:class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
+errors are in different places, so that the mean is better than each, above all if an estimate far from the other two
+counts less. The regression extends chroma relative to :func:`usual_chroma`, since shadows and highlights of an object
+have less than its midtones; propagation between neighbours, relative to its square root.
 """
 
 import math
@@ -24,7 +25,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
 from nlfilter_torch.edits.in_memory import edited
-from nlfilter_torch.edits.local_values import LocalValues, block_size
+from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
@@ -61,7 +62,8 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
-LOCAL_WEIGHT = 0.5  # weight of the local values on a stroke
+WEIGHTS = 1.0, 1.0, 1.5  # of the regression, and of neighbours by absolute and by relative differences
+SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 
 
@@ -84,9 +86,10 @@ def colorize(
     """Colour a grey image from strokes; its luminance is kept.
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
-    distances, then the residual near the strokes. Chroma propagated between neighbouring pixels up to edges is blended
-    in, with equal weight where strokes determine it. Shadows and highlights get less chroma than midtones of the same
-    object. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides the image into one segment per colour.
+    distances, then the residual near the strokes. Two estimates by propagation between neighbouring pixels up to edges
+    are blended in; the estimate that differs most from the other two counts least. Shadows and highlights get less
+    chroma than midtones of the same object. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides the image
+    into one segment per colour.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
@@ -197,12 +200,18 @@ def fit_colorize(
         pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
         return _coloured(source, viewed, part_of(chroma[:, ::2]))
-    step = block_size(small)
-    guide = viewed.reduced(luminance, step)
     wanted = wanted[:, ::2]  # green follows from red and blue
-    marks = [scribbles.places, scribbles.weights, wanted]
-    local = viewed.kept("local", [guide, *marks], lambda: LocalValues.of(guide, step, small[1], *marks))
-    wanted = wanted / usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
+
+    usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
+    marks = [scribbles.places, scribbles.weights, wanted / usual_there.sqrt()]
+
+    def propagated(links: Links) -> LocalValues:
+        step = links.step(small)
+        guide = viewed.reduced(luminance, step)
+        return viewed.kept(links, [guide, *marks], lambda: LocalValues.of(links, guide, step, small[1], *marks))
+
+    absolute, relative = propagated(ABSOLUTE), propagated(RELATIVE)
+    wanted = wanted / usual_there
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
@@ -219,12 +228,17 @@ def fit_colorize(
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
         del operator  # frees its factor before the next one is computed
     far, near = parts
+    everywhere = torch.as_tensor(strength, dtype=source.dtype).reshape(-1, 1, 1, 1)
 
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
-        alike = (far(some) + near(some)) * usual_chroma(own)
-        connected, influence = local(own, some.first)
-        return alike + LOCAL_WEIGHT * (connected - influence * alike)
+        usual = usual_chroma(own)
+        connected, influence = absolute(own, some.first)
+        around, _ = relative(own, some.first)
+        alike = (far(some) + near(some)) * usual
+        around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
+        connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
+        return agreed_mean([alike, connected, around])
 
     return _coloured(source, viewed, chroma_of)
 
@@ -233,6 +247,18 @@ def usual_chroma(image: Tensor) -> Tensor:
     """Usual chroma of pixels (B, 1 or 3, H, W) of one colour, (B, 1, H, W): largest halfway from black to white."""
     own = reduce_channels(image, "luminance")
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
+
+
+def agreed_mean(estimates: list[Tensor]) -> Tensor:
+    """Mean of three estimates (B, C, H, W): the weight of each falls with its distance from the other two."""
+    first, second, third = (
+        (one - other).square().sum(1, keepdim=True)
+        for one, other in zip(estimates, estimates[1:] + estimates[:1], strict=True)
+    )
+    distances = (first + third, first + second, second + third)  # squared, from both others
+    shares = [weight * (d + SAME_CHROMA**2).rsqrt() for weight, d in zip(WEIGHTS, distances, strict=True)]
+    weighted = [share * estimate for share, estimate in zip(shares, estimates, strict=True)]
+    return torch.stack(weighted).sum(0) / torch.stack(shares).sum(0)
 
 
 def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:

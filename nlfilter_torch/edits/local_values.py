@@ -1,30 +1,71 @@
 """Propagation of values from scribbles to neighbouring pixels, up to changes of luminance.
 
-The values solve a linear system over the eight neighbours of each pixel, as in Levin, Lischinski and Weiss,
-"Colorization using Optimization" (2004), with these differences: the system is symmetric; differences in luminance are
-not relative to the local variance, which is large at edges; and the influence of scribbles falls to zero far from them
-and behind edges.
+The values solve a linear system over the eight neighbours of each pixel. Two kinds of weights relate neighbours:
 
-The system is solved on the picture reduced to about :data:`SOLVED` pixels, so that its cost does not grow with the
-size. The values of a pixel are then a mean over the four nearest blocks, weighted by similarity of luminance. They
-depend only on the pixel's own luminance and position, so that tiles are exact.
+- :data:`ABSOLUTE` weights fall with the difference in luminance;
+- :data:`RELATIVE` ones compare the difference with the variance around the pixel, as in Levin, Lischinski and Weiss,
+  "Colorization using Optimization" (2004). Pixels at an edge depend on both sides, but those beside it hardly on them.
+
+The influence of scribbles falls to zero far from them and behind edges. The system is solved on the picture reduced to
+a limited number of pixels, so that its cost does not grow with the size. The values of a pixel are then a mean over the
+four nearest blocks, weighted by similarity of luminance. They depend only on the pixel's own luminance and position, so
+that tiles are exact.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.filtering.neighbours import neighbour_weights, solve_neighbours
+from nlfilter_torch.filtering.neighbours import solve_stencil
 
-SOLVED = 1 << 14  # pixels
-SAME = 0.007  # difference in luminance at which the weight of a neighbour falls to a quarter
+SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
+SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 3e-5  # squared differences at which a relative weight falls to 1/e
+MIN_RELATIVE = 1e-6  # relative weight of the least similar neighbour
 SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference of a pixel from a block, and least weight of a block
 SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
 # Distance at which the influence falls to 1/e in flat areas, relative to the square root of the area.
 DECAY_DISTANCE = 2.0
-TOLERANCE = {torch.float32: 1e-3, torch.float64: 1e-10}
+MIN_INFLUENCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Links:
+    """A way to relate neighbouring pixels.
+
+    Attributes:
+        weights: function of the differences in luminance of the neighbours from a pixel, and of whether these are in
+            the picture, both (B, 9, h, w) with the pixel itself in the middle, which counts as not in the picture.
+            The result sums to 8 in flat areas.
+        pixels: number to which the picture is reduced.
+    """
+
+    weights: Callable[[Tensor, Tensor], Tensor]
+    pixels: int
+
+    def step(self, size: tuple[int, int]) -> int:
+        """Side in pixels of the blocks of a picture (H, W)."""
+        return max(1, round(math.sqrt(size[0] * size[1] / self.pixels)))
+
+
+def _absolute(difference: Tensor, inside: Tensor) -> Tensor:
+    return inside * (1 + difference.square() / SAME**2) ** -2
+
+
+def _relative(difference: Tensor, inside: Tensor) -> Tensor:
+    squared, count = difference.square(), inside.sum(1, keepdim=True)
+    mean = difference.sum(1, keepdim=True) / (count + 1)
+    variance = squared.sum(1, keepdim=True) / (count + 1) - mean.square()
+    nearest = torch.where(inside > 0, squared, torch.inf).amin(1, keepdim=True)
+    distance = (squared - torch.where(count > 0, nearest, 0.0)) / (SHARE_OF_VARIANCE * variance).clamp(MIN_VARIANCE)
+    alike = inside * (torch.exp(-distance.clamp(0.0, 80.0)) + MIN_RELATIVE)
+    return 8 * alike / alike.sum(1, keepdim=True).clamp(min=MIN_RELATIVE)
+
+
+ABSOLUTE, RELATIVE = Links(_absolute, 1 << 14), Links(_relative, 1 << 15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +87,9 @@ class LocalValues:
     width: int
 
     @staticmethod
-    def of(guide: Tensor, step: int, width: int, places: Tensor, weights: Tensor, values: Tensor) -> "LocalValues":
+    def of(
+        links: Links, guide: Tensor, step: int, width: int, places: Tensor, weights: Tensor, values: Tensor
+    ) -> "LocalValues":
         """Solve for scribbled pixels with row-major indices (n,), weights (B, 1, n) and values (B, C, n)."""
         rows, columns = guide.shape[2:]
         blocks = places // width // step * columns + places % width // step
@@ -55,12 +98,15 @@ class LocalValues:
         sums = sums.unflatten(2, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
         anchor = sums[:, -1:] + 3 / (DECAY_DISTANCE**2 * rows * columns)
-        links = neighbour_weights(guide, lambda squared: (1 + squared / SAME**2) ** -2)
-        solved = solve_neighbours(links, anchor, sums / anchor, tolerance=TOLERANCE[guide.dtype])
-        return LocalValues(solved, guide, step, width)
+        around, inside = (F.unfold(planes, 3, padding=1) for planes in (guide, torch.ones_like(guide[:1])))
+        inside[:, 4] = 0.0  # the pixel itself
+        alike = links.weights((around - guide.flatten(2)) * inside, inside).unflatten(2, (rows, columns))
+        own = alike.sum(1, keepdim=True) + anchor
+        stencil = torch.cat([-alike[:, :4], own, -alike[:, 5:]], dim=1).unflatten(1, (3, 3))
+        return LocalValues(solve_stencil(stencil, sums), guide, step, width)
 
     def __call__(self, own: Tensor, first: int) -> tuple[Tensor, Tensor]:
-        """Return values times influence (B, C, h, w), and influence (B, 1, h, w) in [0, 1], of a rectangle of pixels.
+        """Return mean values (B, C, h, w) of scribbles, and their influence (B, 1, h, w) in [0, 1], for a rectangle.
 
         The influence is the square root of the interpolated solution for ones.
 
@@ -69,8 +115,8 @@ class LocalValues:
             first: row-major index of the first pixel.
         """
         found = self._at(own, *divmod(first, self.width))
-        influence = found[:, -1:].clamp(min=1e-6).sqrt()
-        return found[:, :-1] / influence, influence
+        influence = found[:, -1:].clamp(min=MIN_INFLUENCE)
+        return found[:, :-1] / influence, influence.sqrt()
 
     def _at(self, own: Tensor, top: int, left: int) -> Tensor:
         """Interpolate the solutions (B, C+1, h, w) in a rectangle."""
@@ -98,8 +144,3 @@ class LocalValues:
         share = (position - before).to(like)
         number = before.long()
         return [(number.clamp(0, blocks - 1), 1 - share), ((number + 1).clamp(0, blocks - 1), share)]
-
-
-def block_size(size: tuple[int, int]) -> int:
-    """Side in pixels of the blocks of a picture (H, W)."""
-    return max(1, round(math.sqrt(size[0] * size[1] / SOLVED)))
