@@ -7,7 +7,7 @@ look has, and how strong a ridge keeps them close to the identity, is chosen by 
 picture if there is one. A curve is kept from falling by a least-squares problem with bounds.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -127,19 +127,15 @@ class Sums:
         gram: of the columns, (3, F, F), in float64.
         cross: of columns and change, (3, F).
         power: of the change, (3,).
-        count: of the pixels, (3,).
     """
 
     gram: Tensor
     cross: Tensor
     power: Tensor
-    count: Tensor
 
     def __add__(self, other: "Sums") -> "Sums":
         """Of both."""
-        return Sums(
-            self.gram + other.gram, self.cross + other.cross, self.power + other.power, self.count + other.count
-        )
+        return Sums(self.gram + other.gram, self.cross + other.cross, self.power + other.power)
 
     def left(self, coefficients: Tensor) -> float:
         """Squares of the change that coefficients (3, F) leave."""
@@ -161,40 +157,31 @@ def sample(weights: Tensor) -> Tensor:
     return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
 
 
-def columns_of(
-    image: Tensor, bands: Tensor, texture: Tensor, stretch: Tensor, local: Tensor, layers: Tensor, layout: Layout
-) -> Tensor:
+def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> Tensor:
     """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
         image: pixels (3, P) before the edit.
-        bands: of them, (3, 7, P).
-        texture: of them, (6, P).
-        stretch: changes by automatic levels, (3, 3, P).
-        local: changes by local tone curves, (3, 8, P).
-        layers: of luminance, (k+1, P).
+        weighed: by the part of the look that weighs them: ``bands`` (3, 7, P) and ``texture`` (6, P) of the pixels,
+            changes of them by ``stretch`` (3, 3, P) and by ``local`` curves (3, 8, P), and layers of luminance,
+            ``alpha``, (k+1, P).
         layout: of the columns.
     """
     colours = image.double()  # the columns nearly depend on each other
     knots = torch.arange(layout.knots).to(colours).view(-1, 1)
     hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
-    spread = [values.double().expand(3, -1, -1) for values in (colours, texture, layers)]
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    own = [values.double() for values in (bands, stretch, local)]
-    return torch.cat([hats, spread[0], below, own[0], spread[1], *own[1:], spread[2]], dim=1)
+    columns = {"curves": hats, "matrix": colours, "saturation": below, **weighed}
+    return torch.cat([columns[part].double().expand(3, -1, -1) for part in layout.lengths], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
     """The sums of columns (3, F, P), the change (3, P) and weights (3, P) of some pixels."""
     columns, change, weights = (values.double() for values in (columns, change, weights))
     weighed = columns * weights.unsqueeze(1)
-    return Sums(
-        weighed @ columns.mT,
-        (weighed @ change.unsqueeze(2)).squeeze(2),
-        (weights * change.square()).sum(1),
-        weights.sum(1),
-    )
+    cross = (weighed @ change.unsqueeze(2)).squeeze(2)
+    return Sums(weighed @ columns.mT, cross, (weights * change.square()).sum(1))
 
 
 @dataclass(frozen=True)
