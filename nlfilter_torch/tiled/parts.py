@@ -19,13 +19,12 @@ from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, RowSource
 from nlfilter_torch.tiled.sampling import ColumnCache, Report, in_silence
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.strokes import strokes_by_rows
-from nlfilter_torch.tiled.tiles import Passes, Statistics
+from nlfilter_torch.tiled.tiles import Passes, Statistics, intermediate
 from nlfilter_torch.tiled.workers import in_order
 
 STRIP_PIXELS = 1 << 15  # pixels of a rectangle that one worker computes at a time

@@ -102,14 +102,8 @@ class Tiled:
             MemoryError: if not even one row fits, or the samples do not.
         """
         check_scribble_memory(self.picture, self.scribbled_pixels, num_features, self.passes.memory)
-        return rows_that_fit(
-            self.picture,
-            self.passes,
-            floats=self.tile_floats + num_features,
-            num_features=num_features,
-            num_landmarks=num_landmarks,
-            extra_floats=self.cached_floats + self.stored_floats(num_features),
-        )
+        floats, kept = self.tile_floats + num_features, self.cached_floats + self.stored_floats(num_features)
+        return rows_that_fit(self.picture, self.passes, floats, num_features, num_landmarks, kept)
 
     def stored_floats(self, num_features: int) -> int:
         """Floats of stored guides, and of scribbles with ``num_features`` features per pixel."""
