@@ -10,8 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import stages, steps
-from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, working_bytes
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.io.photographs import (
     Photograph,

@@ -49,9 +49,9 @@ def mask(
     """See :data:`MASK`."""
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.progress import stages, steps
-    from nlfilter_torch.core.memory import working_bytes
     from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.edits.mask import fit_mask, region_mask
+    from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
     from nlfilter_torch.io.photographs import Photograph, check_file, check_memory, check_output, write_photograph
