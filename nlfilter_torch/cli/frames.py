@@ -88,13 +88,14 @@ def frames(
     """
     recipe = chosen_recipe(context, edit, preset, given)
 
-    from nlfilter_torch.cli.editing import tile_limit
+    from nlfilter_torch.cli.editing import allowed_memory
     from nlfilter_torch.io.films import is_film
+    from nlfilter_torch.io.rows import TILED
     from nlfilter_torch.tiled.film import FilmEdit, film_steps
     from nlfilter_torch.tiled.tiles import Passes
 
     film_steps(recipe)
-    passes = Passes("float32", memory=tile_limit(memory))
+    passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
     def fit(samples: list[Any]) -> FilmEdit:
         return FilmEdit(recipe, samples, passes, seed=seed)
