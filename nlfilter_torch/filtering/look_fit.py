@@ -256,12 +256,8 @@ def _choose(
 def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: float = 0.0) -> Tensor:
     """Coefficients (3, F) of the look of some parts that explains most.
 
-    Args:
-        sums: of pairs.
-        parts: of the look.
-        layout: of the columns.
-        ridge: weight of the distance from the identity.
-        stiff: least such weight for tone curves and saturation, which few pictures have every value of.
+    ``ridge`` is the weight of the distance from the identity, ``stiff`` the least one for tone curves and saturation,
+    which few pictures have every value of.
     """
     spread = layout.spread(parts)
     gram, cross = _products(sums, spread)

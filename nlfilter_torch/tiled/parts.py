@@ -134,12 +134,7 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
 
 
 class Stage:
-    """A picture between two steps of an edit, and the step last fitted to it.
-
-    Args:
-        picture: rows.
-        stack: closes its temporary file.
-    """
+    """A picture between two steps of an edit, and the step last fitted to it; ``stack`` closes its temporary file."""
 
     def __init__(self, picture: Picture, stack: ExitStack) -> None:
         self.picture, self._stack = picture, stack
@@ -176,12 +171,7 @@ class Stage:
 
 
 class Parts:
-    """Edited rectangles of a picture, and the steps as fitted to the whole picture.
-
-    Args:
-        source: rows.
-        name: of the source, for error messages.
-    """
+    """Edited rectangles of a picture, and the steps as fitted to the whole picture; ``name`` is for error messages."""
 
     def __init__(self, source: RowSource, name: str) -> None:
         self._stages = [Stage(Picture(source, name), ExitStack())]
