@@ -7,7 +7,7 @@ look has, and how strong a ridge keeps them close to the identity, is chosen by 
 picture if there is one. A curve is kept from falling by a least-squares problem with bounds.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -105,18 +105,27 @@ class Layout:
         start = sum(list(self.lengths.values())[: names.index(part)])
         return slice(start, start + self.lengths[part])
 
+    def parameters(self, parts: Parts) -> Iterator[tuple[str, slice, slice]]:
+        """The parameters of some parts, one after the other: the part, its channels, and places of its parameters.
+
+        A part may have parameters of its own for each channel.
+        """
+        start = 0
+        for part in parts:
+            length = self.lengths["curves" if part == "tone" else part]
+            each = [slice(c, c + 1) for c in range(3)] if part in ("curves", "matrix") else [slice(3)]
+            for channels in each:
+                yield part, channels, slice(start, start + length)
+                start += length
+
     def spread(self, parts: Parts) -> Tensor:
         """From the parameters of some parts to the coefficients (3, F, P) of the columns of every channel."""
-        found = []
-        for part in parts:
-            place = self.place("curves" if part == "tone" else part)
-            count, own = place.stop - place.start, part in ("curves", "matrix")
-            ones = torch.zeros(3, self.columns, count * (3 if own else 1), dtype=torch.float64)
-            for channel in range(3):
-                first = channel * count if own else 0
-                ones[channel, place, first : first + count] = torch.eye(count, dtype=torch.float64)
-            found.append(ones)
-        return torch.cat(found, dim=2)
+        every = list(self.parameters(parts))
+        found = torch.zeros(3, self.columns, every[-1][2].stop, dtype=torch.float64)
+        for part, channels, place in every:
+            columns = self.place("curves" if part == "tone" else part)
+            found[channels, columns, place] = torch.eye(place.stop - place.start, dtype=torch.float64)
+        return found
 
 
 @dataclass(frozen=True)
@@ -301,17 +310,11 @@ def _penalties(gram: Tensor, parts: Parts, layout: Layout) -> tuple[Tensor, Tens
     Those of tone curves and saturation are apart.
     """
     free, bent = torch.diag(gram.diagonal()), torch.zeros_like(gram)
-    start = 0
-    curved = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
-    for part in parts:
-        curves, length = curved.get(part, (0, 0))
-        for _ in range(curves):
-            place = slice(start, start + length)
+    for part, _, place in layout.parameters(parts):
+        if part in ROUGHNESS:
             free[place, place] = 0.0
-            bent[place, place] = gram.diagonal()[place].mean() * _distance(length, ROUGHNESS[part])
-            start += length
-        if not curves:
-            start += layout.lengths[part] * (3 if part == "matrix" else 1)
+            weights = _distance(place.stop - place.start, ROUGHNESS[part])
+            bent[place, place] = gram.diagonal()[place].mean() * weights
     return free, bent
 
 
@@ -331,15 +334,11 @@ def _floor(gram: Tensor) -> Tensor:
 def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: Layout) -> Tensor:
     """Parameters (P,) of the least squares under which no curve falls."""
     free = torch.linalg.solve(gram, cross)
-    rows, start = [], 0
-    for part in parts:
-        for _ in range({"tone": 1, "curves": 3}.get(part, 0)):
-            rises = torch.zeros(layout.knots - 1, len(cross), dtype=gram.dtype)
-            rises[:, start : start + layout.knots] = torch.eye(layout.knots, dtype=gram.dtype).diff(dim=0)
-            rows.append(rises)
-            start += layout.knots
-        if part not in ("tone", "curves"):
-            start += layout.lengths[part] * (3 if part == "matrix" else 1)
+    rows = []
+    for part, _, place in layout.parameters(parts):
+        if part in CURVED:
+            rows.append(torch.zeros(layout.knots - 1, len(cross), dtype=gram.dtype))
+            rows[-1][:, place] = torch.eye(layout.knots, dtype=gram.dtype).diff(dim=0)
     if not rows:
         return free
     rises = torch.cat(rows)
