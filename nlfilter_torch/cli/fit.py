@@ -42,7 +42,6 @@ ENOUGH = 0.8  # share that is to be explained
 AMPLIFIED = 4  # what is left, in the preview
 SQUARE = 16  # pixels, of places that an edit is looked for in
 FEW, MOST = 0.1, 0.5  # of these places, and of what is left, for an edit to be called local
-PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff")
 CALLED = {
     "alpha": "sliders",
     "bands": "gains of blurs",
@@ -159,7 +158,9 @@ def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -
 
 
 def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PHOTOGRAPHS
+    from nlfilter_torch.io.photographs import SUFFIXES
+
+    return path.suffix.lower() in SUFFIXES
 
 
 def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import plain_step, preset_option, step_of, with_options
+from nlfilter_torch.cli.edits import DETAIL_OPTIONS, plain_step, preset_option, step_of, with_options
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
-DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
 BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
 
 Frames = Annotated[
