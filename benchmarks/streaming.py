@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from benchmarks.memory import MIB, forget_peak, resident
 from nlfilter_torch import nonlocal_operator, polynomial_filter
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.steps import working_bytes
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_detail
 from nlfilter_torch.tiled.pictures import Picture

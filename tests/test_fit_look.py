@@ -132,11 +132,11 @@ def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.M
     found = photograph.regions_of_sample()
     assert found is not None
     (some,) = found
-    assert some.layers.shape == (4, 2000)
+    assert some.weighed["alpha"].shape == (4, 2000)
     assert float(some.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
     exact = photograph.layers[:, some.places]
-    assert torch.allclose(some.layers.sum(0), exact.sum(0), atol=1e-5)
-    assert bool(((some.layers - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
+    assert torch.allclose(some.weighed["alpha"].sum(0), exact.sum(0), atol=1e-5)
+    assert bool(((some.weighed["alpha"] - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
     masks = torch.ones(1, *CAT.shape[-2:])
     assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
 

@@ -11,13 +11,12 @@ import torch
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, region_mask, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.parameters import CRISP, EDITS
 from nlfilter_torch.edits.presets import PRESETS, Preset, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, working_bytes
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.build import nonlocal_operator

@@ -161,7 +161,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
         def write(self, _: bytes) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("nlfilter_torch.tiled.intermediate.TemporaryFile", lambda **_: Full())
+    monkeypatch.setattr("nlfilter_torch.tiled.tiles.TemporaryFile", lambda **_: Full())
     sentence = "No space left on device, for a temporary file of 0.0 GB between two steps of the edit"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)

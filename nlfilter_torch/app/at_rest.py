@@ -1,14 +1,13 @@
 """The picture of a page at rest: what a file would hold, in place of the preview."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 from torch import Tensor
 
-from nlfilter_torch.app.closeup import OutdatedError, interrupted
+from nlfilter_torch.app.closeup import OutdatedError, Run, Start, interrupted
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.edits.recipe import Recipe
@@ -19,19 +18,12 @@ QUIET = 1.0  # seconds without a change, after which the whole photograph is edi
 class AtRest:
     """Replaces the preview by the photograph under the edit, reduced, once nothing has changed for a second.
 
-    Args:
-        run: runs something in a thread while the page says what it does; see ``Editor``.
-        start: starts a task in the background, and reports its failure.
-        wanted: whether a session and its current edit are what the page shows as a preview.
-        show: shows the result.
+    ``wanted`` says whether a session and its current edit are what the page shows as a preview, ``show`` shows the
+    result.
     """
 
     def __init__(
-        self,
-        run: Callable[[str, Callable[[], Any], Progress], Awaitable[Any]],
-        start: Callable[[Awaitable[None]], None],
-        wanted: Callable[[Session], bool],
-        show: Callable[[Tensor], None],
+        self, run: Run, start: Start, wanted: Callable[[Session], bool], show: Callable[[Tensor], None]
     ) -> None:
         self._run, self._start, self._wanted, self._show = run, start, wanted, show
         self._working = False

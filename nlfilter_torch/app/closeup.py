@@ -20,6 +20,10 @@ KEPT = 24_000_000  # pixels of all pieces; those that are not seen go first
 LARGEST = 40_000_000  # pixels that a page may ask for at once
 
 
+Run = Callable[[str, Callable[[], Any], Progress], Awaitable[Any]]  # in a thread, while the page says what it does
+Start = Callable[[Awaitable[None]], None]  # a task in the background, whose failure is reported
+
+
 class OutdatedError(Exception):
     """The edit has changed meanwhile."""
 
@@ -38,18 +42,10 @@ def interrupted(report: Report, is_outdated: Callable[[], bool]) -> Report:
 class Closeup:
     """What of a photograph a page shows at full size.
 
-    Args:
-        run: runs something in a thread while the page says what it does; see ``Editor``.
-        start: starts a task in the background, and reports its failure.
-        tell: runs JavaScript in the page.
+    ``tell`` runs JavaScript in the page.
     """
 
-    def __init__(
-        self,
-        run: Callable[[str, Callable[[], Any], Progress], Awaitable[Any]],
-        start: Callable[[Awaitable[None]], None],
-        tell: Callable[[str], object],
-    ) -> None:
+    def __init__(self, run: Run, start: Start, tell: Callable[[str], object]) -> None:
         self.session: Session | None = None
         self._run, self._start, self._tell = run, start, tell
         self._view: Rectangle | None = None

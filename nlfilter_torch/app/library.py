@@ -5,7 +5,6 @@ from pathlib import Path
 from threading import Lock
 from weakref import WeakValueDictionary
 
-from nlfilter_torch.app.preview import PIXELS
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.sidecar import ENDING, Sidecar
 
@@ -18,20 +17,18 @@ class Library:
     Args:
         folder: where files are saved.
         photographs: where photographs lie beside which edits are kept; None is ``folder``.
-        pixels: largest number of pixels of a preview.
     """
 
-    def __init__(self, folder: Path, photographs: Path | None = None, pixels: int = PIXELS) -> None:
+    def __init__(self, folder: Path, photographs: Path | None = None) -> None:
         self.folder = folder
         self.photographs = folder if photographs is None else photographs
-        self._pixels = pixels
         self._sessions: WeakValueDictionary[tuple[str, float], Session] = WeakValueDictionary()
         self._latest: Session | None = None  # a page that is loaded again leaves its photograph for a moment
         self._lock = Lock()
 
     def new(self) -> Session:
         """A session without a photograph."""
-        return Session(self.folder, self._pixels)
+        return Session(self.folder)
 
     def open(self, path: Path) -> Session:
         """The session of a file; raises as :meth:`Session.open`."""

@@ -29,7 +29,7 @@ from nlfilter_torch.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.io.rows import WHOLE, tile_memory
+from nlfilter_torch.io.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.sampling import Report, in_silence
@@ -274,7 +274,7 @@ class Session:
         height, width = photograph.size
         statistics: Statistics = "full" if width * height <= SMALL else "sample"
         kind = str(photograph.pixels.numpy().dtype)
-        return Passes(kind, statistics, memory=tile_memory(), report=report, folder=self.folder)
+        return Passes(kind, statistics, memory=usual_memory(TILED), report=report, folder=self.folder)
 
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""

@@ -10,7 +10,7 @@ import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.apply import apply
-from nlfilter_torch.cli.edits import edit_photograph, plain_step, preset_option, step_of, with_options
+from nlfilter_torch.cli.edits import DETAIL_OPTIONS, edit_photograph, plain_step, preset_option, step_of, with_options
 from nlfilter_torch.cli.interrupts import INTERRUPTED
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, find_recipe
@@ -54,7 +54,7 @@ Preset = Annotated[
 ]
 
 
-@with_options(*(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance")))
+@with_options(*DETAIL_OPTIONS)
 def batch(
     context: typer.Context,
     folder: Folder,

@@ -1,5 +1,6 @@
 """The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
@@ -10,8 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.progress import stages, steps
-from nlfilter_torch.core.memory import working_bytes
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, working_bytes
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.io.photographs import (
     Photograph,
@@ -23,13 +23,13 @@ from nlfilter_torch.io.photographs import (
     write_photograph,
 )
 from nlfilter_torch.io.rows import (
+    TILED,
+    WHOLE,
     StoredPicture,
     check_place,
     is_zarr,
-    modest_memory,
     open_picture,
-    tile_memory,
-    whole_memory,
+    usual_memory,
     write_picture,
 )
 from nlfilter_torch.operator.features import reduce_channels
@@ -39,18 +39,13 @@ from nlfilter_torch.tiled.tiles import Passes, Processes, Statistics, Tiling
 MOST = 1e6  # gigabytes; upper limit of ``--memory``
 
 
-def allowed_memory(gigabytes: float | None) -> int:
-    """``--memory`` in bytes."""
+def allowed_memory(gigabytes: float | None, most: int = sys.maxsize) -> int:
+    """``--memory`` in bytes, or without it the usual memory, and at most so many bytes."""
     if gigabytes is None:
-        return modest_memory()
+        return usual_memory(most)
     if not 0 < gigabytes <= MOST:
         raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
     return int(gigabytes * 1e9)
-
-
-def tile_limit(gigabytes: float | None) -> int:
-    """Largest memory in bytes of the tiles of an edit, given ``--memory``."""
-    return tile_memory() if gigabytes is None else allowed_memory(gigabytes)
 
 
 def viewed_within_memory(path: str | Path, size: tuple[int, int], step: Step, factors: int = 1) -> tuple[int, int]:
@@ -69,8 +64,7 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: f
     if is_zarr(Path(source)) or is_zarr(Path(target)):
         return None
     try:
-        memory = whole_memory() if gigabytes is None else allowed_memory(gigabytes)
-        return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=memory)
+        return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=allowed_memory(gigabytes, WHOLE))
     except TooLarge:
         return None
 
@@ -205,6 +199,6 @@ def edit_file(
         check_place(Path(target), stored, written, allowed)
         processes = processes_for(workers, cluster, stack)
         report = stack.enter_context(stages())
-        job = Job(picture, stored, allowed - picture.cached, tile_limit(memory), report, stack, processes)
+        job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with by_rows(job) as tiling:
             write_picture(Path(target), tiling, stored, written)

@@ -15,6 +15,8 @@ from nlfilter_torch.edits.presets import PRESETS, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 
+#: Options of detail that do not concern regions.
+DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
 TYPES = {"number": float, "count": int, "odd": int, "sliders": str}
 
 

@@ -42,7 +42,6 @@ ENOUGH = 0.8  # share that is to be explained
 AMPLIFIED = 4  # what is left, in the preview
 SQUARE = 16  # pixels, of places that an edit is looked for in
 FEW, MOST = 0.1, 0.5  # of these places, and of what is left, for an edit to be called local
-PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".tif", ".tiff")
 CALLED = {
     "alpha": "sliders",
     "bands": "gains of blurs",
@@ -159,7 +158,9 @@ def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -
 
 
 def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PHOTOGRAPHS
+    from nlfilter_torch.io.photographs import SUFFIXES
+
+    return path.suffix.lower() in SUFFIXES
 
 
 def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
@@ -175,7 +176,7 @@ def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     first, second = (image.expand(-1, channels, -1, -1) for image in images)
     image, edited, done = align(first, second, str(before), str(after))
     if done:
-        _tell(done)
+        options.note(done)
     if bool((image == edited).all()):
         raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
     check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
@@ -222,7 +223,7 @@ def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> Non
     if alone:
         typer.echo("in other photographs: not known from one pair; folders of three pairs or more tell")
     if min(share, look.left_out) < ENOUGH:
-        _tell(f"the look explains less than {100 * ENOUGH:.0f} % of the edit; --preview shows what is missing")
+        options.note(f"the look explains less than {100 * ENOUGH:.0f} % of the edit; --preview shows what is missing")
     typer.echo(f"preset: {path}")
 
 
@@ -242,7 +243,7 @@ def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", stride: floa
         return
     place = int(largest.indices[0])
     row, column = (round(SQUARE * stride * number) for number in divmod(place, rest.shape[1]))
-    _tell(
+    options.note(
         f"most of what is left is in a tenth of the picture, around row {row}, column {column}: an edit of a part; "
         "--map shows where, and --mask fits parts by themselves"
     )
@@ -260,7 +261,3 @@ def _draw(before: "Tensor", after: "Tensor", found: "Tensor", preview: Path | No
     if left is not None:
         rest = (after - found).abs().amax(1, keepdim=True)
         write_photograph(Photograph(rest / rest.amax().clamp(min=1e-6)), left)
-
-
-def _tell(sentence: str) -> None:
-    typer.echo(f"nlfilter-torch: note: {sentence}", err=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import plain_step, preset_option, step_of, with_options
+from nlfilter_torch.cli.edits import DETAIL_OPTIONS, plain_step, preset_option, step_of, with_options
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
-DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
 BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
 
 Frames = Annotated[
@@ -88,13 +87,14 @@ def frames(
     """
     recipe = chosen_recipe(context, edit, preset, given)
 
-    from nlfilter_torch.cli.editing import tile_limit
+    from nlfilter_torch.cli.editing import allowed_memory
     from nlfilter_torch.io.films import is_film
+    from nlfilter_torch.io.rows import TILED
     from nlfilter_torch.tiled.film import FilmEdit, film_steps
     from nlfilter_torch.tiled.tiles import Passes
 
     film_steps(recipe)
-    passes = Passes("float32", memory=tile_limit(memory))
+    passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
     def fit(samples: list[Any]) -> FilmEdit:
         return FilmEdit(recipe, samples, passes, seed=seed)

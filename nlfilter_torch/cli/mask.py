@@ -49,13 +49,13 @@ def mask(
     """See :data:`MASK`."""
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.progress import stages, steps
-    from nlfilter_torch.core.memory import working_bytes
     from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.edits.mask import fit_mask, region_mask
+    from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
     from nlfilter_torch.io.photographs import Photograph, check_file, check_memory, check_output, write_photograph
-    from nlfilter_torch.io.rows import check_place, open_picture, write_picture
+    from nlfilter_torch.io.rows import TILED, check_place, open_picture, write_picture
     from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.scribbles import RegionRows
     from nlfilter_torch.tiled.source import Tiled
@@ -116,7 +116,7 @@ def mask(
             check_place(place, kind, plain, allowed)
         with ExitStack() as files:
             processes = editing.processes_for(workers, cluster, files)
-            limit = editing.tile_limit(memory)
+            limit = editing.allowed_memory(memory, TILED)
             job = editing.Job(picture, kind, allowed - picture.cached, limit, report, files, processes)
             tiled = Tiled(Picture(picture.rows, source), job.passes(full, place.parent), "--region")
             drawn = selected_by(job.size, job.open)

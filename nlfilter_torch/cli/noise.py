@@ -58,14 +58,7 @@ class NoiseReport:
 
 
 def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tensor], path: Path) -> None:
-    """Write the standard deviation of the noise at every pixel, in 16 bits.
-
-    Args:
-        noise: of the photograph.
-        size: (H, W) of the photograph.
-        read: reads rows (1, C, h, W) of the photograph.
-        path: an image file.
-    """
+    """Write the standard deviation of the noise at every pixel of a photograph (H, W), in 16 bits."""
     parts = []
     for start in range(0, size[0], ROWS):
         stop = min(start + ROWS, size[0])

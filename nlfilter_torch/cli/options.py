@@ -23,6 +23,11 @@ FileDepth = Literal["8", "16", "float"]  # what a channel of the output file hol
 DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
 
 
+def note(sentence: str) -> None:
+    """Print a note on standard error."""
+    typer.echo(f"nlfilter-torch: note: {sentence}", err=True)
+
+
 def parse_sliders(text: str, option: str) -> tuple[float, ...]:
     """Parse sliders separated by commas.
 

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 import typer
 from torch import Tensor
 
+from nlfilter_torch.cli.options import note
 from nlfilter_torch.cli.scribbles import Overlay, Strokes
 from nlfilter_torch.edits.applying import seeded
 from nlfilter_torch.edits.colour import hundredths_of_lab
@@ -74,11 +75,6 @@ def note_idle(recipe: Recipe, name: str) -> None:
     """Print a note if an edit changes nothing."""
     if not recipe.acting:
         note(f"{name} holds no step that changes anything: the photograph is written as it is")
-
-
-def note(sentence: str) -> None:
-    """Print a note on standard error."""
-    typer.echo(f"nlfilter-torch: note: {sentence}", err=True)
 
 
 def unlike(pixels: Tensor, middle: Tensor) -> float:

@@ -117,14 +117,7 @@ def focus_of(mask: Tensor) -> Tensor:
 
 
 def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture) -> Tensor:
-    """Blur the background by itself and blend it with the image by a soft mask.
-
-    Args:
-        image: (B, C, H, W).
-        focus: fraction of each pixel that is in focus, (B, 1, H, W).
-        radius: radius of the blur.
-        aperture: see :func:`defocus`.
-    """
+    """Blur the background of an image by itself, and blend it by the fraction of each pixel that is in focus."""
     behind = (1 - focus).square() + SUBJECT_WEIGHT  # SUBJECT_WEIGHT matters only where there is no background nearby
     sums = convolve(torch.cat([image * behind, behind], dim=1), blur_kernel(radius, aperture).to(image))
     blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)

@@ -327,7 +327,7 @@ def _add_sliders(region: _Region, pixels: SomePixels, sums: Sums, rounding: floa
         region.sliders = None
         return
     # Sliders add the same to every channel, each of which is rounded by itself.
-    layers = pixels.layers.repeat(1, 3)
+    layers = pixels.weighed["alpha"].repeat(1, 3)
     before, after, weights = (planes.flatten() for planes in (pixels.before, pixels.after, pixels.weights))
     alpha = fit_layers(layers, before, after, weights, rounding)
     place = region.layout.place("alpha")

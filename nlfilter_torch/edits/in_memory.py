@@ -167,8 +167,7 @@ class InMemoryOperator:
         count = self.operator.factor.shape[2]
         if not self.sampled or count <= SAMPLE:
             return self.operator.spectrum()
-        some = sampled_places(count).to(self.operator.factor.device)
-        of = Columns(self.operator.factor, self.operator.scaling, self.operator.remainder)
+        some, of = sampled_places(count).to(self.operator.factor.device), self.operator
         columns = Columns(of.factor[:, :, some], of.scaling[:, some], of.remainder[:, some])
         return sampled_pairs([columns], count, of.factor.dtype)
 

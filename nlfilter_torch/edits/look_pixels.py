@@ -32,33 +32,22 @@ class SomePixels:
         places: their numbers (P,), along the rows.
         before: (3, P).
         after: (3, P).
-        bands: of the photograph before the edit, (3, 7, P).
-        texture: of it, (6, P).
-        stretch: changes by automatic levels, (3, 3, P).
-        local: changes by local tone curves, (3, 8, P).
-        layers: of its luminance, (k+1, P).
+        weighed: what parts of a look weigh there, as for :func:`columns_of`.
         weights: (3, P).
     """
 
     places: Tensor
     before: Tensor
     after: Tensor
-    bands: Tensor
-    texture: Tensor
-    stretch: Tensor
-    local: Tensor
-    layers: Tensor
+    weighed: dict[str, Tensor]
     weights: Tensor
 
     def sums(self, layout: Layout, parts: list[Tensor]) -> list[Sums]:
         """Sums over parts (P',) of them."""
         found = []
         for some in parts:
-            before, bands, texture, stretch, local, layers = (
-                values[..., some]
-                for values in (self.before, self.bands, self.texture, self.stretch, self.local, self.layers)
-            )
-            columns = columns_of(before, bands, texture, stretch, local, layers, layout)
+            before = self.before[..., some]
+            columns = columns_of(before, {name: each[..., some] for name, each in self.weighed.items()}, layout)
             found.append(sums_of(columns, self.after[..., some] - before, self.weights[..., some]))
         return found
 
@@ -164,10 +153,13 @@ class EditedPhotograph:
 
     def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> SomePixels:
         share = float((weights.amax(0) > 0).sum()) / max(len(places), 1)
-        bands = torch.stack([band[:, places] for band in self.bands], dim=1)
-        texture = torch.stack([texture[places] for texture in self.texture])
         rows, columns = places // self.size[1], places % self.size[1]
         before, after = self.before[:, places], self.after[:, places]
-        local = self.local.at(before[None], rows, columns)[0].transpose(0, 1)
-        stretch = self.stretch.changes(before[None, :, None])[0, :, :, 0].transpose(0, 1)
-        return SomePixels(places, before, after, bands, texture, stretch, local, layers, weights[:, places] * share)
+        weighed = {
+            "bands": torch.stack([band[:, places] for band in self.bands], dim=1),
+            "texture": torch.stack([texture[places] for texture in self.texture]),
+            "stretch": self.stretch.changes(before[None, :, None])[0, :, :, 0].transpose(0, 1),
+            "local": self.local.at(before[None], rows, columns)[0].transpose(0, 1),
+            "alpha": layers,
+        }
+        return SomePixels(places, before, after, weighed, weights[:, places] * share)

@@ -213,15 +213,9 @@ def fit_regions(
     spatial_bandwidth: float | Tensor | None = None,
     **options: Any,
 ) -> Regions:
-    """Compute the masks of regions from scribbles on each.
+    """Compute the masks of regions from scribbles on each, and on the background: none, one for all, or one for each.
 
-    Args:
-        source: the picture.
-        inside: scribbles on each region.
-        background: scribbles on the background: none, one for all regions, or one for each.
-        reach: as for :func:`region_mask`.
-        spatial_bandwidth: likewise.
-        **options: further arguments of :func:`region_mask`.
+    Further arguments are those of :func:`region_mask`.
     """
     MASK["reach"].check_argument(reach, source.batch)
     count, several = len(inside), len(background) > 1
@@ -311,13 +305,8 @@ def _regression(
 ) -> Planes:
     """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
 
-    Args:
-        source: the picture.
-        operator: its operator.
-        marked: scribbles on the region and on its background.
-        frame: columns of the pixels along the borders of the picture.
-        unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
-        reach: as for :func:`region_mask`.
+    From scribbles on the region and on its background, and the pixels along the borders of the picture: ``frame`` has
+    their columns, ``unlike`` their dissimilarity to the scribbles on the region, (B, 1, n).
     """
     columns, weights = operator.at(marked.places), marked.weights
     total = weights.sum(1, keepdim=True).clamp(max=1.0)

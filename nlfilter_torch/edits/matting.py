@@ -40,11 +40,6 @@ def pyramid_levels(short: int) -> int:
     return max(0, min(LEVELS, int(math.log2(max(short / COARSEST, 1)))))
 
 
-def steps_on(level: int, levels: int) -> int:
-    """Number of Jacobi steps on a level, where 0 is the finest."""
-    return STEPS[-1] if level == levels else STEPS[min(level, len(STEPS) - 1)]
-
-
 def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
     """Solve for the soft masks (B, K, H, W) of the first problem.
 
@@ -67,7 +62,8 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
         target, trust = area * target, area * trust
         found = target / trust if found is None else doubled(found, some)
         weights = neighbour_weights(colours, lambda squared: torch.exp(steepness * squared) + MIN_WEIGHT)
-        found = jacobi(found, target, trust, weights, steps_on(level, levels))
+        steps = STEPS[-1 if level == levels else min(level, len(STEPS) - 1)]
+        found = jacobi(found, target, trust, weights, steps)
     assert found is not None  # for mypy
     return found.clamp(0.0, 1.0)
 

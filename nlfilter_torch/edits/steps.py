@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.core.memory import working_bytes
 from nlfilter_torch.edits.declaration import Edit, Parameter, is_within, shown
 from nlfilter_torch.edits.parameters import EDITS
 
@@ -101,9 +100,8 @@ class Step:
         if "method" in names and self["method"] == "network":
             return working_bytes(0, 0)  # its tiles are small
         landmarks = self["landmarks"] if "landmarks" in names else 0
-        patch_size = (
-            max(self["patch_size"], 5) if "patch_size" in names else 0
-        )  # 3x3 in colour is as large as 5x5 in grey
+        # Patches of 3x3 in colour are as large as those of 5x5 in grey.
+        patch_size = max(self["patch_size"], 5) if "patch_size" in names else 0
         return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
 
     def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
@@ -169,6 +167,17 @@ class Step:
         if edit == "detail" and len(step.sliders_inside) != len(step["alpha"]):
             raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
         return step
+
+
+def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
+    """Bytes of memory that an edit needs per pixel, slightly more than measured on two megapixels.
+
+    Args:
+        landmarks: M, the number of floats of the factor per pixel.
+        patch_size: p; two copies of the patches exist while they are weighted.
+        factors: number of arrays of the factor's size at once: 1 for filtering, 5 for diagnostics.
+    """
+    return 4 * (factors * landmarks + 2 * patch_size**2 + 40)
 
 
 def _find(declared: Edit, entry: str) -> tuple[Parameter, float | Callable[[float], float]] | None:

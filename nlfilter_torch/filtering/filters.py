@@ -1,7 +1,5 @@
 """Polynomial and spectral filters. Paper: Sec. III, eq. (10) to (14); Appendix A, eq. (19)."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -328,22 +326,11 @@ def filter_regions(
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_unit_range(masks, "masks")
     check_same_size(masks, operator.size, "masks", "operator", operator.factor)
-    alpha = operator.among.copy_to_group(alpha)
-    return blend_regions(
-        image, masks, alpha, lambda sliders: polynomial_filter(operator, image, sliders, residual=residual)
-    )
-
-
-def blend_regions(image: Tensor, masks: Tensor, alpha: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
-    """:func:`filter_regions` with any function ``edit`` that filters the image with sliders (B, k+1, H, W)."""
-    inside, share = _within(masks, alpha)
-    return torch.lerp(image, edit(inside), share.to(image))
-
-
-def _within(masks: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Sliders (B, k+1, H, W), averaged over the regions with the masks as weights, and the sum of the masks."""
     total = masks.sum(1, keepdim=True)
-    return compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), alpha), total.clamp(max=1.0)
+    # Averaged over the regions with the masks as weights, (B, k+1, H, W).
+    sliders = compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), operator.among.copy_to_group(alpha))
+    filtered = polynomial_filter(operator, image, sliders, residual=residual)
+    return torch.lerp(image, filtered, total.clamp(max=1.0).to(image))
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:

@@ -4,13 +4,13 @@ Each part gives a change of the image, and the result is the image plus all chan
 parameter but the image: looks are fitted to edits by least squares.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_tensor
+from nlfilter_torch.core.checks import check_tensor
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.filtering.local_tone import STRENGTHS, LocalCurves, mean_ramps
 from nlfilter_torch.filtering.stretch import KINDS, Stretch, ends_of, tones
@@ -21,108 +21,59 @@ BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
 DARKEST = 1 / 255  # that has a saturation
-NAMES = ("alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local")
-#: Of one image.
-DIMENSIONS = {name: 2 if name in ("curves", "matrix") else 1 for name in NAMES}
+#: Parts of a look, with their shapes for one image; a letter is any length from 2 on.
+SHAPES: dict[str, tuple[int | str, ...]] = {
+    "alpha": ("k+1",),
+    "bands": (BLURS + 1,),
+    "texture": (BLURS,),
+    "curves": (3, "K"),
+    "matrix": (3, 3),
+    "saturation": ("K",),
+    "stretch": (KINDS,),
+    "local": (STRENGTHS,),
+}
+NAMES = tuple(SHAPES)
+#: Numbers with which these parts change nothing; such parts are not computed.
+IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0}
 
 
-def filter_look(
-    image: Tensor,
-    *,
-    alpha: Tensor | None = None,
-    bands: Tensor | None = None,
-    texture: Tensor | None = None,
-    curves: Tensor | None = None,
-    matrix: Tensor | None = None,
-    saturation: Tensor | None = None,
-    stretch: Tensor | None = None,
-    local: Tensor | None = None,
-    operator: NonlocalOperator | None = None,
-) -> Tensor:
-    """An image under a look, each part of which may be left out.
+def filter_look(image: Tensor, parts: Mapping[str, Tensor], operator: NonlocalOperator | None) -> Tensor:
+    """An image (B, 3, H, W) under a look of all :data:`NAMES`, whose parts may differ between the images.
 
-    Args:
-        image: (B, 3, H, W) in [0, 1].
-        alpha: sliders (k+1,) or (B, k+1) of the filter's layers of luminance. Paper: eq. (12).
-        bands: gains (7,) or (B, 7) of what six blurs, each twice as wide, take away one after the other, fine to
-            coarse, and last of what they leave, around the picture's mean luminance: 1 changes nothing.
-        texture: gains (6,) or (B, 6) of what the six blurs take away from luminance, the less of it the more luminance
-            varies around a pixel, so that edges have little: 1 changes nothing.
-        curves: (3, K) or (B, 3, K), what red, green and blue become at K equal steps from 0 to 1.
-        matrix: (3, 3) or (B, 3, 3) that colours are multiplied by; its change, like that of the curves, is that of the
-            image itself.
-        saturation: (K,) or (B, K), how many times as far each channel is to be from the largest one of its pixel, for
-            colours whose saturation in HSV is at K equal steps from 0 to 1.
-        stretch: (3,) or (B, 3), how much of the change that stretches brightness from the darkest to the lightest pixel
-            to the range from 0 to 1 is added: of luminance, for all channels alike; of the largest channel, for colours
-            in proportion; and of each channel for itself.
-        local: (8,) or (B, 8), how much of the change that equalises histograms of the surroundings is added, under four
-            limits of contrast, :data:`~nlfilter_torch.filtering.local_tone.LIMITS`: of luminance, for all channels
-            alike, and then of the largest channel, for colours in proportion.
-        operator: W, which ``alpha`` needs.
-
-    Returns:
-        (B, 3, H, W); values may leave [0, 1]. Differentiable in everything.
-
-    Raises:
-        TypeError, ValueError: if a part does not have its shape, or ``alpha`` comes without an operator.
-
-    Example:
-        >>> image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-        >>> darker = filter_look(image, curves=torch.tensor([0.0, 0.4, 1.0]).expand(3, 3))
-        >>> bool(darker.mean() < image.mean())
-        True
+    Differentiable in everything. W is needed only if ``alpha`` :func:`acts`. ``apply_look`` says what the parts are.
     """
-    check_image(image, "image", channels=3)
-    parts = dict(zip(NAMES, (alpha, bands, texture, curves, matrix, saturation, stretch, local), strict=True))
-    given = {name: value for name, value in parts.items() if value is not None}
-    for name, value in given.items():
+    acting = {name: value for name, value in parts.items() if name not in IDLE or acts(value, IDLE[name])}
+    for name, value in acting.items():
         check_part(value, name, image.shape[0])
-    result = pointwise(image, curves, matrix, saturation)
-    if bands is not None:
+    result = pointwise(image, parts["curves"], parts["matrix"], parts["saturation"])
+    if "bands" in acting:
         mean = reduce_channels(image, "luminance").mean((2, 3), keepdim=True)
-        result = result + band_change(image, bands, mean)
-    if texture is not None:
-        result = result + texture_change(image, texture)
-    if stretch is not None:
-        result = result + range_of(image).change(image, stretch)
-    if local is not None:
-        result = result + local_curves(image, range_of(image)).weighed(local).rectangle(image, (0, 0)).sum(1)
-    if alpha is not None:
-        if operator is None:
-            raise ValueError("operator must be given where alpha is, got None; make it with nonlocal_operator")
-        result = result + polynomial_filter(operator, reduce_channels(image, "luminance"), alpha - 1)
+        result = result + band_change(image, parts["bands"], mean)
+    if "texture" in acting:
+        result = result + texture_change(image, parts["texture"])
+    if "stretch" in acting:
+        result = result + range_of(image).change(image, parts["stretch"])
+    if "local" in acting:
+        curves = local_curves(image, range_of(image)).weighed(parts["local"])
+        result = result + curves.rectangle(image, (0, 0)).sum(1)
+    if "alpha" in acting:
+        assert operator is not None  # for mypy
+        result = result + polynomial_filter(operator, reduce_channels(image, "luminance"), parts["alpha"] - 1)
     return result
 
 
 def check_part(value: Tensor, name: str, batch: int) -> None:
     """Raise unless a part of a look has its shape."""
     check_tensor(value, name)
-    shapes = {
-        "alpha": "(k+1,)",
-        "bands": f"({BLURS + 1},)",
-        "texture": f"({BLURS},)",
-        "curves": "(3, K)",
-        "matrix": "(3, 3)",
-        "saturation": "(K,)",
-        "stretch": f"({KINDS},)",
-        "local": f"({STRENGTHS},)",
-    }
-    shape, one = tuple(value.shape), DIMENSIONS[name]
-    last = shape[-one:]
-    fits = {
-        "alpha": lambda: last[0] >= 2,
-        "bands": lambda: last == (BLURS + 1,),
-        "texture": lambda: last == (BLURS,),
-        "curves": lambda: last[0] == 3 and last[1] >= 2,
-        "matrix": lambda: last == (3, 3),
-        "saturation": lambda: last[0] >= 2,
-        "stretch": lambda: last == (KINDS,),
-        "local": lambda: last == (STRENGTHS,),
-    }
-    if len(shape) not in (one, one + 1) or (len(shape) > one and shape[0] not in (1, batch)) or not fits[name]():
+    shape, wanted = tuple(value.shape), SHAPES[name]
+    own = shape[-len(wanted) :]
+    fits = len(own) == len(wanted) and all(
+        length >= 2 if isinstance(one, str) else length == one for length, one in zip(own, wanted, strict=True)
+    )
+    if not fits or shape[: -len(wanted)] not in ((), (1,), (batch,)):
         each = f", or that for each of {batch} images" if batch > 1 else ""
-        raise ValueError(f"{name} must have the shape {shapes[name]}{each}, got {shape}; reshape it, or add values")
+        named = f"({wanted[0]},)" if len(wanted) == 1 else f"({wanted[0]}, {wanted[1]})"
+        raise ValueError(f"{name} must have the shape {named}{each}, got {shape}; reshape it, or add values")
 
 
 def acts(gains: Tensor, idle: float = 1.0) -> bool:
@@ -140,18 +91,12 @@ def local_curves(image: Tensor, stretch: Stretch) -> LocalCurves:
     return LocalCurves.of((image.shape[-2], image.shape[-1]), stretch, partial(mean_ramps, image, stretch))
 
 
-def pointwise(image: Tensor, curves: Tensor | None, matrix: Tensor | None, saturation: Tensor | None) -> Tensor:
+def pointwise(image: Tensor, curves: Tensor, matrix: Tensor, saturation: Tensor) -> Tensor:
     """The image (B, 3, H, W) plus what tone curves, matrix and saturation change."""
-    result = image
-    if curves is not None:
-        result = tone_curve(image, curves)
-    if matrix is not None:
-        change = matrix - torch.eye(3).to(matrix)
-        result = result + (change.to(image) @ image.flatten(2)).view_as(image)
-    if saturation is not None:
-        factors = (saturation.to(image) - 1).reshape(-1, saturation.shape[-1], 1, 1)
-        result = result + below_largest(image) * (factors * saturation_hats(image, saturation.shape[-1])).sum(1, True)
-    return result
+    change = matrix - torch.eye(3).to(matrix)
+    result = tone_curve(image, curves) + (change.to(image) @ image.flatten(2)).view_as(image)
+    factors = (saturation.to(image) - 1).reshape(-1, saturation.shape[-1], 1, 1)
+    return result + below_largest(image) * (factors * saturation_hats(image, saturation.shape[-1])).sum(1, True)
 
 
 def below_largest(image: Tensor) -> Tensor:

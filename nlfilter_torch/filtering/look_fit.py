@@ -7,7 +7,7 @@ look has, and how strong a ridge keeps them close to the identity, is chosen by 
 picture if there is one. A curve is kept from falling by a least-squares problem with bounds.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -105,18 +105,27 @@ class Layout:
         start = sum(list(self.lengths.values())[: names.index(part)])
         return slice(start, start + self.lengths[part])
 
+    def parameters(self, parts: Parts) -> Iterator[tuple[str, slice, slice]]:
+        """The parameters of some parts, one after the other: the part, its channels, and places of its parameters.
+
+        A part may have parameters of its own for each channel.
+        """
+        start = 0
+        for part in parts:
+            length = self.lengths["curves" if part == "tone" else part]
+            each = [slice(c, c + 1) for c in range(3)] if part in ("curves", "matrix") else [slice(3)]
+            for channels in each:
+                yield part, channels, slice(start, start + length)
+                start += length
+
     def spread(self, parts: Parts) -> Tensor:
         """From the parameters of some parts to the coefficients (3, F, P) of the columns of every channel."""
-        found = []
-        for part in parts:
-            place = self.place("curves" if part == "tone" else part)
-            count, own = place.stop - place.start, part in ("curves", "matrix")
-            ones = torch.zeros(3, self.columns, count * (3 if own else 1), dtype=torch.float64)
-            for channel in range(3):
-                first = channel * count if own else 0
-                ones[channel, place, first : first + count] = torch.eye(count, dtype=torch.float64)
-            found.append(ones)
-        return torch.cat(found, dim=2)
+        every = list(self.parameters(parts))
+        found = torch.zeros(3, self.columns, every[-1][2].stop, dtype=torch.float64)
+        for part, channels, place in every:
+            columns = self.place("curves" if part == "tone" else part)
+            found[channels, columns, place] = torch.eye(place.stop - place.start, dtype=torch.float64)
+        return found
 
 
 @dataclass(frozen=True)
@@ -127,19 +136,15 @@ class Sums:
         gram: of the columns, (3, F, F), in float64.
         cross: of columns and change, (3, F).
         power: of the change, (3,).
-        count: of the pixels, (3,).
     """
 
     gram: Tensor
     cross: Tensor
     power: Tensor
-    count: Tensor
 
     def __add__(self, other: "Sums") -> "Sums":
         """Of both."""
-        return Sums(
-            self.gram + other.gram, self.cross + other.cross, self.power + other.power, self.count + other.count
-        )
+        return Sums(self.gram + other.gram, self.cross + other.cross, self.power + other.power)
 
     def left(self, coefficients: Tensor) -> float:
         """Squares of the change that coefficients (3, F) leave."""
@@ -161,40 +166,31 @@ def sample(weights: Tensor) -> Tensor:
     return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
 
 
-def columns_of(
-    image: Tensor, bands: Tensor, texture: Tensor, stretch: Tensor, local: Tensor, layers: Tensor, layout: Layout
-) -> Tensor:
+def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> Tensor:
     """What the parameters of a look weigh at some pixels, (3, F, P), in float64.
 
     Args:
         image: pixels (3, P) before the edit.
-        bands: of them, (3, 7, P).
-        texture: of them, (6, P).
-        stretch: changes by automatic levels, (3, 3, P).
-        local: changes by local tone curves, (3, 8, P).
-        layers: of luminance, (k+1, P).
+        weighed: by the part of the look that weighs them: ``bands`` (3, 7, P) and ``texture`` (6, P) of the pixels,
+            changes of them by ``stretch`` (3, 3, P) and by ``local`` curves (3, 8, P), and layers of luminance,
+            ``alpha``, (k+1, P).
         layout: of the columns.
     """
     colours = image.double()  # the columns nearly depend on each other
     knots = torch.arange(layout.knots).to(colours).view(-1, 1)
     hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
-    spread = [values.double().expand(3, -1, -1) for values in (colours, texture, layers)]
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    own = [values.double() for values in (bands, stretch, local)]
-    return torch.cat([hats, spread[0], below, own[0], spread[1], *own[1:], spread[2]], dim=1)
+    columns = {"curves": hats, "matrix": colours, "saturation": below, **weighed}
+    return torch.cat([columns[part].double().expand(3, -1, -1) for part in layout.lengths], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
     """The sums of columns (3, F, P), the change (3, P) and weights (3, P) of some pixels."""
     columns, change, weights = (values.double() for values in (columns, change, weights))
     weighed = columns * weights.unsqueeze(1)
-    return Sums(
-        weighed @ columns.mT,
-        (weighed @ change.unsqueeze(2)).squeeze(2),
-        (weights * change.square()).sum(1),
-        weights.sum(1),
-    )
+    cross = (weighed @ change.unsqueeze(2)).squeeze(2)
+    return Sums(weighed @ columns.mT, cross, (weights * change.square()).sum(1))
 
 
 @dataclass(frozen=True)
@@ -269,12 +265,8 @@ def _choose(
 def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: float = 0.0) -> Tensor:
     """Coefficients (3, F) of the look of some parts that explains most.
 
-    Args:
-        sums: of pairs.
-        parts: of the look.
-        layout: of the columns.
-        ridge: weight of the distance from the identity.
-        stiff: least such weight for tone curves and saturation, which few pictures have every value of.
+    ``ridge`` is the weight of the distance from the identity, ``stiff`` the least one for tone curves and saturation,
+    which few pictures have every value of.
     """
     spread = layout.spread(parts)
     gram, cross = _products(sums, spread)
@@ -318,17 +310,11 @@ def _penalties(gram: Tensor, parts: Parts, layout: Layout) -> tuple[Tensor, Tens
     Those of tone curves and saturation are apart.
     """
     free, bent = torch.diag(gram.diagonal()), torch.zeros_like(gram)
-    start = 0
-    curved = {"tone": (1, layout.knots), "curves": (3, layout.knots), "saturation": (1, layout.factors)}
-    for part in parts:
-        curves, length = curved.get(part, (0, 0))
-        for _ in range(curves):
-            place = slice(start, start + length)
+    for part, _, place in layout.parameters(parts):
+        if part in ROUGHNESS:
             free[place, place] = 0.0
-            bent[place, place] = gram.diagonal()[place].mean() * _distance(length, ROUGHNESS[part])
-            start += length
-        if not curves:
-            start += layout.lengths[part] * (3 if part == "matrix" else 1)
+            weights = _distance(place.stop - place.start, ROUGHNESS[part])
+            bent[place, place] = gram.diagonal()[place].mean() * weights
     return free, bent
 
 
@@ -348,15 +334,11 @@ def _floor(gram: Tensor) -> Tensor:
 def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: Layout) -> Tensor:
     """Parameters (P,) of the least squares under which no curve falls."""
     free = torch.linalg.solve(gram, cross)
-    rows, start = [], 0
-    for part in parts:
-        for _ in range({"tone": 1, "curves": 3}.get(part, 0)):
-            rises = torch.zeros(layout.knots - 1, len(cross), dtype=gram.dtype)
-            rises[:, start : start + layout.knots] = torch.eye(layout.knots, dtype=gram.dtype).diff(dim=0)
-            rows.append(rises)
-            start += layout.knots
-        if part not in ("tone", "curves"):
-            start += layout.lengths[part] * (3 if part == "matrix" else 1)
+    rows = []
+    for part, _, place in layout.parameters(parts):
+        if part in CURVED:
+            rows.append(torch.zeros(layout.knots - 1, len(cross), dtype=gram.dtype))
+            rows[-1][:, place] = torch.eye(layout.knots, dtype=gram.dtype).diff(dim=0)
     if not rows:
         return free
     rises = torch.cat(rows)

@@ -94,9 +94,10 @@ def diffusion_mask(
     # The constant eigenvector does not contribute to distances, so it is kept, and no eigenvectors need to be formed.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     scale = spectrum.pixels / torch.as_tensor(spectrum.among.copy_to_group(width)).to(distances).reshape(-1, 1, 1)
-    exponents = scale.clamp(max=STEEPEST) * distances
+    exponents = scale.clamp(max=STEEPEST) * distances  # of the regions, then of negative ones
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
-    mask = mask_of_exponents(inner, None if negative is None else outer)
+    mask = torch.exp(-inner.clamp(max=FARTHEST))
+    mask = mask if negative is None else mask * torch.sigmoid((outer - inner).clamp(min=-20.0))
     return mask.unflatten(2, spectrum.size).to(region.dtype)
 
 
@@ -123,12 +124,6 @@ def check_negative(count: int, regions: int) -> None:
             f"negative must have 1 channel or those of region, {regions}, got {count}; give one for all regions "
             "or one for each"
         )
-
-
-def mask_of_exponents(exponents: Tensor, others: Tensor | None) -> Tensor:
-    """Positive masks (B, K, N) from squared distances over width, to the regions and, ``others``, to negative ones."""
-    mask = torch.exp(-exponents.clamp(max=FARTHEST))
-    return mask if others is None else mask * torch.sigmoid((others - exponents).clamp(min=-20.0))
 
 
 def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:

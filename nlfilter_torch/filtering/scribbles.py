@@ -141,17 +141,13 @@ def fit_strokes(
 ) -> FittedStrokes:
     """Fit the regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
-    Args:
-        painted: returns an iterable over all scribbled pixels, in blocks of columns of the factor (B, M, n), weights
-            (B, 1, n) and values (B, C, n); called more than once.
-        pairs: of the operator.
-        pixels: N, of the whole image.
-        strength: as for :func:`propagate_strokes`.
-        reach: as for :func:`propagate_strokes`; s of the walks.
-        smoothness: as for :func:`propagate_strokes`; scales the noise.
-        among: ranks that the rows of the image are distributed over.
+    ``painted`` is called more than once and returns an iterable over all scribbled pixels, in blocks of columns of the
+    factor (B, M, n), weights (B, 1, n) and values (B, C, n). ``pixels`` is their number N in the whole image, whose
+    rows are distributed over the ranks of ``among``.
     """
-    half = walk_basis(pairs, reach).mT  # R, where X = R R^T
+    walk = _per_image(reach, pairs.root).squeeze(2)  # s, (B or 1, 1)
+    basis = pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt())
+    half = basis.mT  # R, where X = R R^T
     effective_weights = EffectiveWeights.of(painted, half, DAB * pixels, among)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
@@ -178,17 +174,6 @@ def fit_strokes(
     mean = residual[:, :-1] / residual[:, -1:]
     share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
     return FittedStrokes((solution[:, :, :-1] - solution[:, :, -1:] * share).mT, share.mT)
-
-
-def walk_basis(pairs: RitzPairs, reach: float | Tensor) -> Tensor:
-    """Matrix B (B, M, M) with ``X = B^T B``: columns u and v of the factor have the covariance ``(B u)^T (B v)``.
-
-    Args:
-        pairs: of the operator.
-        reach: s in [0, 1), a number or a tensor of shape () or (B,).
-    """
-    walk = _per_image(reach, pairs.root).squeeze(2)  # (B or 1, 1)
-    return pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt())
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,10 +92,10 @@ class Film:
         pix_fmt = self.stream.codec_context.pix_fmt or ""
         return FULL if self.stream.codec_context.color_range == FULL or pix_fmt.startswith("yuvj") else LIMITED
 
-    def frames(self, packets: Iterator[Any] | None = None) -> Iterator["VideoFrame"]:
+    def frames(self) -> Iterator["VideoFrame"]:
         """Decode all frames from the current position on; raises ValueError if a frame cannot be decoded."""
         number = 0
-        for packet in self.container.demux(self.stream) if packets is None else packets:
+        for packet in self.container.demux(self.stream):
             for frame in self.decoded(packet, number):
                 number += 1
                 yield frame

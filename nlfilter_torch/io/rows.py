@@ -5,6 +5,7 @@ Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complet
 
 import math
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -160,19 +161,9 @@ def free_memory() -> int:
     return int(psutil.virtual_memory().available * 4 // 5)
 
 
-def modest_memory() -> int:
+def usual_memory(most: int = sys.maxsize) -> int:
     """Memory budget in bytes of a command if none is given: a fifth of the machine's memory, at most what is free."""
-    return min(FIFTH, free_memory())
-
-
-def whole_memory() -> int:
-    """Memory budget in bytes of an edit if none is given; a photograph that needs more is edited in tiles."""
-    return min(modest_memory(), WHOLE)
-
-
-def tile_memory() -> int:
-    """Memory budget in bytes of an edit in tiles if none is given."""
-    return min(modest_memory(), TILED)
+    return min(FIFTH, most, free_memory())
 
 
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:

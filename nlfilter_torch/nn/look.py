@@ -94,15 +94,7 @@ class Look(nn.Module):
         check_image(image, "image", channels=3)
         check_learn(list(parts), NAMES, "parts")
         used = {name: parts.get(name, getattr(self, name)) for name in NAMES}
-        if not acts(used["alpha"]):
-            del used["alpha"]
-        elif operator is None:
+        if operator is None and acts(used["alpha"]):
             near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
             operator = nonlocal_operator(reduce_channels(image, "luminance"), **near | self.options)
-        for name in ("bands", "texture"):
-            if not acts(used[name]):
-                del used[name]
-        for name in ("stretch", "local"):
-            if not acts(used[name], 0.0):
-                del used[name]
-        return filter_look(image, operator=operator, **used)
+        return filter_look(image, used, operator)

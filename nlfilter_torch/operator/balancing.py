@@ -64,9 +64,12 @@ def balance(
         weights: number of identical pixels that each point represents, (B, N), a constant; None means one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    scaling, total, residual, steps = _Balance.apply(factor, diagonal, tolerance, completed, among, weights)  # type: ignore[no-untyped-call]
-    warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
-    return Balancing(scaling, total, residual, int(steps))
+    with torch.no_grad():
+        found = solve(KernelMatrix(factor, diagonal, weights, among), tolerance, completed)
+    warn_of_residual(found.residual, tolerance, factor.dtype, completed=completed)
+    known = found.scaling, found.moment, found.inverse
+    scaling = _Balanced.apply(factor, diagonal, *known, completed, among, weights)  # type: ignore[no-untyped-call]
+    return Balancing(scaling, found.moment, found.residual, found.steps)
 
 
 def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
@@ -85,8 +88,8 @@ def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:
     return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
 
 
-class _Balance(torch.autograd.Function):
-    """Implicit differentiation of ``log d + log(K d) = 0``.
+class _Balanced(torch.autograd.Function):
+    """The scaling d (B, N) that a balancing found, with implicit differentiation of ``log d + log(K d) = 0``.
 
     Differentiating gives ``(I + W) d(log d) = -diag(d) dK d``. With g the gradient of the loss with respect to d,
     ``(I + W) x = d * g`` and ``a = d * x``, the loss changes by ``-a^T dK d``. Its gradient with respect to the factor
@@ -102,25 +105,26 @@ class _Balance(torch.autograd.Function):
         ctx: Any,
         factor: Tensor,
         diagonal: Tensor,
-        tolerance: float,
+        scaling: Tensor,
+        moment: Tensor,
+        inverse: Tensor,
         completed: bool,
         among: Communicator,
         weights: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor, int]:
-        found = solve(KernelMatrix(factor, diagonal, weights, among), tolerance, completed)
-        ctx.save_for_backward(factor, diagonal, found.scaling, found.moment, found.inverse, weights)
+    ) -> Tensor:
+        scaling = scaling.clone()
+        ctx.save_for_backward(factor, diagonal, scaling, moment, inverse, weights)
         ctx.among, ctx.completed = among, completed
-        ctx.mark_non_differentiable(found.moment, found.residual)
-        return found.scaling, found.moment, found.residual, found.steps
+        return scaling
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling, moment, inverse, weights = ctx.saved_tensors
         matrix = KernelMatrix(factor, diagonal, weights, ctx.among)
         solution = Balancing(scaling, moment, scaling, 0)  # the residual is not used
         gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
-        return *gradients, None, None, None, None
+        return *gradients, None, None, None, None, None, None
 
 
 def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
@@ -135,7 +139,7 @@ def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
 def implicit_gradients(
     matrix: KernelMatrix, balancing: Balancing, inverse: Tensor, grad: Tensor, completed: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gradients with respect to factor and diagonal from that with respect to the scaling; see :class:`_Balance`."""
+    """Gradients with respect to factor and diagonal from that with respect to the scaling; see :class:`_Balanced`."""
     factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
     scaling, total, dtype = balancing.scaling, balancing.moment, factor.dtype
     if not completed:  # without completion d may reach 1e25, and its square overflows float32
@@ -305,26 +309,6 @@ def balance_in_graph(
         factor.detach(), diagonal.detach(), tolerance, completed, bound
     )
     factor, diagonal = without(factor, removed), torch.where(removed, 1.0, diagonal)
-    scaling = _Settled.apply(factor, diagonal, scaling, moments[-1], inverse, completed)  # type: ignore[no-untyped-call]
+    known = scaling, moments[-1], inverse
+    scaling = _Balanced.apply(factor, diagonal, *known, completed, ALONE, None)  # type: ignore[no-untyped-call]
     return factor, diagonal, Balancing(scaling, moments[-1], residual, 0), moments[:-1].unbind()
-
-
-class _Settled(torch.autograd.Function):
-    """Attach the implicit gradient in factor and diagonal to a solution d (B, N) of the balancing."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, factor: Tensor, diagonal: Tensor, scaling: Tensor, moment: Tensor, inverse: Tensor, completed: bool
-    ) -> Tensor:
-        scaling = scaling.clone()
-        ctx.save_for_backward(factor, diagonal, scaling, moment, inverse)
-        ctx.completed = completed
-        return scaling
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, diagonal, scaling, moment, inverse = ctx.saved_tensors
-        matrix, solution = KernelMatrix(factor, diagonal, None, ALONE), Balancing(scaling, moment, scaling, 0)
-        gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
-        return *gradients, None, None, None, None

@@ -242,21 +242,9 @@ def sampled_operator(
 ) -> NonlocalOperator:
     """:func:`nonlocal_operator` of some pixels of a guide, each of which stands for as many others.
 
-    Landmarks are those of the whole guide, and so are the results at these pixels, but for the error of sums over a
-    sample.
-
-    Args:
-        guide: (1, 1, H, W), which is checked.
-        places: of the pixels (n,), along the rows, even over the picture.
-        patch_size: as for :func:`nonlocal_operator`, as are all further ones.
-        photometric_bandwidth: see there.
-        spatial_bandwidth: see there.
-        num_landmarks: see there.
-        landmarks: see there.
-        generator: see there.
-
-    Returns:
-        The operator, for images of the size (1, n).
+    Landmarks are those of the whole guide (1, 1, H, W), and so are the results at these pixels, but for the error of
+    sums over a sample. ``places`` of the pixels (n,), along the rows, are even over the picture. The images of the
+    operator have the size (1, n).
     """
     method = Construction(num_landmarks, landmarks, "diagonal", None, generator)
     if isinstance(photometric_bandwidth, str):
@@ -280,16 +268,9 @@ def _assemble(
     among: Communicator = ALONE,
     chosen: Tensor | None = None,
 ) -> NonlocalOperator:
-    """Build an operator from features (B, D, N).
+    """Build an operator from features (B, D, N), which ``recipe`` computed if they come from a guide.
 
-    Args:
-        features: of the points.
-        size: (H, W) of the images to filter.
-        method: options.
-        recipe: computed the features, if they come from a guide.
-        weights: of the points.
-        among: ranks over which the points are distributed.
-        chosen: landmarks (B, D, M), if they are already chosen.
+    Landmarks (B, D, M) are chosen by the method unless they are already ``chosen``.
     """
     whole = among.whole(size)
     points, count, tolerance = whole[0] * whole[1], method.num_landmarks, method.tolerance

@@ -100,8 +100,7 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, among: Comm
     """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M."""
     if subset.shape[2] == count:
         return subset
-    start, assignment = clusters(subset.detach(), count, generator, among)
-    return means_of_clusters(subset, assignment, start)
+    return means_of_clusters(subset, *clusters(subset.detach(), count, generator, among))
 
 
 def clusters(
@@ -121,11 +120,6 @@ def draw_few(candidates: int, count: int, generator: torch.Generator) -> Tensor:
     """Draw the indices of up to half of the candidates, from which the initial centroids are chosen."""
     few = torch.randperm(candidates, generator=generator, device=generator.device)
     return few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)]
-
-
-def means_of_clusters(subset: Tensor, assignment: Tensor, start: Tensor) -> Tensor:
-    """Compute landmarks (B, D, M) from candidates (B, D, S) and the result of :func:`clusters`."""
-    return _cluster_means(subset, assignment, pick(subset, start))
 
 
 def candidate_count(pixels: int, count: int, sampling: str) -> int:
@@ -219,13 +213,16 @@ def _row(matrices: Tensor, pivot: Tensor) -> Tensor:
     return pick(matrices, pivot).mT
 
 
-def _cluster_means(points: Tensor, assignment: Tensor, fallback: Tensor) -> Tensor:
-    """Means (B, D, M) of the points (B, D, S) of each cluster; for an empty cluster, its column of ``fallback``."""
-    extended = torch.cat([points, torch.ones_like(points[:, :1])], dim=1)  # for sums and sizes at once
-    add = _sums_in_order if points.device.type == "cpu" else _sums_by_product
-    sums = add(extended, assignment, fallback.shape[2])
+def means_of_clusters(subset: Tensor, start: Tensor, assignment: Tensor) -> Tensor:
+    """Landmarks (B, D, M): means of candidates (B, D, S) by the result of :func:`clusters`.
+
+    The landmark of an empty cluster is its initial centroid.
+    """
+    extended = torch.cat([subset, torch.ones_like(subset[:, :1])], dim=1)  # for sums and sizes at once
+    add = _sums_in_order if subset.device.type == "cpu" else _sums_by_product
+    sums = add(extended, assignment, start.shape[2])
     sizes = sums[:, -1:]
-    return torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), fallback)
+    return torch.where(sizes > 0, sums[:, :-1] / sizes.clamp(min=1.0), pick(subset, start))
 
 
 def _sums_in_order(points: Tensor, assignment: Tensor, count: int) -> Tensor:
@@ -268,4 +265,4 @@ def choose_in_graph(features: Tensor, size: tuple[int, int], count: int, samplin
         return features
     pixels, start, assignment = choose(features.detach(), size[0], size[1], count, sampling)
     subset = ALONE.columns(features, pixels)
-    return subset if pixels.shape[0] == count else means_of_clusters(subset, assignment, start)
+    return subset if pixels.shape[0] == count else means_of_clusters(subset, start, assignment)

@@ -19,13 +19,12 @@ from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, RowSource
 from nlfilter_torch.tiled.sampling import ColumnCache, Report, in_silence
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.strokes import strokes_by_rows
-from nlfilter_torch.tiled.tiles import Passes, Statistics
+from nlfilter_torch.tiled.tiles import Passes, Statistics, intermediate
 from nlfilter_torch.tiled.workers import in_order
 
 STRIP_PIXELS = 1 << 15  # pixels of a rectangle that one worker computes at a time
@@ -135,12 +134,7 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
 
 
 class Stage:
-    """A picture between two steps of an edit, and the step last fitted to it.
-
-    Args:
-        picture: rows.
-        stack: closes its temporary file.
-    """
+    """A picture between two steps of an edit, and the step last fitted to it; ``stack`` closes its temporary file."""
 
     def __init__(self, picture: Picture, stack: ExitStack) -> None:
         self.picture, self._stack = picture, stack
@@ -177,12 +171,7 @@ class Stage:
 
 
 class Parts:
-    """Edited rectangles of a picture, and the steps as fitted to the whole picture.
-
-    Args:
-        source: rows.
-        name: of the source, for error messages.
-    """
+    """Edited rectangles of a picture, and the steps as fitted to the whole picture; ``name`` is for error messages."""
 
     def __init__(self, source: RowSource, name: str) -> None:
         self._stages = [Stage(Picture(source, name), ExitStack())]

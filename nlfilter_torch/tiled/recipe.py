@@ -29,11 +29,7 @@ def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> R
 def edit_tiling(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Iterator[Tiling]:
     """Yield the rows of the picture edited as by :meth:`Recipe.apply`, not yet computed after the last step.
 
-    Args:
-        passes: tiling options of every step.
-        source: as in :func:`stream_detail`.
-        recipe: the edit.
-        name: of the source, for error messages.
+    ``name`` is that of the source, for error messages.
 
     Raises:
         ValueError: if a step needs the whole picture at once, or does not suit the picture.

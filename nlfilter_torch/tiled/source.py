@@ -102,14 +102,8 @@ class Tiled:
             MemoryError: if not even one row fits, or the samples do not.
         """
         check_scribble_memory(self.picture, self.scribbled_pixels, num_features, self.passes.memory)
-        return rows_that_fit(
-            self.picture,
-            self.passes,
-            floats=self.tile_floats + num_features,
-            num_features=num_features,
-            num_landmarks=num_landmarks,
-            extra_floats=self.cached_floats + self.stored_floats(num_features),
-        )
+        floats, kept = self.tile_floats + num_features, self.cached_floats + self.stored_floats(num_features)
+        return rows_that_fit(self.picture, self.passes, floats, num_features, num_landmarks, kept)
 
     def stored_floats(self, num_features: int) -> int:
         """Floats of stored guides, and of scribbles with ``num_features`` features per pixel."""
@@ -222,7 +216,7 @@ class Tiled:
         def summed(tile: Tile) -> Tensor:
             return planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
 
-        total = sum(self._map_tiles(summed, 0, self.picture.statistics_rows, "Averaging"))
+        total = sum(self._map_tiles(summed, self.picture.statistics_rows, "Averaging"))
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
 
     @torch.no_grad()
@@ -232,7 +226,7 @@ class Tiled:
         def part(tile: Tile) -> tuple[Tensor, Tensor]:
             return ends_of(planes(self.pixels_of(tile)))
 
-        parts = list(self._map_tiles(part, 0, self.picture.statistics_rows, "Finding black and white"))
+        parts = list(self._map_tiles(part, self.picture.statistics_rows, "Finding black and white"))
         least, largest = (torch.cat(values, dim=2) for values in zip(*parts, strict=True))
         return least.amin(2, keepdim=True), largest.amax(2, keepdim=True)
 
@@ -244,16 +238,16 @@ class Tiled:
         def part(tile: Tile) -> Tensor:
             return block_means(planes(self.pixels_of(tile)), step)
 
-        return torch.cat(list(self._map_tiles(part, 0, rows, "Reducing")), dim=2)
+        return torch.cat(list(self._map_tiles(part, rows, "Reducing")), dim=2)
 
-    def _map_tiles(self, function: Callable[[Tile], Result], margin: int, rows: int, stage: str) -> Iterator[Result]:
+    def _map_tiles(self, function: Callable[[Tile], Result], rows: int, stage: str) -> Iterator[Result]:
         """Apply a function to each tile, and yield the results in order.
 
         The first tile is finished before the others begin, since it may compute the sums of an operator.
         """
 
         def tiles() -> Iterator[Tile]:
-            for tile in self.picture.tiles(margin, rows):
+            for tile in self.picture.tiles(0, rows):
                 self.passes.report(stage, tile.start, self.size[0])
                 yield tile
 

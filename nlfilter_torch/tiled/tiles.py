@@ -1,9 +1,10 @@
 """Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -13,7 +14,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.intermediate import intermediate
 from nlfilter_torch.tiled.pictures import KINDS, Picture, Rows, RowSource, RowTarget, Tile, stored_as, transparency
 from nlfilter_torch.tiled.sampling import Report, in_silence
 from nlfilter_torch.tiled.workers import in_order
@@ -196,6 +196,29 @@ class Processes(Protocol):
         """Compute rows and store them where all processes can read them."""
 
 
+@contextmanager
+def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iterator[RowSource]:
+    """Write rows (h, W, S) of a picture (H, W) between two steps to a temporary file, and yield that as a source.
+
+    Without a folder for the file, it is in the system's folder for temporary files.
+
+    Raises:
+        OSError: if the file does not fit.
+    """
+    with TemporaryFile(dir=folder) as file:
+        shape, kind = (*size, 0), np.dtype(np.float32)
+        for _, values in rows:
+            shape, kind = (*size, values.shape[2]), values.dtype
+            try:
+                file.write(np.ascontiguousarray(values).tobytes())
+            except OSError as error:
+                gigabytes = kind.itemsize * np.prod(shape) / 1e9
+                reason = f"{error.strerror}, for a temporary file of {gigabytes:.1f} GB between two steps of the edit"
+                raise OSError(error.errno, reason, str(folder)) from error
+        file.flush()
+        yield np.memmap(file, kind, "r", shape=shape)
+
+
 def factor_bytes(pixels: int, num_landmarks: int) -> int:
     """Memory in bytes for pixels that are computed together: their factor, and products of the same size."""
     return 16 * pixels * num_landmarks
@@ -217,7 +240,7 @@ def fill(target: RowTarget, rows: Rows) -> None:
         target[part] = values.reshape(values.shape[0], *target.shape[1:])
 
 
-def bytes_needed(picture: Picture, passes: Passes, num_features: int, num_landmarks: int, extra_floats: int = 0) -> int:
+def bytes_needed(picture: Picture, passes: Passes, num_features: int, num_landmarks: int, extra_floats: int) -> int:
     """Smallest memory in bytes for statistics and for rows; arguments as in :func:`rows_that_fit`."""
     size = picture.dtype.itemsize
     workers, rows = passes.workers(num_landmarks), passes.chunk_rows(picture.size[1], num_landmarks)
@@ -230,23 +253,9 @@ def bytes_needed(picture: Picture, passes: Passes, num_features: int, num_landma
 
 
 def rows_that_fit(
-    picture: Picture,
-    passes: Passes,
-    *,
-    floats: int,
-    num_features: int,
-    num_landmarks: int,
-    extra_floats: int = 0,
+    picture: Picture, passes: Passes, floats: int, num_features: int, num_landmarks: int, extra_floats: int
 ) -> int:
-    """Number of rows of a tile that fit in memory.
-
-    Args:
-        picture: to be edited.
-        passes: tiling options.
-        floats: per pixel of a tile.
-        num_features: features per pixel.
-        num_landmarks: M.
-        extra_floats: floats that are kept in memory besides.
+    """Number of rows of a tile that fit in memory, with ``floats`` per pixel, and ``extra_floats`` in memory besides.
 
     Raises:
         MemoryError: if not even one row fits, or the samples do not.
