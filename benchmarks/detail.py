@@ -9,7 +9,7 @@ halo      99th percentile of the excess over the local range of 11x11 pixels, in
 noise     ratio, after to before the edit, of noise of 5 grey levels in flat areas (the half of the picture with less
           activity), from two realisations of noise;
 clipped   pixels with a channel that becomes 0 or 255 but was not before, in percent;
-chroma    change of the mean chroma (YCbCr), in percent;
+chroma    change of the mean chroma (YCbCr), in percent; in a grey picture, of a hundredth of a level;
 mean      change of the mean brightness, in grey levels.
 
 With ``--scales``, one large photograph at 1.5, 6 and 24 megapixels under the same sliders: detail gain of each result
@@ -44,6 +44,7 @@ GAINS = (1.5, 2.0)
 RADIUS = 2.0
 TEXTURE = (0.5, 0.85)  # quantiles of activity
 NOISE = 5 / 255
+LEAST_CHROMA = 0.01 / 255  # mean chroma of a grey picture, at most, by the rounding of float32
 STRONGEST = 60.0
 LARGE = "retina"
 FACTORS = (1, 2, 4)  # of the sides
@@ -119,7 +120,7 @@ class Scene:
             255 * float(beyond.flatten().quantile(0.99)),
             float(noises[0] / noises[1]),
             100 * float(newly.any(1).float().mean()),
-            100 * float(chroma[0] / chroma[1] - 1) if chroma[1] > 0 else 0.0,
+            100 * float((chroma[0] - chroma[1]) / chroma[1].clamp(min=LEAST_CHROMA)),
             255 * float((z - y).mean()),
         )
 

@@ -11,7 +11,7 @@ from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.detail import limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.limits import Limits
+from nlfilter_torch.edits.limits import Balance, Limits
 from nlfilter_torch.edits.pixels import Fitted, part_of
 from nlfilter_torch.edits.resizing import resize, resized
 from nlfilter_torch.edits.viewing import viewed_size, within_limits
@@ -38,8 +38,21 @@ def drawn(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return image, torch.randn(2, 1, 40, 40, generator=generator, dtype=torch.float64)
 
 
+def saturated(seed: int = 0, size: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
+    """A yellow image without blue whose last third is muted, and changes of its luminance."""
+    generator = torch.Generator().manual_seed(seed)
+    yellow = torch.tensor([0.95, 0.8, 0.01], dtype=torch.float64).view(1, 3, 1, 1)
+    image = yellow * (0.95 + 0.1 * torch.rand(1, 3, size, size, generator=generator, dtype=torch.float64))
+    muted = slice(2 * size // 3, size)
+    image[..., muted] = 0.5 + 0.1 * (image[..., muted] - 0.5)
+    return image, 0.15 * torch.randn(1, 1, size, size, generator=generator, dtype=torch.float64)
+
+
 def changed(
-    image: torch.Tensor, change: torch.Tensor, limits: Limits = "soft", brighter: float | None = None
+    image: torch.Tensor,
+    change: torch.Tensor,
+    limits: Limits = "soft",
+    brighter: float | Balance | None = None,
 ) -> torch.Tensor:
     source = InMemory(image)
     return source.all(within_limits(source, Fitted(part_of(change)), limits, brighter))
@@ -94,6 +107,40 @@ def test_balance_keeps_mean_brightness_and_chroma(channels: int) -> None:
         torch.testing.assert_close(found[1], means(image)[1], atol=2e-6, rtol=0)
 
 
+def test_saturated_colours_keep_their_chroma_and_muted_ones_their_detail() -> None:
+    image, change = saturated()
+    before = image - luminance(image)
+
+    def lost(found: torch.Tensor) -> float:
+        return 1 - float((found - luminance(found)).norm(dim=1).mean() / before.norm(dim=1).mean())
+
+    assert lost(changed(image, change)) > 0.1
+    found = changed(image, change, brighter=0.0)
+    assert abs(lost(found)) < 0.015
+    assert abs((luminance(found) - luminance(image)).mean()) < 2e-6
+    assert bool((torch.linalg.cross(before, found - luminance(found), dim=1).abs() < 1e-7).all())  # hues are kept
+    free, full = (changed(image, change, brighter=Balance(torch.tensor(r).double())) for r in (0.0, 1.0))
+    assert abs(lost(full)) < 1e-6
+    torch.testing.assert_close(full[..., 27:], free[..., 27:], atol=0, rtol=0)
+    assert torch.equal(changed(image, change), free)
+    both = torch.cat([image, 0.3 + 0.1 * image]), torch.cat([change, change])  # the second needs no restraint
+    together = changed(*both, brighter=0.0)
+    for i in range(2):
+        alone = changed(both[0][i : i + 1], both[1][i : i + 1], brighter=0.0)
+        torch.testing.assert_close(together[i : i + 1], alone, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("restraint", [0.3, 0.7, 1.0])
+@pytest.mark.parametrize(("rest", "change"), [((87, 160), -0.055), ((170, 90), 0.05)])
+def test_a_restrained_change_causes_no_edge(rest: tuple[int, int], change: float, restraint: float) -> None:
+    ends = [9, 8, 7, 6, 5, 4, 3, 2, 1, 0] if change < 0 else [246, 247, 248, 249, 250, 251, 252, 253, 254, 255]
+    sky = torch.tensor([[end, *rest] for end in ends]).T.reshape(1, 3, 1, 10) / 255
+    balance = Balance(torch.tensor(restraint))
+    moved = luminance(changed(sky, torch.full((1, 1, 1, 10), change), brighter=balance) - sky).flatten() * 255
+    assert bool((moved * change >= 0).all())
+    assert moved.diff().abs().max() < 1.01  # at most as much as the channel
+
+
 @pytest.mark.parametrize("name", EDITS)
 def test_edits_keep_mean_brightness_and_chroma(name: str) -> None:
     image = colour("astronaut", 60, 80)
@@ -110,6 +157,9 @@ def test_limits_have_exact_gradients() -> None:
     image = torch.rand(1, 3, 4, 5, generator=generator, dtype=torch.float64, requires_grad=True)
     change = torch.randn(1, 1, 4, 5, generator=generator, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(changed, (image, change))
+    for tensors in (saturated(size=6), (image.detach(), change.detach())):
+        inputs = [tensor.clone().requires_grad_() for tensor in tensors]
+        assert torch.autograd.gradcheck(lambda x, d: changed(x, d, brighter=0.0), inputs)
     still = torch.zeros(1, 1, 4, 5, dtype=torch.float64, requires_grad=True)
     changed(image.detach(), still).sum().backward()
     assert still.grad is not None
@@ -226,8 +276,11 @@ def test_gradients_go_through_the_viewing_size(name: str) -> None:
     assert image.grad.abs().max() > 0
 
 
-def test_tiles_are_those_of_the_edit_in_memory() -> None:
+@pytest.mark.parametrize("saturation", [1.0, 3.0])
+def test_tiles_are_those_of_the_edit_in_memory(saturation: float) -> None:
     image = colour("coffee", 120, 160)
+    if saturation > 1:  # many channels at 0 and 1
+        image = torch.lerp(luminance(image), image, saturation).clamp(0, 1)
     rows = image[0].permute(1, 2, 0).numpy().astype(np.float32)
     weights = np.zeros((120, 160, 1), np.float32)
     weights[20:40, 30:60] = 1

@@ -1,7 +1,7 @@
 """Changes of luminance that clip nothing and keep the mean brightness and chroma of a picture.
 
-A change is limited in each pixel by :func:`limit`. The limits shift the mean brightness and chroma of the picture a
-little, which :func:`balance_of` measures and :func:`balanced` corrects.
+A change is limited in each pixel by :func:`limit`. The limits shift the mean brightness and chroma of the picture,
+which :func:`balance_of` measures and :func:`balanced` corrects.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.edits.colour import split_luminance
 from nlfilter_torch.operator.features import reduce_channels
 
@@ -19,6 +20,7 @@ LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that r
 CHANNEL_WEIGHT = 0.25  # weight of the channel with the least headroom
 MAX_SATURATION_GAIN = 2.0  # limit of the relative growth of saturation, as a multiple of that of luminance
 MIN_LUMINANCE = 0.02  # lower limit of the luminance that the change of luminance is divided by
+MAX_CHROMA_LOSS = 0.01  # relative decrease of the mean chroma that is left when changes of luminance are restrained
 MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
 EPSILON = 1e-9
 Limits = Literal["soft", "none"]
@@ -29,10 +31,13 @@ class Balance:
     """Correction of a limited change of brightness, so that a picture keeps its mean brightness and chroma.
 
     Attributes:
+        restraint: fraction in [0, 1] that is removed from the part of the change that costs chroma, (B, 1, 1, 1); the
+            number 0 if the loss of chroma is small.
         curve: k of the tone curve ``y - k y (1 - y)`` applied after the change, (B, 1 or C, 1, 1).
         colour: fraction in [0, 1] of the possible gain in saturation that is applied, (B, 1, 1, 1).
     """
 
+    restraint: float | Tensor = 0.0
     curve: float | Tensor = 0.0
     colour: float | Tensor = 0.0
 
@@ -68,7 +73,8 @@ def balanced(
 ) -> tuple[Tensor, Tensor | None]:
     """Apply the balance of the picture, if any, to the result of :func:`limit`, and find the change of saturation.
 
-    Chroma is kept as far as the headroom of the channels allows.
+    Chroma is kept as far as the headroom of the channels allows. If saturated colours would lose so much of it that the
+    others cannot make up for that, :attr:`Balance.restraint` makes the change of these colours smaller.
 
     Returns:
         The change, in the same shape; and the relative change of saturation, (B, 1, H, W), or None for a change of each
@@ -77,7 +83,7 @@ def balanced(
     if limits == "none":
         return moved, None
     balance = Balance() if balance is None else balance
-    moved = _bent(_before(image, moved), moved, balance.curve)
+    moved = _bent(_before(image, moved), _restrained(image, moved, balance.restraint), balance.curve)
     if moved.shape[1] == image.shape[1]:
         return moved, None
     less, more = _saturation(image, moved)
@@ -116,24 +122,37 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
         brighter: intended relative change of the mean brightness, (B, 1, 1, 1).
     """
 
-    def shifts(image: Tensor, moved: Tensor) -> Tensor:
-        before = _before(image, moved)
-        after = before + moved
-        return torch.cat([moved, before, after * (1 - after)], dim=1)
+    def curve_of(restraint: float | Tensor) -> Tensor:
+        def shifts(image: Tensor, moved: Tensor) -> Tensor:
+            before, moved = _before(image, moved), _restrained(image, moved, restraint)
+            after = before + moved
+            return torch.cat([moved, before, after * (1 - after)], dim=1)
 
-    shift, before, room = mean(shifts).chunk(3, dim=1)
-    curve = ((shift - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
+        shift, before, room = mean(shifts).chunk(3, dim=1)
+        return ((shift - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
 
-    def chromas(image: Tensor, moved: Tensor) -> Tensor:
-        """Lost and possible gained chroma."""
-        if moved.shape[1] == image.shape[1]:
-            return image.new_zeros(len(image), 2, *image.shape[2:])
-        less, more = _saturation(image, _bent(_before(image, moved), moved, curve))
-        chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
-        return torch.cat([-less * chroma, more * chroma], dim=1)
+    def chroma_of(restraint: float | Tensor, curve: Tensor) -> tuple[Tensor, ...]:
+        """Means of the lost chroma, of the chroma that can be gained, and of the chroma of the picture."""
 
-    lost, gained = mean(chromas).chunk(2, dim=1)
-    return Balance(curve, (lost / gained.clamp(min=EPSILON)).clamp(max=1.0))
+        def chromas(image: Tensor, moved: Tensor) -> Tensor:
+            if moved.shape[1] == image.shape[1]:
+                return image.new_zeros(len(image), 3, *image.shape[2:])
+            less, more = _saturation(image, _bent(_before(image, moved), _restrained(image, moved, restraint), curve))
+            chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
+            return torch.cat([-less * chroma, more * chroma, chroma], dim=1)
+
+        return mean(chromas).chunk(3, dim=1)
+
+    restraint: float | Tensor = 0.0
+    curve = curve_of(restraint)
+    lost, gained, chroma = chroma_of(restraint, curve)
+    allowed = gained + MAX_CHROMA_LOSS * chroma
+    if is_hidden(lost) or bool((lost > allowed).any()):
+        # With a constant curve, the loss is proportional to 1 - restraint, and the gain constant.
+        restraint = (1 - allowed / lost.clamp(min=EPSILON)).clamp(min=0.0)
+        curve = curve_of(restraint)
+        lost, gained, _ = chroma_of(restraint, curve)
+    return Balance(restraint, curve, (lost / gained.clamp(min=EPSILON)).clamp(max=1.0))
 
 
 def _before(image: Tensor, change: Tensor) -> Tensor:
@@ -154,6 +173,19 @@ def _room(distance: Tensor) -> Tensor:
 def _inside(before: Tensor, moved: Tensor) -> Tensor:
     """Clamp a change to the headroom."""
     return torch.minimum(torch.maximum(moved, -_room(before)), _room(1 - before))
+
+
+def _restrained(image: Tensor, moved: Tensor, restraint: float | Tensor) -> Tensor:
+    """Reduce the part of a change of luminance for which the channel with the least headroom leaves no room.
+
+    In saturated colours, it is this part that costs chroma. Other colours have none.
+    """
+    if isinstance(restraint, float) or moved.shape[1] == image.shape[1]:
+        return moved
+    up = moved >= 0
+    nearest = torch.where(up, 1 - image.amax(1, keepdim=True), image.amin(1, keepdim=True))
+    removed = restraint * (moved.abs() - _room(nearest)).clamp(min=0.0)
+    return torch.where(up, moved - removed, moved + removed)
 
 
 def _bent(before: Tensor, moved: Tensor, curve: float | Tensor) -> Tensor:
