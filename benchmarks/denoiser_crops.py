@@ -43,12 +43,11 @@ class Crops:
         side: of the crops, in pixels.
         seed: of all random numbers.
         textured: share of crops with an added texture.
-        turned: share of crops that are turned by any angle and stretched, not only by right angles.
     """
 
-    def __init__(self, side: int, seed: int, *, textured: float = 0.0, turned: float = 0.0) -> None:
+    def __init__(self, side: int, seed: int, *, textured: float = 0.0) -> None:
         self.side, self.generator = side, torch.Generator().manual_seed(seed)
-        self.textured, self.turned = textured, turned
+        self.textured = textured
         self.pictures: list[Tensor] = []
         weights = []
         for name, weight in PICTURES.items():
@@ -97,28 +96,9 @@ class Crops:
     def _cut(self) -> Tensor:
         """A crop (C, side, side), rotated and mirrored at random."""
         picture = self.pictures[int(torch.multinomial(self.weights, 1, generator=self.generator))]
-        if self.turned and self._chance(self.turned):
-            crop = self._turn(picture)
-        else:
-            row, column = (self._below(length - self.side + 1) for length in picture.shape[-2:])
-            crop = torch.rot90(picture[:, row : row + self.side, column : column + self.side], self._below(4), (1, 2))
+        row, column = (self._below(length - self.side + 1) for length in picture.shape[-2:])
+        crop = torch.rot90(picture[:, row : row + self.side, column : column + self.side], self._below(4), (1, 2))
         return crop.flip(2) if self._chance(0.5) else crop
-
-    def _turn(self, picture: Tensor) -> Tensor:
-        """A crop at any angle, reduced by up to a half, and by up to a quarter more along one of its sides."""
-        angle, stretch = self._number(0, 2 * math.pi), self._number(-0.12, 0.12)
-        reduction = math.exp(self._number(0, math.log(2)))
-        down, across = (torch.tensor([math.cos(turn), math.sin(turn)]) for turn in (angle, angle + math.pi / 2))
-        offsets = (torch.arange(self.side) - (self.side - 1) / 2) * reduction
-        places = (offsets * math.exp(stretch))[:, None, None] * down + (offsets / math.exp(stretch))[:, None] * across
-        half = places.abs().amax((0, 1))  # (rows, columns)
-        sides = torch.tensor(picture.shape[-2:])
-        room = (sides - 1 - 2 * half).clamp(min=0.0)
-        places = places + half.clamp(max=(sides - 1) / 2) + room * self._random(2)
-        grid = (2 * places / (sides - 1) - 1).flip(2)[None]
-        # Bicubic interpolation between pixels twice as far apart as the crop's aliases little: photographs are smooth.
-        crop = F.grid_sample(picture[None], grid, mode="bicubic", padding_mode="reflection", align_corners=True)
-        return crop[0].clamp(0, 1)
 
     def _blend(self, first: Tensor, second: Tensor) -> Tensor:
         """Blend two crops, or put them side by side with a soft or sharp border."""

@@ -109,7 +109,6 @@ class Training:
         start: file of the initial weights; None draws them.
         fall: final share of the steps, over which the learning rate falls to zero.
         textured: share of crops with an added texture.
-        turned: share of crops that are turned by any angle and stretched.
     """
 
     def __init__(
@@ -123,7 +122,6 @@ class Training:
         start: Path | None = None,
         fall: float = FALL,
         textured: float = 0.0,
-        turned: float = 0.0,
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed).to(memory_format=torch.channels_last)
         if start is not None:
@@ -147,8 +145,8 @@ class Training:
         ]
         self.rates = (rate, ADAM_RATE * rate, BANDWIDTH_RATE * rate)
         self.half, self.fall = half, fall
-        self.crops = Crops(side, seed, textured=textured, turned=turned)
-        aside = Crops(side, ASIDE_SEED, textured=textured, turned=turned)
+        self.crops = Crops(side, seed, textured=textured)
+        aside = Crops(side, ASIDE_SEED, textured=textured)
         self.aside = [aside.batch(ASIDE, grey=grey) for grey in (True, False)]
         self.losses: list[float] = []
         self.curve: list[float] = []
@@ -259,9 +257,6 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--textured", type=float, default=0.0, help="share of crops with an added texture; default %(default)s"
     )
-    parser.add_argument(
-        "--turned", type=float, default=0.0, help="share of crops turned by any angle; default %(default)s"
-    )
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
     parser.add_argument(
         "--half", action="store_true", help="convolutions in bfloat16, fast where the processor has AMX"
@@ -278,10 +273,8 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rate must be between 0 and 1, got {options.rate}; {RATE} does well")
     if not 0 < options.fall <= 1:
         parser.error(f"--fall must be above 0 and at most 1, got {options.fall}; {FALL} does well")
-    for name in ("textured", "turned"):
-        share = getattr(options, name)
-        if not 0 <= share <= 1:
-            parser.error(f"--{name} must be 0 to 1, got {share}; it is a share of the crops")
+    if not 0 <= options.textured <= 1:
+        parser.error(f"--textured must be 0 to 1, got {options.textured}; it is a share of the crops")
     if options.start is not None and not options.start.is_file():
         parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
     if options.out.exists() and not options.out.is_dir():
@@ -302,7 +295,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start=options.start,
         fall=options.fall,
         textured=options.textured,
-        turned=options.turned,
     )
     state = options.out / "state.pt"
     if state.exists():
@@ -311,8 +303,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parameters = sum(parameter.numel() for parameter in training.model.parameters())
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
     figures = {
-        name: getattr(options, name)
-        for name in ("steps", "side", "seed", "rate", "fall", "textured", "turned", "plain", "half")
+        name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "textured", "plain", "half")
     }
     if options.start is not None:
         with safe_open(options.start, "pt") as weights:
