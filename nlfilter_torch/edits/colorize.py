@@ -228,7 +228,7 @@ def fit_colorize(
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
         del operator  # frees its factor before the next one is computed
     far, near = parts
-    everywhere = torch.as_tensor(strength, dtype=source.dtype).reshape(-1, 1, 1, 1)
+    everywhere = torch.as_tensor(strength).to(wanted).reshape(-1, 1, 1, 1)
 
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
