@@ -42,7 +42,8 @@ def local(links: Links, image: Tensor, places: Tensor, weights: Tensor, values: 
     """Return mean values and influence of scribbled pixels."""
     step = links.step((image.shape[2], image.shape[3]))
     guide = InMemory(image).reduced(luminance, step)
-    return LocalValues.of(links, guide, step, image.shape[3], places, weights, values)(image, 0)
+    found = LocalValues.of(links, guide, step, image.shape[3], places, weights, values)(image, 0)
+    return found[:, :-1], found[:, -1:]
 
 
 @LINKS

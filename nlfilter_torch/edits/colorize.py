@@ -2,8 +2,9 @@
 
 Three estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart; two
 :class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
-errors are in different places, so that the mean is better than each, above all if an estimate far from the other two
-counts less. The regression extends chroma relative to :func:`usual_chroma`, since shadows and highlights of an object
+errors are in different places, so that the mean is better than each. Where they differ, the more saturated ones count
+less, and so do those whose hue differs from that of the estimate by relative differences, whose largest errors are the
+smallest. The regression extends chroma relative to :func:`usual_chroma`, since shadows and highlights of an object
 have less than its midtones; propagation between neighbours, relative to its square root.
 """
 
@@ -62,9 +63,9 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
-WEIGHTS = 1.0, 1.0, 1.5  # of the regression, and of neighbours by absolute and by relative differences
-SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
+FAINT, GREY = 0.05, 0.02  # chroma below which estimates differ little in weight, and in hue
+OTHER_HUE = 0.1  # weight of an estimate of the opposite hue
 
 
 @full_precision
@@ -87,7 +88,7 @@ def colorize(
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
     distances, then the residual near the strokes. Two estimates by propagation between neighbouring pixels up to edges
-    are blended in; the estimate that differs most from the other two counts least. Shadows and highlights get less
+    are blended in. Shadows and highlights get less
     chroma than midtones of the same object. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides the image
     into one segment per colour.
 
@@ -205,10 +206,16 @@ def fit_colorize(
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
     marks = [scribbles.places, scribbles.weights, wanted / usual_there.sqrt()]
 
-    def propagated(links: Links) -> LocalValues:
+    def propagated(links: Links) -> Planes:
         step = links.step(small)
         guide = viewed.reduced(luminance, step)
-        return viewed.kept(links, [guide, *marks], lambda: LocalValues.of(links, guide, step, small[1], *marks))
+        found = viewed.kept(links, [guide, *marks], lambda: LocalValues.of(links, guide, step, small[1], *marks))
+
+        def interpolated(some: Any) -> Tensor:
+            place = (links, some.first, some.image.shape)
+            return viewed.kept(place, [found.values], lambda: found(luminance(some), some.first))
+
+        return interpolated
 
     absolute, relative = propagated(ABSOLUTE), propagated(RELATIVE)
     wanted = wanted / usual_there
@@ -233,12 +240,12 @@ def fit_colorize(
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
         usual = usual_chroma(own)
-        connected, influence = absolute(own, some.first)
-        around, _ = relative(own, some.first)
+        connected, influence = absolute(some).tensor_split([2], dim=1)
+        around = relative(some)[:, :2]
         alike = (far(some) + near(some)) * usual
         around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
-        return agreed_mean([alike, connected, around])
+        return mean_by_hue(alike, connected, around, influence)
 
     return _coloured(source, viewed, chroma_of)
 
@@ -249,16 +256,24 @@ def usual_chroma(image: Tensor) -> Tensor:
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
 
 
-def agreed_mean(estimates: list[Tensor]) -> Tensor:
-    """Mean of three estimates (B, C, H, W): the weight of each falls with its distance from the other two."""
-    first, second, third = (
-        (one - other).square().sum(1, keepdim=True)
-        for one, other in zip(estimates, estimates[1:] + estimates[:1], strict=True)
-    )
-    distances = (first + third, first + second, second + third)  # squared, from both others
-    shares = [weight * (d + SAME_CHROMA**2).rsqrt() for weight, d in zip(WEIGHTS, distances, strict=True)]
-    weighted = [share * estimate for share, estimate in zip(shares, estimates, strict=True)]
-    return torch.stack(weighted).sum(0) / torch.stack(shares).sum(0)
+def mean_by_hue(alike: Tensor, connected: Tensor, around: Tensor, influence: Tensor) -> Tensor:
+    """Average three estimates (B, 2, H, W), of which the last decides on the hue.
+
+    Args:
+        alike: estimate by similarity.
+        connected: estimate by absolute differences of neighbours.
+        around: estimate by relative differences of neighbours.
+        influence: of the scribbles on ``connected``, (B, 1, H, W).
+    """
+    own = around.square().sum(1, keepdim=True)
+    total, weights = around.new_zeros(()), around.new_zeros(())
+    for estimate, weight in ((alike, 1.0), (connected, influence), (around, 1.0)):
+        squared = estimate.square().sum(1, keepdim=True)
+        product = torch.addcmul(estimate[:, :1] * around[:, :1], estimate[:, 1:], around[:, 1:])
+        cosine = (product + GREY**2) * ((squared + GREY**2) * (own + GREY**2)).rsqrt()
+        share = weight * ((1 + cosine) / 2 + OTHER_HUE) * (squared + FAINT**2).rsqrt()
+        total, weights = torch.addcmul(total, share, estimate), weights + share
+    return total / weights
 
 
 def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:

@@ -23,7 +23,7 @@ from torch import Tensor
 from nlfilter_torch.filtering.neighbours import solve_stencil
 
 SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
-SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 3e-5  # squared differences at which a relative weight falls to 1/e
+SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a relative weight falls to 1/e
 MIN_RELATIVE = 1e-6  # relative weight of the least similar neighbour
 SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference of a pixel from a block, and least weight of a block
 SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
@@ -105,8 +105,8 @@ class LocalValues:
         stencil = torch.cat([-alike[:, :4], own, -alike[:, 5:]], dim=1).unflatten(1, (3, 3))
         return LocalValues(solve_stencil(stencil, sums), guide, step, width)
 
-    def __call__(self, own: Tensor, first: int) -> tuple[Tensor, Tensor]:
-        """Return mean values (B, C, h, w) of scribbles, and their influence (B, 1, h, w) in [0, 1], for a rectangle.
+    def __call__(self, own: Tensor, first: int) -> Tensor:
+        """Return mean values of scribbles, and their influence in [0, 1], for a rectangle: (B, C+1, h, w).
 
         The influence is the square root of the interpolated solution for ones.
 
@@ -116,7 +116,7 @@ class LocalValues:
         """
         found = self._at(own, *divmod(first, self.width))
         influence = found[:, -1:].clamp(min=MIN_INFLUENCE)
-        return found[:, :-1] / influence, influence.sqrt()
+        return torch.cat([found[:, :-1] / influence, influence.sqrt()], dim=1)
 
     def _at(self, own: Tensor, top: int, left: int) -> Tensor:
         """Interpolate the solutions (B, C+1, h, w) in a rectangle."""
