@@ -2,10 +2,10 @@
 
 Three estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart; two
 :class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
-errors are in different places, so that the mean is better than each. Where they differ, the more saturated ones count
-less, and so do those whose hue differs from that of the estimate by relative differences, whose largest errors are the
-smallest. The regression extends chroma relative to :func:`usual_chroma`, since shadows and highlights of an object
-have less than its midtones; propagation between neighbours, relative to its square root.
+errors are in different places, so that the mean is better than each. An estimate counts less the farther it is from the
+other two, the more saturated it is, and the more its hue differs from that of the estimate by relative differences,
+whose largest errors are the smallest. The regression extends chroma relative to :func:`usual_chroma`, since shadows and
+highlights of an object have less than its midtones; propagation between neighbours, relative to its square root.
 """
 
 import math
@@ -64,6 +64,7 @@ class Stage:
 # names for that and on thirteen more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
+SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 FAINT, GREY = 0.05, 0.02  # chroma below which estimates differ little in weight, and in hue
 OTHER_HUE = 0.1  # weight of an estimate of the opposite hue
 
@@ -245,7 +246,7 @@ def fit_colorize(
         alike = (far(some) + near(some)) * usual
         around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
-        return mean_by_hue(alike, connected, around, influence)
+        return weighted_mean(alike, connected, around, influence)
 
     return _coloured(source, viewed, chroma_of)
 
@@ -256,8 +257,11 @@ def usual_chroma(image: Tensor) -> Tensor:
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
 
 
-def mean_by_hue(alike: Tensor, connected: Tensor, around: Tensor, influence: Tensor) -> Tensor:
-    """Average three estimates (B, 2, H, W), of which the last decides on the hue.
+def weighted_mean(alike: Tensor, connected: Tensor, around: Tensor, influence: Tensor) -> Tensor:
+    """Average three estimates (B, 2, H, W).
+
+    The weight of each falls with its distance from the other two, with its saturation, and with the difference of its
+    hue from that of ``around``.
 
     Args:
         alike: estimate by similarity.
@@ -265,13 +269,17 @@ def mean_by_hue(alike: Tensor, connected: Tensor, around: Tensor, influence: Ten
         around: estimate by relative differences of neighbours.
         influence: of the scribbles on ``connected``, (B, 1, H, W).
     """
-    own = around.square().sum(1, keepdim=True)
+    first, second, third = (
+        (one - other).square().sum(1, keepdim=True)
+        for one, other in ((alike, connected), (connected, around), (around, alike))
+    )
+    distances = (first + third, first + second, second + third)  # squared, from both others
+    own = around.square().sum(1, keepdim=True) + GREY**2
     total, weights = around.new_zeros(()), around.new_zeros(())
-    for estimate, weight in ((alike, 1.0), (connected, influence), (around, 1.0)):
+    for estimate, weight, distance in zip((alike, connected, around), (1.0, influence, 1.0), distances, strict=True):
         squared = estimate.square().sum(1, keepdim=True)
-        product = torch.addcmul(estimate[:, :1] * around[:, :1], estimate[:, 1:], around[:, 1:])
-        cosine = (product + GREY**2) * ((squared + GREY**2) * (own + GREY**2)).rsqrt()
-        share = weight * ((1 + cosine) / 2 + OTHER_HUE) * (squared + FAINT**2).rsqrt()
+        cosine = ((estimate * around).sum(1, keepdim=True) + GREY**2) * ((squared + GREY**2) * own).rsqrt()
+        share = weight * ((1 + cosine) / 2 + OTHER_HUE) * (squared + FAINT**2).rsqrt() / (distance + SAME_CHROMA**2)
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 
