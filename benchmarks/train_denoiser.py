@@ -10,7 +10,8 @@ curve.png              the loss on validation crops;
 state.pt               the state of the training: the same command resumes a stopped training, and a larger number of
                        steps continues a finished one.
 
-``--start FILE`` starts from trained weights, and raises the learning rate again. ``--plain`` trains the same network
+``--start FILE`` starts from trained weights, and raises the learning rate again. ``--passes 1`` trains a single pass of
+the network, in half the time; the second pass of its weights repeats the first. ``--plain`` trains the same network
 with a further convolution in place of the filter, for comparison. Equal arguments give equal weights on the same
 machine with the same number of threads.
 """
@@ -33,7 +34,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import Crops
 from nlfilter_torch.io.photographs import open_beside
-from nlfilter_torch.nn.denoiser import PLANES, WIDTH, NonlocalDenoiser
+from nlfilter_torch.nn.denoiser import ADDED, PASSES, PLANES, WIDTH, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.plotting import save_figure
 
@@ -54,14 +55,14 @@ ASIDE, ASIDE_SEED = 24, 1_000_000  # validation crops of each kind, and their se
 class PlainDenoiser(NonlocalDenoiser):
     """The denoiser without the filter: a convolution, with more weights, in place of guide and sliders."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, passes: int = PASSES) -> None:
+        super().__init__(passes)
         del self.log_bandwidths
         self.guide = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
         self.picture = nn.Conv2d(WIDTH, PLANES, 1)
         self.register_buffer("log_bandwidths", torch.zeros(2), persistent=False)
 
-    def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
+    def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
         """Estimate the smoothed planes by convolutions."""
         found: Tensor = self.picture(F.leaky_relu(self.guide(F.leaky_relu(features, 0.1)), 0.1))
         return planes + found.to(planes)
@@ -90,11 +91,11 @@ def _as_matrix(kernel: Tensor) -> Tensor:
     return kernel.detach().permute(0, 2, 3, 1).view(len(kernel), -1)
 
 
-def new_denoiser(*, plain: bool, seed: int) -> NonlocalDenoiser:
+def new_denoiser(*, plain: bool, seed: int, passes: int) -> NonlocalDenoiser:
     """Create a denoiser with weights drawn from a seed."""
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.manual_seed(seed)
-        return PlainDenoiser() if plain else NonlocalDenoiser()
+        return PlainDenoiser(passes) if plain else NonlocalDenoiser(passes)
 
 
 class Training:
@@ -109,6 +110,7 @@ class Training:
         start: file of the initial weights; None draws them.
         fall: final share of the steps, over which the learning rate falls to zero.
         textured: share of crops with an added texture.
+        passes: of the network.
     """
 
     def __init__(
@@ -122,13 +124,14 @@ class Training:
         start: Path | None = None,
         fall: float = FALL,
         textured: float = 0.0,
+        passes: int = PASSES,
     ) -> None:
-        self.model = new_denoiser(plain=plain, seed=seed).to(memory_format=torch.channels_last)
+        self.model = new_denoiser(plain=plain, seed=seed, passes=passes).to(memory_format=torch.channels_last)
         if start is not None:
-            shapes = {name: tuple(value.shape) for name, value in self.model.named_parameters()}
-            self.model.load_state_dict(read_weights(start, shapes))
+            self.model.load_state_dict(read_weights(start, shapes_of(self.model), ADDED))
+        self.model.again.requires_grad_(passes > 1)
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
-        named = dict(self.model.named_parameters())
+        named = {name: weight for name, weight in self.model.named_parameters() if weight.requires_grad}
         bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []
         self.kernels = [
             (weight, _as_matrix(weight)) for weight in named.values() if weight.ndim == 4 and len(weight) > PLANES
@@ -257,6 +260,7 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--textured", type=float, default=0.0, help="share of crops with an added texture; default %(default)s"
     )
+    parser.add_argument("--passes", type=int, default=PASSES, help="of the network; default %(default)s")
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
     parser.add_argument(
         "--half", action="store_true", help="convolutions in bfloat16, fast where the processor has AMX"
@@ -275,6 +279,8 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--fall must be above 0 and at most 1, got {options.fall}; {FALL} does well")
     if not 0 <= options.textured <= 1:
         parser.error(f"--textured must be 0 to 1, got {options.textured}; it is a share of the crops")
+    if options.passes < 1:
+        parser.error(f"--passes must be at least 1, got {options.passes}; {PASSES} are what the package has")
     if options.start is not None and not options.start.is_file():
         parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
     if options.out.exists() and not options.out.is_dir():
@@ -295,6 +301,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start=options.start,
         fall=options.fall,
         textured=options.textured,
+        passes=options.passes,
     )
     state = options.out / "state.pt"
     if state.exists():
@@ -303,7 +310,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parameters = sum(parameter.numel() for parameter in training.model.parameters())
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
     figures = {
-        name: getattr(options, name) for name in ("steps", "side", "seed", "rate", "fall", "textured", "plain", "half")
+        name: getattr(options, name)
+        for name in ("steps", "side", "seed", "rate", "fall", "textured", "passes", "plain", "half")
     }
     if options.start is not None:
         with safe_open(options.start, "pt") as weights:

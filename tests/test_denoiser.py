@@ -325,6 +325,45 @@ def test_files_that_are_damaged_or_of_something_else_name_themselves(tmp_path: P
         NonlocalDenoiser.trained(path)
 
 
+def test_a_second_pass_repeats_the_first_until_it_is_trained(tmp_path: Path) -> None:
+    """So files without its weights, which had one pass, give what they gave."""
+    from safetensors.torch import save_file
+
+    once = NonlocalDenoiser(passes=1)
+    save_file({n: v for n, v in once.state_dict().items() if not n.startswith("again")}, tmp_path / "once.safetensors")
+    twice = NonlocalDenoiser.trained(tmp_path / "once.safetensors")
+    assert twice.passes == 2
+    image = CAT[..., :40, :40]
+    with torch.no_grad():
+        assert torch.equal(once(image, 0.1), twice(image, 0.1))
+        assert not torch.equal(TRAINED_ONE(image, 0.1), once(image, 0.1))
+
+
+def test_a_second_pass_is_trained_with_the_first() -> None:
+    denoiser = NonlocalDenoiser()
+    denoiser(CAT[..., :24, :24], 0.1).square().mean().backward()
+    assert denoiser.again.weight.grad is not None
+    assert denoiser.again.weight.grad.abs().max() > 0
+
+
+def test_where_the_second_pass_diverges_the_first_result_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With features that are too large, as regular stripes beside an even area may have."""
+    denoiser = NonlocalDenoiser()
+    denoiser.load_state_dict(TRAINED_ONE.state_dict())
+    clean = CAT[..., :64, :64]
+    image = noisy(clean, 4 / 255)
+    with torch.no_grad():
+        denoiser.again.bias += 60.0
+        assert decibels(denoiser(image, 4 / 255), clean) > decibels(image, clean) + 1
+        monkeypatch.setattr(module, "LARGEST", 1e6)
+        assert decibels(denoiser(image, 4 / 255), clean) < 20
+
+
+def test_passes_are_counted() -> None:
+    with pytest.raises(ValueError, match="passes must be at least 1, got 0"):
+        NonlocalDenoiser(passes=0)
+
+
 def test_weights_of_ones_own_are_loaded(tmp_path: Path) -> None:
     from safetensors.torch import save_file
 

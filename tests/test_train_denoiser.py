@@ -86,6 +86,16 @@ def test_a_training_starts_from_weights_of_another(more: list[str], tmp_path: Pa
     assert (figures["start"]["side"], figures["start"]["steps"], figures["side"]) == ("16", "2", 20)
 
 
+def test_the_second_pass_is_not_trained_with_the_first_alone(tmp_path: Path) -> None:
+    main(["--steps", "2", "--side", "16", "--passes", "1", "--out", str(tmp_path)])
+    assert json.loads((tmp_path / "denoiser.json").read_text())["passes"] == 1
+    weights = load_file(tmp_path / "denoiser.safetensors")
+    assert weights["again.weight"].abs().max() == 0
+    begun = Training(1, side=16, start=tmp_path / "denoiser.safetensors")
+    begun.run(2)
+    assert begun.model.again.weight.abs().max() > 0
+
+
 def test_a_larger_share_of_the_steps_has_a_falling_rate() -> None:
     rates = [rate_at(step, 1000, 0.75) for step in range(1000)]
     assert rates[250] == 1 > rates[252]
@@ -194,6 +204,7 @@ def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> 
         (["--seed", "-1"], "--seed must not be negative, got -1"),
         (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
         (["--fall", "0"], "--fall must be above 0 and at most 1, got 0"),
+        (["--passes", "0"], "--passes must be at least 1, got 0"),
         (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
         (["--steps", "many"], "--steps: invalid int value: 'many'"),
     ],

@@ -1,4 +1,4 @@
-"""A denoiser: a small network computes guide and sliders for the filter, which averages similar pixels."""
+"""A denoiser: in each of two passes, a small network computes guide and sliders for a filter of similar pixels."""
 
 import math
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import (
+    check_count,
     check_image,
     check_photograph,
     check_same_size,
@@ -23,18 +24,21 @@ from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
 
 TRAINED = Path(__file__).with_name("denoiser.safetensors")
+ADDED = ("again.weight", "again.bias")  # 0 where absent: files of earlier versions, whose denoiser had one pass
 
 WIDTH, FEATURES, ORDER = 48, 20, 3  # channels of the network and of the guide; order k of the sliders
-BEFORE, AFTER = (1, 2, 3, 4), (3,)  # dilations before and after the filter; the receptive field is 33x33 pixels
+BEFORE, AFTER = (1, 2, 3, 4), (3,)  # dilations before and after the filter; the receptive field of a pass is 33x33
+PASSES = 2
 PLANES, LEVELS = 3, 2  # colour planes, and noise levels for them
-PIXELS = 85  # pixels per landmark
+PIXELS, ROUGH_PIXELS = 85, 170  # pixels per landmark, in the last pass and in those before it
 BANDWIDTHS = (0.15, 12.0)  # initial bandwidths: of the guide, and in pixels
 FAINT = 1 / 255  # noise level below which filtering is reduced in proportion
+LARGEST, AROUND = 3.0, 8  # largest plausible correction, in noise levels, and the radius around others, in pixels
 BRIGHTEST = 2.0  # images of larger magnitude, which do not occur in training, are scaled down to this
 
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
-BORDER = 16  # width in pixels of the border added to images, so that their own border does not affect results
+BORDER = 8  # width in pixels of the border added to images, so that their own border does not affect results
 TILE_BATCH = 8  # tiles processed at once
 
 
@@ -43,11 +47,17 @@ class NonlocalDenoiser(nn.Module):
 
     A convolutional network computes two things at every pixel: a guide, from which :func:`operator_from_features`
     builds W, and sliders for a filter that averages pixels with similar guides. The filter removes most of the noise,
-    and further convolutions correct its result. Colours are split into luminance and two differences, so that the same
-    network handles grey images, whose differences are free of noise. Larger images are processed in overlapping tiles,
-    whose positions do not depend on the size of the image.
+    and further convolutions correct its result. A second pass with the same weights starts from the features of that
+    result, so that its guide is almost free of noise; where it diverges, which rare patterns cause, the first result is
+    kept. Colours are split into luminance and two differences, so that the same network handles grey images, whose
+    differences are free of noise. Larger images are processed in overlapping tiles, whose positions do not depend on
+    the size of the image.
 
     A new instance is untrained; :meth:`trained` loads the weights of the package.
+
+    Args:
+        passes: how often the network and its filter are applied. The weights of the package are trained for two; one
+            takes half the time, and needs weights trained for it.
 
     Example:
         >>> noisy = 0.5 + 0.1 * torch.randn(1, 1, 32, 32, generator=torch.Generator().manual_seed(0))
@@ -58,8 +68,10 @@ class NonlocalDenoiser(nn.Module):
         True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, passes: int = PASSES) -> None:
         super().__init__()
+        check_count(passes, "passes")
+        self.passes = passes
         self.first = _convolution(PLANES + LEVELS, WIDTH)
         self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in BEFORE)
         self.guide = _convolution(WIDTH, FEATURES + LEVELS * (ORDER + 1))
@@ -67,6 +79,9 @@ class NonlocalDenoiser(nn.Module):
         self.join = _convolution(WIDTH + 2 * PLANES, WIDTH)
         self.after = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in AFTER)
         self.last = _convolution(WIDTH, PLANES)
+        self.again = nn.Conv2d(WIDTH, WIDTH, 1)
+        for weight in self.again.parameters():
+            nn.init.zeros_(weight)  # every pass is like the first, until it is trained
 
     @classmethod
     def trained(
@@ -85,7 +100,7 @@ class NonlocalDenoiser(nn.Module):
         """
         with torch.device("meta"):
             denoiser = cls()
-        weights = read_weights(Path(path), {name: tuple(value.shape) for name, value in denoiser.named_parameters()})
+        weights = read_weights(Path(path), shapes_of(denoiser), ADDED)
         denoiser.load_state_dict({name: value.to(device, dtype) for name, value in weights.items()}, assign=True)
         return denoiser.eval()
 
@@ -148,19 +163,30 @@ class NonlocalDenoiser(nn.Module):
         planes, levels = split_colours(noisy / scale, noise / scale)
         middle = planes.new_tensor([0.5, 0.0, 0.0]).view(1, -1, 1, 1)
         seen = torch.cat([2 * (planes - middle), 10 * levels], dim=1)
-        features = self.first(seen.contiguous(memory_format=torch.channels_last))
-        for layer in self.before:
-            features = features + layer(_activated(features))
-        levels = levels[:, (0, 1, 1)]
-        found = (planes - self.smooth(features, planes)) * (levels / FAINT).clamp(max=1.0)
-        features = self.join(torch.cat([_activated(features), 2 * (planes - found - middle), 2 * found], dim=1))
-        for layer in self.after:
-            features = features + layer(_activated(features))
-        left = self.last(_activated(features))
-        return join_colours(found + levels * left.to(planes), noisy.shape[1]) * scale
+        first = features = self.first(seen.contiguous(memory_format=torch.channels_last))
+        levels, estimate = levels[:, (0, 1, 1)], planes
+        for number in range(self.passes):
+            if number > 0:
+                features = first + self.again(_activated(features))
+            for layer in self.before:
+                features = features + layer(_activated(features))
+            pixels = PIXELS if number == self.passes - 1 else ROUGH_PIXELS
+            found = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
+            features = self.join(torch.cat([_activated(features), 2 * (planes - found - middle), 2 * found], dim=1))
+            for layer in self.after:
+                features = features + layer(_activated(features))
+            left = self.last(_activated(features)).to(planes)
+            found = found + levels * left.clamp(-LARGEST, LARGEST)
+            if number > 0:
+                found = torch.lerp(estimate, found, _trust(left[:, : noisy.shape[1]]).to(found))
+            estimate = found
+        return join_colours(estimate, noisy.shape[1]) * scale
 
-    def smooth(self, features: Tensor, planes: Tensor) -> Tensor:
-        """Filter planes (B, 3, H, W) with a guide and sliders computed from ``features``, averaging similar pixels."""
+    def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
+        """Filter planes (B, 3, H, W) with a guide and sliders computed from ``features``, averaging similar pixels.
+
+        The filter has a landmark for every so many ``pixels``.
+        """
         height, width = planes.shape[-2:]
         guide, logits = self.guide(_activated(features)).to(planes).split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
@@ -169,11 +195,16 @@ class NonlocalDenoiser(nn.Module):
         operator = operator_from_features(
             torch.cat([guide.flatten(2) / alike, places.expand(len(guide), -1, -1)], dim=1),
             size=(height, width),
-            num_landmarks=max(1, height * width // PIXELS),
+            num_landmarks=max(1, height * width // pixels),
         )
         # Cumulative sums: the sliders increase to 1 for the smooth layer, so that the filter computes means of pixels.
         sliders = logits.unflatten(1, (ORDER + 1, LEVELS)).softmax(1).cumsum(1)[:, :, (0, 1, 1)]
         return (sliders * detail_layers(operator, planes, order=ORDER)).sum(1)
+
+
+def shapes_of(denoiser: NonlocalDenoiser) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the weights."""
+    return {name: tuple(value.shape) for name, value in denoiser.named_parameters()}
 
 
 def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tensor:
@@ -292,6 +323,12 @@ def _mixture(like: Tensor) -> Tensor:
     """Matrix (3, 3) from red, green and blue to luminance and differences."""
     rows = [[1 / 3, 1 / 3, 1 / 3], [0.5**0.5, 0.0, -(0.5**0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]]
     return like.new_tensor(rows)
+
+
+def _trust(left: Tensor) -> Tensor:
+    """1 where all corrections (B, C, H, W) nearby are plausible, 0 where one is twice as large as plausible."""
+    largest = F.max_pool2d(left.abs().amax(1, keepdim=True), 2 * AROUND + 1, stride=1, padding=AROUND)
+    return (2 - largest / LARGEST).clamp(0.0, 1.0)
 
 
 def _activated(features: Tensor) -> Tensor:
