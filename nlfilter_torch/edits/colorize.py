@@ -275,11 +275,12 @@ def weighted_mean(alike: Tensor, connected: Tensor, around: Tensor, influence: T
     )
     distances = (first + third, first + second, second + third)  # squared, from both others
     own = around.square().sum(1, keepdim=True) + GREY**2
+    factors: tuple[float | Tensor, ...] = (1.0, influence, 1.0)
     total, weights = around.new_zeros(()), around.new_zeros(())
-    for estimate, weight, distance in zip((alike, connected, around), (1.0, influence, 1.0), distances, strict=True):
+    for estimate, factor, distance in zip((alike, connected, around), factors, distances, strict=True):
         squared = estimate.square().sum(1, keepdim=True)
         cosine = ((estimate * around).sum(1, keepdim=True) + GREY**2) * ((squared + GREY**2) * own).rsqrt()
-        share = weight * ((1 + cosine) / 2 + OTHER_HUE) * (squared + FAINT**2).rsqrt() / (distance + SAME_CHROMA**2)
+        share = factor * ((1 + cosine) / 2 + OTHER_HUE) * (squared + FAINT**2).rsqrt() / (distance + SAME_CHROMA**2)
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 
