@@ -57,7 +57,7 @@ class NonlocalDenoiser(nn.Module):
 
     Args:
         passes: how often the network and its filter are applied. The weights of the package are trained for two; one
-            takes half the time, and needs weights trained for it.
+            is faster, and needs weights trained for it.
 
     Example:
         >>> noisy = 0.5 + 0.1 * torch.randn(1, 1, 32, 32, generator=torch.Generator().manual_seed(0))
