@@ -15,7 +15,7 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from nlfilter_torch.cli import folders, main, workers
+from nlfilter_torch.cli import folders, interrupts, main, workers
 from nlfilter_torch.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
 from nlfilter_torch.cli.workers import DEATHS
 from nlfilter_torch.edits.presets import PRESETS
@@ -209,7 +209,8 @@ def wait_for_ever(source: str, target: str) -> None:
 
 
 def run_for_ever(folder: str, target: str) -> None:
-    tally_of(pictures(Path(folder)), Path(target), wait_for_ever)
+    with interrupts.handled():  # as the command does; an interrupt during a callback would be lost
+        tally_of(pictures(Path(folder)), Path(target), wait_for_ever)
 
 
 @pytest.mark.slow
