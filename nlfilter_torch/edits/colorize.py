@@ -4,11 +4,13 @@ Three estimates of the chroma are averaged: the regression on the strokes relate
 :class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
 errors are in different places, so that the mean is better than each. An estimate counts less the farther it is from the
 other two, the more saturated it is, and the more its hue differs from that of the estimate by relative differences,
-whose largest errors are the smallest. The regression extends chroma relative to :func:`usual_chroma`, since shadows and
-highlights of an object have less than its midtones; propagation between neighbours, relative to its square root.
+which is never as wrong as the others are at worst. The regression extends chroma relative to :func:`usual_chroma`,
+since shadows and highlights of an object have less than its midtones; propagation between neighbours, relative to its
+square root.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, cast
@@ -61,7 +63,7 @@ class Stage:
 
 
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
-# names for that and on thirteen more, with 6 to 60 random strokes.
+# names for that and on 64 more, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 SAME_CHROMA = 0.003  # difference of estimates that hardly counts
@@ -89,9 +91,8 @@ def colorize(
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
     distances, then the residual near the strokes. Two estimates by propagation between neighbouring pixels up to edges
-    are blended in. Shadows and highlights get less
-    chroma than midtones of the same object. ``"kmeans"`` is the paper's method: :func:`segment_mask` divides the image
-    into one segment per colour.
+    are blended in. Shadows and highlights get less chroma than midtones of the same object. ``"kmeans"`` is the paper's
+    method: :func:`segment_mask` divides the image into one segment per colour.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
@@ -205,16 +206,18 @@ def fit_colorize(
     wanted = wanted[:, ::2]  # green follows from red and blue
 
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
-    marks = [scribbles.places, scribbles.weights, wanted / usual_there.sqrt()]
+    # Squared, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
+    # size of the picture.
+    marks = [scribbles.places, scribbles.weights.square(), wanted / usual_there.sqrt()]
 
-    def propagated(links: Links) -> Planes:
+    def propagated(links: Links) -> Callable[[Any, Tensor], Tensor]:
         step = links.step(small)
         guide = viewed.reduced(luminance, step)
         found = viewed.kept(links, [guide, *marks], lambda: LocalValues.of(links, guide, step, small[1], *marks))
 
-        def interpolated(some: Any) -> Tensor:
+        def interpolated(some: Any, own: Tensor) -> Tensor:
             place = (links, some.first, some.image.shape)
-            return viewed.kept(place, [found.values], lambda: found(luminance(some), some.first))
+            return viewed.kept(place, [found.values], lambda: found(own, some.first))
 
         return interpolated
 
@@ -241,8 +244,8 @@ def fit_colorize(
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
         usual = usual_chroma(own)
-        connected, influence = absolute(some).tensor_split([2], dim=1)
-        around = relative(some)[:, :2]
+        connected, influence = absolute(some, own).tensor_split([2], dim=1)
+        around = relative(some, own)[:, :2]
         alike = (far(some) + near(some)) * usual
         around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
