@@ -33,7 +33,9 @@ PICTURES = {
 RIGHT_HALVES = ("retina", "page")
 SCALES = (1.0, 0.8, 0.6, 0.4, 0.28)
 LARGEST = 60 / 255  # standard deviation of noise
-MISSTATED = 0.75, 1.35  # range of given over actual noise level, in half of the crops
+MISSTATED = 0.5  # share of crops whose given noise level is not the actual one
+RATIOS = 0.75, 1.35  # range of given over actual noise level, in these crops
+CONTRASTS = 2 / 255, 40 / 255  # range of the standard deviation of added textures
 
 
 class Crops:
@@ -43,11 +45,21 @@ class Crops:
         side: of the crops, in pixels.
         seed: of all random numbers.
         textured: share of crops with an added texture.
+        contrast: largest standard deviation of a texture.
+        misstated: share of crops whose given noise level is not the actual one.
     """
 
-    def __init__(self, side: int, seed: int, *, textured: float = 0.0) -> None:
+    def __init__(
+        self,
+        side: int,
+        seed: int,
+        *,
+        textured: float = 0.0,
+        contrast: float = CONTRASTS[1],
+        misstated: float = MISSTATED,
+    ) -> None:
         self.side, self.generator = side, torch.Generator().manual_seed(seed)
-        self.textured = textured
+        self.textured, self.contrast, self.misstated = textured, contrast, misstated
         self.pictures: list[Tensor] = []
         weights = []
         for name, weight in PICTURES.items():
@@ -134,7 +146,7 @@ class Crops:
             texture = (0.3 + self._random(3, 1, 1)) * texture + colours
         if self._chance(0.5):
             texture = texture * (self._smooth(1, 2 + self._below(3)) * self._number(2, 20) + 0.5).clamp(0, 1)
-        contrast = math.exp(self._number(math.log(2 / 255), math.log(40 / 255)))
+        contrast = math.exp(self._number(math.log(CONTRASTS[0]), math.log(self.contrast)))
         return (crop + contrast * texture).clamp(0, 1)
 
     def _texture(self, planes: int) -> Tensor:
@@ -194,8 +206,8 @@ class Crops:
         noisy = clean + deviation * torch.randn(clean.shape, generator=self.generator)
         seen = F.avg_pool2d(F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1)  # estimated brightness
         told = torch.where(kind < 0.82, uneven, (gain * seen.clamp(min=0) + dark).sqrt())
-        low, high = (math.log(factor) for factor in MISSTATED)
+        low, high = (math.log(factor) for factor in RATIOS)
         factor = (low + (high - low) * self._random(*each)).exp()
-        wrong = torch.where(self._random(*each) < 0.5, factor, 1.0)
+        wrong = torch.where(self._random(*each) < self.misstated, factor, 1.0)
         clipped = torch.where(self._random(*each) < 0.15, noisy.clamp(0, 1), noisy)
         return clipped, told * wrong

@@ -10,7 +10,8 @@ curve.png              the loss on validation crops;
 state.pt               the state of the training: the same command resumes a stopped training, and a larger number of
                        steps continues a finished one.
 
-``--start FILE`` starts from trained weights, and raises the learning rate again. ``--passes 1`` trains a single pass of
+``--start FILE`` starts from trained weights, or from the mean of those of several files, and raises the learning rate
+again. ``--passes 1`` trains a single pass of
 the network, in half the time; the second pass of its weights repeats the first. ``--plain`` trains the same network
 with a further convolution in place of the filter, for comparison. Equal arguments give equal weights on the same
 machine with the same number of threads.
@@ -32,7 +33,7 @@ from safetensors.torch import save as as_bytes
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from benchmarks.denoiser_crops import Crops
+from benchmarks.denoiser_crops import CONTRASTS, MISSTATED, Crops
 from nlfilter_torch.io.photographs import open_beside
 from nlfilter_torch.nn.denoiser import ADDED, PASSES, PLANES, WIDTH, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.weights import read_weights
@@ -107,9 +108,12 @@ class Training:
         side: of crops, in pixels.
         half: whether convolutions run in bfloat16.
         rate: of Muon, for kernels of convolutions; those of Adam are in proportion.
-        start: file of the initial weights; None draws them.
+        start: files of weights, which are averaged for the initial weights; without any they are drawn.
         fall: final share of the steps, over which the learning rate falls to zero.
         textured: share of crops with an added texture.
+        contrast: largest standard deviation of such a texture.
+        misstated: share of crops whose given noise level is not the actual one.
+        rim: width of the outermost pixels of crops, in which errors do not count.
         passes: of the network.
     """
 
@@ -121,14 +125,19 @@ class Training:
         side: int = SIDE,
         half: bool = False,
         rate: float = RATE,
-        start: Path | None = None,
+        start: Sequence[Path] = (),
         fall: float = FALL,
         textured: float = 0.0,
+        contrast: float = CONTRASTS[1],
+        misstated: float = MISSTATED,
+        rim: int = 0,
         passes: int = PASSES,
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed, passes=passes).to(memory_format=torch.channels_last)
-        if start is not None:
-            self.model.load_state_dict(read_weights(start, shapes_of(self.model), ADDED))
+        if start:
+            files = [read_weights(path, shapes_of(self.model), ADDED) for path in start]
+            means = {name: torch.stack([weights[name] for weights in files]).mean(0) for name in files[0]}
+            self.model.load_state_dict(means)
         self.model.again.requires_grad_(passes > 1)
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
         named = {name: weight for name, weight in self.model.named_parameters() if weight.requires_grad}
@@ -147,9 +156,10 @@ class Training:
             torch.optim.Adam([{"params": others}, {"params": bandwidths}], lr=rate),
         ]
         self.rates = (rate, ADAM_RATE * rate, BANDWIDTH_RATE * rate)
-        self.half, self.fall = half, fall
-        self.crops = Crops(side, seed, textured=textured)
-        aside = Crops(side, ASIDE_SEED, textured=textured)
+        self.half, self.fall, self.rim = half, fall, rim
+        kinds = {"textured": textured, "contrast": contrast, "misstated": misstated}
+        self.crops = Crops(side, seed, **kinds)
+        aside = Crops(side, ASIDE_SEED, **kinds)
         self.aside = [aside.batch(ASIDE, grey=grey) for grey in (True, False)]
         self.losses: list[float] = []
         self.curve: list[float] = []
@@ -161,6 +171,11 @@ class Training:
             found: Tensor = model.estimate_noise(noisy, told)  # type: ignore[operator]
         return noisy - found
 
+    def without_rim(self, crops: Tensor) -> Tensor:
+        """The pixels of crops (B, C, H, W) whose errors count."""
+        counted = slice(self.rim, crops.shape[-1] - self.rim)
+        return crops[..., counted, counted]
+
     def step(self, steps: int) -> None:
         """Train one step, out of ``steps`` in all."""
         number = len(self.losses)
@@ -168,7 +183,7 @@ class Training:
         for group, rate in zip(groups, self.rates, strict=True):
             group["lr"] = rate * rate_at(number, steps, self.fall)
         clean, noisy, told = self.crops.batch(BATCH, grey=number % 2 == 0)
-        loss = loss_of(self.denoise(self.model, noisy, told), clean, noisy)
+        loss = loss_of(*map(self.without_rim, (self.denoise(self.model, noisy, told), clean, noisy)))
         self.model.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.model.parameters(), LARGEST_GRADIENT)
@@ -182,7 +197,10 @@ class Training:
     @torch.no_grad()
     def judge(self) -> float:
         """Mean error of the running-mean weights on the validation crops, in grey levels."""
-        found = [errors(self.denoise(self.mean.module, noisy, told), clean) for clean, noisy, told in self.aside]
+        found = [
+            errors(*map(self.without_rim, (self.denoise(self.mean.module, noisy, told), clean)))
+            for clean, noisy, told in self.aside
+        ]
         return float(torch.stack(found).mean())
 
     def run(self, steps: int, folder: Path | None = None) -> None:
@@ -256,9 +274,34 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--fall", type=float, default=FALL, help="final share of the steps, with a falling rate; default %(default)s"
     )
-    parser.add_argument("--start", type=Path, metavar="FILE", help="initial weights; default: drawn at random")
+    parser.add_argument(
+        "--start",
+        type=Path,
+        metavar="FILE",
+        nargs="+",
+        default=[],
+        help="initial weights, the mean of these; default: drawn at random",
+    )
     parser.add_argument(
         "--textured", type=float, default=0.0, help="share of crops with an added texture; default %(default)s"
+    )
+    parser.add_argument(
+        "--contrast",
+        type=float,
+        default=round(255 * CONTRASTS[1]),
+        help="largest standard deviation of such a texture, in grey levels; default %(default)s",
+    )
+    parser.add_argument(
+        "--misstated",
+        type=float,
+        default=MISSTATED,
+        help="share of crops whose given noise level is not the actual one; default %(default)s",
+    )
+    parser.add_argument(
+        "--rim",
+        type=int,
+        default=0,
+        help="width of the outermost pixels of crops, in which errors do not count; default %(default)s",
     )
     parser.add_argument("--passes", type=int, default=PASSES, help="of the network; default %(default)s")
     parser.add_argument("--plain", action="store_true", help="a convolution in place of the filter")
@@ -277,12 +320,18 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rate must be between 0 and 1, got {options.rate}; {RATE} does well")
     if not 0 < options.fall <= 1:
         parser.error(f"--fall must be above 0 and at most 1, got {options.fall}; {FALL} does well")
-    if not 0 <= options.textured <= 1:
-        parser.error(f"--textured must be 0 to 1, got {options.textured}; it is a share of the crops")
+    for name in ("textured", "misstated"):
+        if not 0 <= getattr(options, name) <= 1:
+            parser.error(f"--{name} must be 0 to 1, got {getattr(options, name)}; it is a share of the crops")
+    if not 255 * CONTRASTS[0] <= options.contrast <= 255:
+        parser.error(f"--contrast must be {255 * CONTRASTS[0]:.0f} to 255, got {options.contrast}; 40 does well")
+    if not 0 <= options.rim < options.side / 2:
+        parser.error(f"--rim must be at least 0 and less than half of --side, got {options.rim}; 8 does well")
     if options.passes < 1:
         parser.error(f"--passes must be at least 1, got {options.passes}; {PASSES} are what the package has")
-    if options.start is not None and not options.start.is_file():
-        parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
+    for path in options.start:
+        if not path.is_file():
+            parser.error(f"--start must be files of weights, got {path}, which is not there; train one first")
     if options.out.exists() and not options.out.is_dir():
         parser.error(f"--out must be a folder, got the file {options.out}; name another")
     return options
@@ -301,6 +350,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start=options.start,
         fall=options.fall,
         textured=options.textured,
+        contrast=options.contrast / 255,
+        misstated=options.misstated,
+        rim=options.rim,
         passes=options.passes,
     )
     state = options.out / "state.pt"
@@ -311,11 +363,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{parameters} weights, crops of {options.side} pixels, {torch.get_num_threads()} threads", flush=True)
     figures = {
         name: getattr(options, name)
-        for name in ("steps", "side", "seed", "rate", "fall", "textured", "passes", "plain", "half")
+        for name in (
+            *("steps", "side", "seed", "rate", "fall"),
+            *("textured", "contrast", "misstated", "rim", "passes", "plain", "half"),
+        )
     }
-    if options.start is not None:
-        with safe_open(options.start, "pt") as weights:
-            figures["start"] = weights.metadata()
+    if options.start:
+        figures["start"] = []
+        for path in options.start:
+            with safe_open(path, "pt") as weights:
+                figures["start"].append(weights.metadata())
     training.run(options.steps, options.out)
     figures |= {"weights": parameters, "seconds": round(training.seconds), "loss": round(training.curve[-1], 4)}
     save(options.out, training, figures)

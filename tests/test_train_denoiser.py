@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
 from safetensors.torch import load_file
+from torch import Tensor
 
 from benchmarks import denoising, denoising_tables, train_denoiser
 from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
@@ -78,12 +80,39 @@ def test_the_command_writes_weights_figures_and_a_curve_and_goes_on(
 def test_a_training_starts_from_weights_of_another(more: list[str], tmp_path: Path) -> None:
     main(["--steps", "2", "--side", "16", "--out", str(tmp_path / "first"), *more])
     start = tmp_path / "first" / "denoiser.safetensors"
-    begun = Training(1, side=16, start=start, plain=bool(more))
+    begun = Training(1, side=16, start=[start], plain=bool(more))
     for name, value in load_file(start).items():
         torch.testing.assert_close(begun.model.state_dict()[name], value, rtol=0, atol=0)
     main(["--steps", "1", "--side", "20", "--start", str(start), "--out", str(tmp_path), *more])
     figures = json.loads((tmp_path / "denoiser.json").read_text())
-    assert (figures["start"]["side"], figures["start"]["steps"], figures["side"]) == ("16", "2", 20)
+    (before,) = figures["start"]
+    assert (before["side"], before["steps"], figures["side"]) == ("16", "2", 20)
+
+
+def test_a_training_starts_from_the_mean_of_several_weights(tmp_path: Path) -> None:
+    files = []
+    for seed in (1, 2):
+        folder = tmp_path / str(seed)
+        main(["--steps", "1", "--side", "16", "--seed", str(seed), "--out", str(folder)])
+        files.append(folder / "denoiser.safetensors")
+    first, second = (load_file(file)["first.weight"] for file in files)
+    begun = Training(3, side=16, start=files)
+    torch.testing.assert_close(begun.model.first.weight.detach(), (first + second) / 2)
+    main(["--steps", "1", "--side", "16", "--start", *map(str, files), "--out", str(tmp_path)])
+    figures = json.loads((tmp_path / "denoiser.json").read_text())
+    assert [start["seed"] for start in figures["start"]] == ["1", "2"]
+
+
+def test_errors_in_the_rim_of_crops_do_not_count() -> None:
+    training = Training(0, side=24, rim=6)
+    kept = training.without_rim(torch.arange(576.0).view(1, 1, 24, 24))
+    assert kept.shape == (1, 1, 12, 12)
+    assert kept[0, 0, 0, 0] == 6 * 24 + 6
+    judged = training.judge()
+    training.aside = [
+        (F.pad(training.without_rim(clean), (6, 6, 6, 6)), noisy, told) for clean, noisy, told in training.aside
+    ]
+    assert training.judge() == judged
 
 
 def test_the_second_pass_is_not_trained_with_the_first_alone(tmp_path: Path) -> None:
@@ -91,7 +120,7 @@ def test_the_second_pass_is_not_trained_with_the_first_alone(tmp_path: Path) -> 
     assert json.loads((tmp_path / "denoiser.json").read_text())["passes"] == 1
     weights = load_file(tmp_path / "denoiser.safetensors")
     assert weights["again.weight"].abs().max() == 0
-    begun = Training(1, side=16, start=tmp_path / "denoiser.safetensors")
+    begun = Training(1, side=16, start=[tmp_path / "denoiser.safetensors"])
     begun.run(2)
     assert begun.model.again.weight.abs().max() > 0
 
@@ -140,6 +169,22 @@ def test_crops_are_pictures_with_the_noise_that_is_told(grey: bool) -> None:
         levels.append(told.square().mean())
     assert float(torch.stack(differences).mean() / torch.stack(levels).mean()) == pytest.approx(1, abs=0.2)
     assert float(torch.stack(levels).max()) < (2 * LARGEST) ** 2
+
+
+def test_a_share_of_the_crops_has_a_misstated_noise_level() -> None:
+    def ratios(misstated: float) -> Tensor:
+        clean, noisy, told = Crops(64, 6, misstated=misstated).batch(60, grey=True)
+        return told.square().mean((1, 2, 3)) / (noisy - clean).square().mean((1, 2, 3))
+
+    assert ((ratios(0.0) - 1).abs() < 0.1).float().mean() > 0.75  # others are clipped
+    assert ((ratios(1.0) - 1).abs() < 0.1).float().mean() < 0.4
+
+
+def test_textures_are_up_to_the_given_contrast() -> None:
+    weak, strong = Crops(32, 7), Crops(32, 7, contrast=0.5)
+    grey = torch.full((3, 32, 32), 0.5)
+    deviations = [[float(crops._add_texture(grey).std()) for _ in range(40)] for crops in (weak, strong)]
+    assert max(deviations[0]) < 0.25 < max(deviations[1])
 
 
 def test_nothing_that_is_judged_is_trained_on() -> None:
@@ -205,7 +250,11 @@ def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> 
         (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
         (["--fall", "0"], "--fall must be above 0 and at most 1, got 0"),
         (["--passes", "0"], "--passes must be at least 1, got 0"),
-        (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
+        (["--textured", "2"], "--textured must be 0 to 1, got 2"),
+        (["--misstated", "-1"], "--misstated must be 0 to 1, got -1"),
+        (["--contrast", "1"], "--contrast must be 2 to 255, got 1"),
+        (["--side", "16", "--rim", "8"], "--rim must be at least 0 and less than half of --side, got 8"),
+        (["--start", "absent"], "--start must be files of weights, got absent, which is not there"),
         (["--steps", "many"], "--steps: invalid int value: 'many'"),
     ],
 )
