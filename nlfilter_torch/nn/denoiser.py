@@ -161,26 +161,37 @@ class NonlocalDenoiser(nn.Module):
             return self.estimate_noise(*each).view_as(noisy)
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
         planes, levels = split_colours(noisy / scale, noise / scale)
-        middle = planes.new_tensor([0.5, 0.0, 0.0]).view(1, -1, 1, 1)
-        seen = torch.cat([2 * (planes - middle), 10 * levels], dim=1)
-        first = features = self.first(seen.contiguous(memory_format=torch.channels_last))
-        levels, estimate = levels[:, (0, 1, 1)], planes
-        for number in range(self.passes):
-            if number > 0:
-                features = first + self.again(_activated(features))
-            for layer in self.before:
-                features = features + layer(_activated(features))
-            pixels = PIXELS if number == self.passes - 1 else ROUGH_PIXELS
-            found = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
-            features = self.join(torch.cat([_activated(features), 2 * (planes - found - middle), 2 * found], dim=1))
-            for layer in self.after:
-                features = features + layer(_activated(features))
-            left = self.last(_activated(features)).to(planes)
-            found = found + levels * left.clamp(-LARGEST, LARGEST)
-            if number > 0:
-                found = torch.lerp(estimate, found, _trust(left[:, : noisy.shape[1]]).to(found))
-            estimate = found
+        seen = torch.cat([_centred(planes), 10 * levels], dim=1)
+        first = self.first(seen.contiguous(memory_format=torch.channels_last))
+        levels = levels[:, (0, 1, 1)]
+        pixels, *others = [ROUGH_PIXELS] * (self.passes - 1) + [PIXELS]
+        features, estimate, _ = self._pass(first, planes, levels, pixels)
+        for pixels in others:
+            again = first + self.again(_activated(features))
+            features, found, corrections = self._pass(again, planes, levels, pixels)
+            estimate = torch.lerp(estimate, found, _trust(corrections[:, : noisy.shape[1]]).to(found))
         return join_colours(estimate, noisy.shape[1]) * scale
+
+    def _pass(self, features: Tensor, planes: Tensor, levels: Tensor, pixels: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Apply the network and its filter once.
+
+        Args:
+            features: of the noisy planes, and of the result of the previous pass if there is one.
+            planes: noisy luminance and colour differences (B, 3, H, W).
+            levels: noise of each plane.
+            pixels: per landmark.
+
+        Returns:
+            Features, the estimated noise of each plane, and the last corrections of it in noise levels.
+        """
+        for layer in self.before:
+            features = features + layer(_activated(features))
+        found = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
+        features = self.join(torch.cat([_activated(features), _centred(planes - found), 2 * found], dim=1))
+        for layer in self.after:
+            features = features + layer(_activated(features))
+        corrections = self.last(_activated(features)).to(planes)
+        return features, found + levels * corrections.clamp(-LARGEST, LARGEST), corrections
 
     def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
         """Filter planes (B, 3, H, W) with a guide and sliders computed from ``features``, averaging similar pixels.
@@ -325,9 +336,14 @@ def _mixture(like: Tensor) -> Tensor:
     return like.new_tensor(rows)
 
 
-def _trust(left: Tensor) -> Tensor:
+def _centred(planes: Tensor) -> Tensor:
+    """Planes (B, 3, H, W) as the network sees them, in [-1, 1]."""
+    return 2 * (planes - planes.new_tensor([0.5, 0.0, 0.0]).view(1, -1, 1, 1))
+
+
+def _trust(corrections: Tensor) -> Tensor:
     """1 where all corrections (B, C, H, W) nearby are plausible, 0 where one is twice as large as plausible."""
-    largest = F.max_pool2d(left.abs().amax(1, keepdim=True), 2 * AROUND + 1, stride=1, padding=AROUND)
+    largest = F.max_pool2d(corrections.abs().amax(1, keepdim=True), 2 * AROUND + 1, stride=1, padding=AROUND)
     return (2 - largest / LARGEST).clamp(0.0, 1.0)
 
 
