@@ -30,7 +30,7 @@ from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
 ROUND_TRIP_RADIUS = 4  # radius in pixels of the kernel that enlarging and reducing again amounts to
-RESTORED = 3  # terms of the Neumann series that inverts the smoothing by enlarging and reducing again
+RESTORED = 5  # terms of the Neumann series that inverts the smoothing by enlarging and reducing again
 FAINT_VARIANCE = (2 / 255) ** 2  # variance of brightness below which its slope is attenuated towards 0
 
 
