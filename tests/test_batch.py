@@ -152,7 +152,9 @@ def test_a_cluster_that_does_not_answer(
     fill(tmp_path / "in", 1)
     monkeypatch.setattr(workers, "CONNECTING", 0.2)
     sentence = refused(capsys, tmp_path / "in", tmp_path / "out", "--cluster", "tcp://127.0.0.1:9", *more)
-    wanted = "--workers are those of the cluster" if more else "--cluster must be the address of a Dask scheduler"
+    wanted = (
+        "--workers must not be combined with --cluster" if more else "--cluster must be the address of a Dask scheduler"
+    )
     assert wanted in sentence
 
 
@@ -252,7 +254,10 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr("nlfilter_torch.cli.folders.edit_folder", interrupt)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 130
     captured = capsys.readouterr()
-    told = "nlfilter-torch: the same command does the rest\nnlfilter-torch: interrupted; no file is half written\n"
+    told = (
+        "nlfilter-torch: run the same command again to edit the remaining photographs\n"
+        "nlfilter-torch: interrupted; no file is half written\n"
+    )
     assert captured.err == told
     assert captured.out == f"1 edited, 0 there already, 0 failed, 1 not begun, in {tmp_path / 'out'}\n"
 
@@ -290,7 +295,7 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fill(source, 2)
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
-    assert "none is no folder; name the one" in refused(capsys, tmp_path / "none", target)
+    assert "none is not a folder; give the one" in refused(capsys, tmp_path / "none", target)
     assert "holds no PNG, JPEG, TIFF, WebP or AVIF file" in refused(capsys, tmp_path / "empty", target)
     assert "must be another folder than that of the photographs" in refused(capsys, source, source)
     assert "is a file, not a folder" in refused(capsys, source, tmp_path / "file")
@@ -310,10 +315,10 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert not target.exists()
 
     fill(target, 1)
-    assert f"{target} holds a file 000.png from somewhere else" in refused(capsys, source, target)
+    assert f"{target} already contains 000.png, which this command did not write" in refused(capsys, source, target)
     prepare(pictures(source), tmp_path / "begun", {"alpha": "1,2"})
     prepare(pictures(source), tmp_path / "begun", {"alpha": "1,2"})
-    assert "was begun with other settings" in refused(capsys, source, tmp_path / "begun")
+    assert "contains results of other settings" in refused(capsys, source, tmp_path / "begun")
 
 
 def test_a_folder_that_cannot_be_written_to(

@@ -263,7 +263,7 @@ def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "film").mkdir()
     write_photograph(Photograph(pan(1, 1, 20, 20)[0]), tmp_path / "film" / "a.png")
     write_photograph(Photograph(pan(1, 1, 20, 22)[0]), tmp_path / "film" / "b.png")
-    assert "is no folder; name the one that holds the frames" in refused(tmp_path / "none", tmp_path / "out")
+    assert "is not a folder; give the one that contains the frames" in refused(tmp_path / "none", tmp_path / "out")
     assert "holds no PNG, JPEG, TIFF, WebP or AVIF file" in refused(tmp_path / "empty", tmp_path / "out")
     assert "must not be the folder of the frames" in refused(tmp_path / "film", tmp_path / "film")
     assert "does not exist; make it first" in refused(tmp_path / "film", tmp_path / "no" / "where")

@@ -42,7 +42,7 @@ class Canvas:
             with ui.element("div").classes("welcome") as self._welcome:
                 ui.icon("photo", size="64px")
                 ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
-                ui.label("PNG, JPEG, TIFF or WebP. It stays on this machine.").classes("hint")
+                ui.label("PNG, JPEG, TIFF, WebP or AVIF. It stays on this machine.").classes("hint")
             self._photo = ui.interactive_image(
                 events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
             ).classes("photo")

@@ -111,7 +111,7 @@ class Editor:
             self._working.set_visibility(False)
             photographs = self._upload(self._take_photograph, "image/*", LARGEST)
             presets = self._upload(self._take_preset, ".json,application/json", LARGEST_PRESET)
-            kinds = f"A PNG, JPEG, TIFF or WebP file of at most {LARGEST / 1e9:g} GB"
+            kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST / 1e9:g} GB"
             _button("Open", "folder_open", kinds, js=_pick(photographs))
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
             self._redo_button = _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)

@@ -84,8 +84,8 @@ def _check_address(host: str, port: int) -> int:
         try:
             probe.bind((host, port))
         except OSError as error:
+            remedy = "use --port 0 for a free port, or another address" if port else "use another, such as 127.0.0.1"
             raise ValueError(
-                f"cannot listen on --host {host} --port {port} ({error.strerror or error}); "
-                "use --port 0 for a free port, or another address"
+                f"cannot listen on --host {host} --port {port} ({error.strerror or error}); {remedy}"
             ) from error
         return int(probe.getsockname()[1])

@@ -338,7 +338,9 @@ class Session:
         return target
 
     def save_preset(self, name: str, report: Report = in_silence) -> Path:
-        """Write the edit as a file for :meth:`load_preset` and the command line; nothing to report takes that long.
+        """Write the edit as a file for :meth:`load_preset` and the command line.
+
+        This is quick, so that ``report`` is not called.
 
         Raises:
             ValueError, OSError: if it cannot be written.
@@ -351,4 +353,4 @@ class Session:
 
     def load_preset(self, content: bytes, name: str) -> None:
         """Load the edit in the content of a file; raises ValueError if there is none."""
-        self.load(Recipe.from_json(content.decode("utf-8", errors="replace"), name))
+        self.load(Recipe.from_json(content, name))

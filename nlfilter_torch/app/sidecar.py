@@ -30,7 +30,7 @@ class Sidecar:
     """The file that an edit is kept in.
 
     Attributes:
-        path: it.
+        path: path of the file.
         trouble: what went wrong when it was read or written last, as a sentence, or None.
     """
 
@@ -50,7 +50,7 @@ class Sidecar:
         """The edit that is kept, or None; a file that cannot be read is renamed, so that nothing in it is lost."""
         self.trouble = None
         try:
-            return Recipe.from_json(self.path.read_text(encoding="utf-8", errors="replace"), str(self.path))
+            return Recipe.from_json(self.path.read_bytes(), str(self.path))
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -62,7 +62,7 @@ class Sidecar:
         return None
 
     def write(self, recipe: Recipe) -> None:
-        """Keep an edit, completely or not at all; one that says nothing leaves no file."""
+        """Keep an edit, completely or not at all; an edit without effect removes the file."""
         self.trouble = None
         try:
             if recipe.drawn == Recipe():

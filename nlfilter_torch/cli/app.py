@@ -37,8 +37,10 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
 
     Example: `nlfilter-torch app photo.jpg`
     """
-    from nlfilter_torch.io.photographs import check_folder
+    from nlfilter_torch.io.photographs import check_folder, first_bytes
 
+    if image is not None:
+        first_bytes(image)
     folder = out if out is not None else image.parent if image is not None else Path.cwd()
     check_folder(folder)
     if not folder.is_dir():

@@ -58,6 +58,7 @@ def apply(
     from nlfilter_torch.tiled.recipe import edit_regions, edit_tiling
     from nlfilter_torch.tiled.tiles import Tiling
 
+    editing.check_apart("OUT", target, mask=masks, preset=preset)
     for recipe, name in zip(recipes, preset, strict=True):
         showing.note_idle(recipe, name)
     colorizes = any(step.edit == "colorize" for recipe in recipes for step in recipe.acting)

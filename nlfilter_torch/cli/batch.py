@@ -23,8 +23,8 @@ Target = Annotated[
     Path,
     typer.Argument(
         metavar="OUT_DIR",
-        help="The folder for the edited ones, under the same names; it is made if it is not there. What it holds "
-        "already is not done again.",
+        help="The folder for the edited ones, under the same names; created if it does not exist. Photographs that "
+        "it already contains are skipped.",
     ),
 ]
 Workers = Annotated[
@@ -32,7 +32,7 @@ Workers = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="How many photographs are edited at a time; each takes memory of its own. Left out: one for every core.",
+        help="How many photographs are edited at a time; each takes memory of its own. Default: one per core.",
     ),
 ]
 
@@ -48,7 +48,7 @@ Preset = Annotated[
     str | None,
     preset_option(
         f"One of {', '.join(PRESETS)}, or a file of any edits, such as `nlfilter-torch fit` and the editor make. "
-        "Options that are given count for more than a preset of detail; other edits take none.",
+        "Options on the command line override a detail preset; other presets accept none.",
         plain=False,
     ),
 ]
@@ -85,7 +85,9 @@ def batch(
 
     check_patch_size(given["patch_size"])
     if cluster is not None and workers is not None:
-        raise ValueError(f"--workers are those of the cluster, got {workers} and {cluster}; leave out one of them")
+        raise ValueError(
+            f"--workers must not be combined with --cluster, got {workers} and {cluster}; omit one of them"
+        )
     if cluster is not None:  # whose workers run in other folders
         folder, target = folder.absolute(), target.absolute()
         if preset is not None and preset not in PRESETS:
@@ -124,7 +126,7 @@ def batch(
             )
     except KeyboardInterrupt:
         interrupted = True
-        _tell("the same command does the rest")
+        _tell("run the same command again to edit the remaining photographs")
     _summarise(tally, target)
     if interrupted:
         raise typer.Exit(INTERRUPTED)

@@ -1,7 +1,7 @@
 """The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,11 +83,14 @@ def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | No
     return torch.cat(found, dim=1)
 
 
-def check_apart(option: str, path: Path | None, **files: str) -> None:
-    """Raise ValueError if the picture that an option writes would replace one of the files, given by what they are."""
-    for what, file in files.items():
-        if path is not None and path.resolve() == Path(file).resolve():
-            raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
+def check_apart(option: str, path: str | Path | None, **files: str | Path | Iterable[str | Path] | None) -> None:
+    """Raise ValueError if the file that an option or argument writes is one of the others, given by what they are."""
+    if path is None:
+        return
+    for what, some in files.items():
+        for file in [some] if isinstance(some, str | Path) else some or []:
+            if Path(path).resolve() == Path(file).resolve():
+                raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
 
 
 @dataclass
@@ -134,7 +137,9 @@ def check_processes(source: str, target: str, workers: int | None, cluster: str 
     """Raise ValueError if worker processes are asked for and the files are not zarr arrays."""
     option = "--workers" if cluster is None else "--cluster"
     if workers is not None and cluster is not None:
-        raise ValueError(f"--workers are those of the cluster, got {workers} and {cluster}; leave out one of them")
+        raise ValueError(
+            f"--workers must not be combined with --cluster, got {workers} and {cluster}; omit one of them"
+        )
     if (workers is not None or cluster is not None) and not (is_zarr(Path(source)) and is_zarr(Path(target))):
         raise ValueError(
             f"{option} takes zarr arrays, which several processes can write, as IN and OUT, got {source} and {target}; "

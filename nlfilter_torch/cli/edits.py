@@ -211,12 +211,12 @@ def edit_photograph(
 
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.editing import Job
-    from nlfilter_torch.cli.noise import NoiseReport, squared_difference, write_map
+    from nlfilter_torch.cli.noise import MAP_DEPTH, NoiseReport, squared_difference, write_map
     from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
     from nlfilter_torch.edits.in_memory import InMemory
     from nlfilter_torch.edits.noise import Noise, noise_of
     from nlfilter_torch.edits.source import Source
-    from nlfilter_torch.io.photographs import Photograph
+    from nlfilter_torch.io.photographs import Photograph, check_type
     from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.source import Tiled
@@ -289,8 +289,12 @@ def edit_photograph(
         if noise is not None:
             noise.tell()
 
+    read = {what: given.get(what) for what in ("mask", "strokes", "preset")}
+    editing.check_apart("OUT", target, **read)
     for which in ("show", "map"):
-        editing.check_apart(f"--{which}", given.get(which), photograph=source, output=target)
+        editing.check_apart(f"--{which}", given.get(which), photograph=source, output=target, **read)
+    if given.get("map") is not None:
+        check_type(given["map"], MAP_DEPTH, alpha=False)
     masked = name == "detail" and bool(given.get("region") or given.get("mask"))
     editing.edit_file(
         source,

@@ -1,6 +1,7 @@
 """``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -81,16 +82,26 @@ def fit(
     """
     step = step_of(EDITS["look"], given)
 
-    from nlfilter_torch.cli.editing import read_masks
+    from nlfilter_torch.cli.editing import check_apart, read_masks
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.fit_look import fit_look
-    from nlfilter_torch.io.photographs import check_file, open_beside
+    from nlfilter_torch.io.photographs import check_file, check_type, open_beside
 
     paths = _paths(before, after)
     regions = _regions(mask or [], paths, Path(before).is_dir())
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
-    for path in (*results, *(path for path in (preview, left) if path is not None)):
+    if preset.suffix.lower() != ".json":
+        raise ValueError(f"PRESET must end in .json, got {preset}; rename it")
+    read = {"photographs": chain(*paths), "mask": chain(*regions)}
+    inputs = {what: list(files) for what, files in read.items()}
+    for path in results:
         check_file(path)
+        check_apart("PRESET", path, **inputs)
+    for option, picture in (("--preview", preview), ("--map", left)):
+        if picture is not None:
+            check_type(picture, "uint8", alpha=False)
+            check_apart(option, picture, **inputs)
+    check_apart("--map", left, preview=preview)
     alone = len(paths) == 1
     judged = (alone and not mask) or preview is not None or left is not None
     first: list[tuple[Tensor, ...]] = []  # images that are judged, and masks
@@ -133,7 +144,17 @@ def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
     found = [(path, edited[path.stem]) for path in sorted(first.iterdir()) if _is_picture(path) and path.stem in edited]
     if not found:
         raise ValueError(f"{after} must hold photographs of the names of those in {before}, got none; rename them")
+    _note_unpaired(first, {path.stem for _, path in found})
+    _note_unpaired(second, {path.stem for path, _ in found})
     return found
+
+
+def _note_unpaired(folder: Path, paired: set[str]) -> None:
+    """Print a note if photographs of a folder have no counterpart of their name in the other."""
+    rest = [path.name for path in sorted(folder.iterdir()) if _is_picture(path) and path.stem not in paired]
+    if rest:
+        others = f" and {len(rest) - 1} more" if len(rest) > 1 else ""
+        options.note(f"{rest[0]}{others} in {folder} left out, without a photograph of that name in the other folder")
 
 
 def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -> list[list[Path]]:

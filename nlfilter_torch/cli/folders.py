@@ -18,7 +18,7 @@ from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, r
 
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
 
-DIED = "the process that worked on it died; give it more memory, by fewer --workers, or look at the file"
+DIED = "the process that worked on it died; use fewer --workers, so that each has more memory, or check the file"
 
 Edit = Callable[[str, str], object]  # from the name of the input to that of the output; can be pickled
 
@@ -47,7 +47,7 @@ def pictures(folder: Path, what: str = "photographs") -> list[Path]:
         ValueError: if it is no folder, or has no image files; the message calls them ``what``.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder} is no folder; name the one that holds the {what}")
+        raise ValueError(f"{folder} is not a folder; give the one that contains the {what}")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not paths:
         raise ValueError(f"{folder} holds no PNG, JPEG, TIFF, WebP or AVIF file; put the {what} there")
@@ -72,10 +72,10 @@ def prepare(paths: Sequence[Path], target: Path, settings: Mapping[str, object])
     if record.exists():
         if record.read_text(encoding="utf-8") != text:
             raise ValueError(
-                f"{target} was begun with other settings, which {record} tells; name a new folder, or empty this one"
+                f"{target} contains results of other settings, listed in {record}; name a new folder, or empty this one"
             )
     elif present is not None:
-        raise ValueError(f"{target} holds a file {present} from somewhere else; name a new folder")
+        raise ValueError(f"{target} already contains {present}, which this command did not write; name a new folder")
     else:
         with open_beside(record) as stream:
             stream.write(text.encode())

@@ -153,6 +153,7 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
 
     from nlfilter_torch.cli.folders import pictures
     from nlfilter_torch.cli.progress import steps
+    from nlfilter_torch.io.films import is_film
     from nlfilter_torch.io.photographs import check_folder, check_output, read_photograph, write_photograph
 
     if source.is_file():
@@ -160,6 +161,8 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     paths = pictures(source, "frames")
     if target.exists() and target.resolve() == source.resolve():
         raise ValueError(f"{target} must not be the folder of the frames; choose another folder")
+    if is_film(target) and not target.is_dir():
+        raise ValueError(f"OUT must be a folder, as FRAMES is one, got {target}; choose the name of a folder")
     check_folder(target)
     first: tuple[int, ...] = ()
 

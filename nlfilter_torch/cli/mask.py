@@ -63,7 +63,8 @@ def mask(
 
     if mask is None and not region:
         raise ValueError(GIVE)
-    editing.check_apart("--show", show, photograph=source, output=target)
+    editing.check_apart("OUT", target, photograph=source, mask=mask)
+    editing.check_apart("--show", show, photograph=source, output=target, mask=mask)
     place, floats = Path(target), Path(target).suffix.lower() == PFM
     kind = options.DEPTHS[depth or ("16" if place.suffix.lower() in (".tif", ".tiff") else "8")]
     allowed = editing.allowed_memory(memory)

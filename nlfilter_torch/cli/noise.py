@@ -13,12 +13,13 @@ from torch import Tensor
 from nlfilter_torch.cli.options import LEVELS
 from nlfilter_torch.edits.denoise import NEGLIGIBLE_NOISE
 from nlfilter_torch.edits.noise import Noise
-from nlfilter_torch.io.photographs import Photograph, write_photograph
+from nlfilter_torch.io.photographs import Depth, Photograph, write_photograph
 from nlfilter_torch.tiled.pictures import WHITE
 from nlfilter_torch.tiled.tiles import Tiling
 
 VISIBLE_LEVELS = 0.5  # grey levels; the rounding error of eight bits
 WHITE_LEVELS = 64  # grey levels; white in a map
+MAP_DEPTH: Depth = "uint16"
 ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides
 
 
@@ -58,7 +59,7 @@ class NoiseReport:
 
 
 def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tensor], path: Path) -> None:
-    """Write the standard deviation of the noise at every pixel of a photograph (H, W), in 16 bits."""
+    """Write the standard deviation of the noise at every pixel of a photograph (H, W), at :data:`MAP_DEPTH`."""
     parts = []
     for start in range(0, size[0], ROWS):
         stop = min(start + ROWS, size[0])
@@ -66,7 +67,7 @@ def write_map(noise: Noise, size: tuple[int, int], read: Callable[[slice], Tenso
         levels = noise.at(read(slice(first, last)).float())
         parts.append(levels.square().mean(1, keepdim=True).sqrt()[..., start - first : stop - first, :])
     levels = torch.cat(parts, dim=2) * (LEVELS / WHITE_LEVELS)
-    write_photograph(Photograph(levels.clamp(0, 1), "uint16"), path)
+    write_photograph(Photograph(levels.clamp(0, 1), MAP_DEPTH), path)
 
 
 def squared_difference(before: NDArray[np.generic], after: NDArray[np.generic]) -> tuple[float, int]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.io.photographs import check_depth
 from nlfilter_torch.io.rows import StoredPicture
 from nlfilter_torch.tiled.pictures import Picture, transparency
 
@@ -196,6 +197,8 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
             raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
         try:
             *colour, opacity = (*ImageColor.getrgb(rectangle.note), 255)[:4]
+            if max(*colour, opacity) > 255:
+                raise ValueError(rectangle.note)
         except ValueError:
             raise ValueError(
                 "--region must end in a colour, such as red, #c04020 or rgb(192,64,32), "
@@ -246,6 +249,7 @@ def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = F
     if path is None:
         return None
     stored = read(path)
+    check_depth(path, stored.rows.dtype)
     found = stored.shape[:2]
     if found != size:
         raise ValueError(

@@ -61,7 +61,7 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
 
 
 def note_colours(name: str, size: tuple[int, int], read: Read) -> None:
-    """Print a note if a photograph that is to be colourised is in colour."""
+    """Print a note if a photograph to which ``colorize`` is applied is in colour."""
     step = max(1, size[0] // COLOUR_ROWS)
     rows = torch.cat([read(slice(y, y + 1)).float() for y in range(step // 2, size[0], step)], dim=2)
     if bool(((rows.amax(1) - rows.amin(1)) > COLOURED).float().mean() > COLOURED_SHARE):

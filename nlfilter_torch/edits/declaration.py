@@ -255,17 +255,29 @@ class Edit:
         return tuple(word for word, _ in self.brushes)
 
 
-def parse_json(text: str, name: str, remedy: str) -> Any:
-    """Parse the text of the file ``name``.
+def parse_json(text: str | bytes, name: str, remedy: str) -> Any:
+    """Parse the content of the file ``name``, in UTF-8, UTF-16 or UTF-32 if it is given as bytes.
 
     Raises:
-        ValueError: if it is not JSON, or too deeply nested for Python.
+        ValueError: if it is not JSON, names an entry twice, or is too deeply nested for Python.
     """
+    twice: list[str] = []
+
+    def entries(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            names = [key for key, _ in pairs]
+            twice.append(next(key for key in names if names.count(key) > 1))
+        return found
+
     try:
-        return json.loads(text)
+        found = json.loads(text, object_pairs_hook=entries)
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
         raise ValueError(f"{name} is not a preset: {reason}; {remedy}") from error
+    if twice:
+        raise ValueError(f"{name} must have each entry once, got {shown(twice[0])} twice; remove one of them")
+    return found
 
 
 def shown(value: Any) -> str:

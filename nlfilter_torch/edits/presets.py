@@ -105,7 +105,7 @@ class Preset:
         return in_file([self.step.to_json("    ", complete=True)])
 
     @staticmethod
-    def from_json(text: str, name: str) -> "Preset":
+    def from_json(text: str | bytes, name: str) -> "Preset":
         """Parse the output of :meth:`to_json`; omitted entries have their defaults.
 
         Args:
@@ -184,4 +184,4 @@ def find_recipe(name: str) -> Recipe:
             f"{name} is neither a file nor one of the presets {', '.join(PRESETS)}; "
             "create a file with nlfilter-torch fit"
         )
-    return Recipe.from_json(path.read_text(encoding="utf-8", errors="replace"), name)
+    return Recipe.from_json(path.read_bytes(), name)

@@ -126,7 +126,7 @@ class Recipe:
         return in_file(step.to_json("    ") for step in (self.drawn.steps if drawn else self.acting))
 
     @staticmethod
-    def from_json(text: str, name: str, remedy: str = REMEDY) -> "Recipe":
+    def from_json(text: str | bytes, name: str, remedy: str = REMEDY) -> "Recipe":
         """Parse the output of :meth:`to_json`, or a file in the former format without a list of steps.
 
         Raises:

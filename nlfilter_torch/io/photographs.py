@@ -45,9 +45,11 @@ DEPTHS: dict[str, tuple[str, ...]] = {
 }
 ENCODING: dict[str, dict[str, object]] = {
     "JPEG": {"quality": 95, "subsampling": 0},
-    "WebP": {"lossless": True},
+    "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
     "AVIF": {"quality": 90, "subsampling": "4:4:4"},
 }
+LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500}  # pixels
+LONGEST_EXIF = 65533  # bytes, in JPEG
 CONVERTED = 1 << 18  # pixels that are converted at a time between files and floats
 PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
 unfinished: set[Path] = set()  # files being written; read by the command line when interrupted
@@ -224,11 +226,13 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
 
     Call it before long work, so that the error comes early.
     """
-    return check_type(path, photograph.depth, photograph.alpha is not None)
+    return check_type(path, photograph.depth, photograph.alpha is not None, photograph.size, photograph.exif)
 
 
-def check_type(path: str | Path, depth: str, alpha: bool) -> str:
-    """Do the check of :func:`check_output` for a picture of that depth, with or without alpha."""
+def check_type(
+    path: str | Path, depth: str, alpha: bool, size: tuple[int, int] = (1, 1), exif: bytes | None = None
+) -> str:
+    """Check, as :func:`check_output`, a picture of that depth and size (H, W), with or without alpha."""
     path = Path(path)
     check_file(path)
     kind = SUFFIXES.get(path.suffix.lower())
@@ -245,6 +249,16 @@ def check_type(path: str | Path, depth: str, alpha: bool) -> str:
     if alpha and kind == "JPEG":
         raise ValueError(
             f"{path} cannot hold this picture: JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"
+        )
+    if max(size) > LONGEST_SIDE.get(kind, max(size)):
+        raise ValueError(
+            f"{path} cannot hold this picture: {kind} has at most {LONGEST_SIDE[kind]} pixels per side, got "
+            f"{size[1]}x{size[0]}; write a PNG or TIFF file"
+        )
+    if kind == "JPEG" and len(exif or b"") > LONGEST_EXIF:
+        raise ValueError(
+            f"{path} cannot hold this picture: JPEG has at most {LONGEST_EXIF} bytes of EXIF data, got "
+            f"{len(exif or b'')}; write a PNG, TIFF or WebP file"
         )
     return kind
 
@@ -293,6 +307,8 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
         with claimed(beside):
             with beside.open("r+b") as stream:
                 yield stream
+            if path.exists():
+                shutil.copymode(path, beside)
             beside.replace(path)
 
 

@@ -127,7 +127,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         elif not _holds_zarr(path):
             raise ValueError(f"{path} is a folder, not a zarr array that can be replaced; choose another name")
         return
-    kind = check_type(path, depth, picture.alpha)
+    kind = check_type(path, depth, picture.alpha, picture.shape[:2], picture.exif)
     needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
     if needed > memory:
         raise MemoryError(

@@ -111,7 +111,8 @@ def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
     """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
     channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
-        channels[..., :1] = np.iinfo(channels.dtype).max - channels[..., :1]
+        white = np.iinfo(channels.dtype).max if channels.dtype.kind == "u" else 1
+        channels[..., :1] = white - channels[..., :1]
     return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
 
 

@@ -156,7 +156,7 @@ def stream_recolor(
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     if tiled.channels != 3:
         raise ValueError(
-            f"source must have 3 or 4 channels to be recoloured, got {tiled.picture.samples}; colourise it instead"
+            f"source must have 3 or 4 channels to be recoloured, got {tiled.picture.samples}; use colorize instead"
         )
     options |= {"photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
     with single_threaded(tiled.passes.workers(1)):
