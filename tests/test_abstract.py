@@ -49,3 +49,10 @@ def test_flat_images_leave_the_gradient_of_a_batch_alone() -> None:
     assert power.grad is not None
     assert power.grad.isfinite()
     assert power.grad != 0
+
+
+def test_channels_of_the_guide_can_be_chosen() -> None:
+    image = colour("chelsea", 24, 32)
+    found = [abstract(image, num_landmarks=20, guide_channels=channels) for channels in ("all", "luminance")]
+    torch.testing.assert_close(found[0], abstract(image, num_landmarks=20), rtol=0, atol=0)
+    assert not torch.equal(found[0], found[1])

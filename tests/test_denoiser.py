@@ -389,3 +389,11 @@ def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.Monkey
     assert min(sides) >= module.SMALLEST
     assert max(sides) == module.SIDE
     assert max(size[0] for size in seen) <= module.TILE_BATCH
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_weights_in_half_precision_denoise_colours(dtype: torch.dtype) -> None:
+    noisy = 0.5 + 0.1 * torch.randn(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        found = NonlocalDenoiser.trained(dtype=dtype)(noisy, 0.1)
+    assert (found - 0.5).std() < 0.04

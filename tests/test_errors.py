@@ -12,6 +12,7 @@ import torch
 from nlfilter_torch import (
     NonlocalFilter,
     captured_energy,
+    compose_alpha,
     detail_layers,
     diffusion_map,
     diffusion_mask,
@@ -246,7 +247,7 @@ BAD_MASKS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: diffusion_mask(SPECTRUM, PAINTED, negative=PAINTED.expand(-1, 3, -1, -1)),
         ValueError,
-        "negative must have 1 channel or those of region, 1, got 3",
+        "negative must have 1 channel or as many as region (1), got 3",
     ),
 ]
 
@@ -278,3 +279,10 @@ def test_nothing_is_changed_by_an_error() -> None:
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.is_grad_enabled()
     assert not torch.is_autocast_enabled("cpu")
+
+
+def test_shapes_of_sliders_and_eigenvalues_that_do_not_fit() -> None:
+    message = "eigenvalues must have shape (B, R) for sliders of shape (B, k+1), got (3, 3, 5)"
+    raises(lambda: polynomial_response(torch.ones(3, 3, 5), torch.ones(3, 4)), ValueError, message)
+    message = "alpha must have the batch of masks, 2, or 1, got 3"
+    raises(lambda: compose_alpha(torch.ones(2, 1, 4, 4), torch.ones(3, 1, 4)), ValueError, message)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from nlfilter_torch import (
     captured_energy,
     detail_layers,
+    filter_regions,
     nonlocal_operator,
     polynomial_filter,
     polynomial_response,
@@ -16,7 +17,7 @@ from nlfilter_torch import (
 )
 from tests import reference
 from tests.images import photograph
-from tests.problems import build, guides, noise, options, picture
+from tests.problems import build, colour, guides, noise, options, picture
 
 ALPHA = (3.0, 0.5, 4.0, 1.05)
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -348,3 +349,23 @@ def test_captured_energy_is_a_share(guide: torch.Tensor, chosen: dict[str, objec
 def test_all_of_a_black_image_is_captured() -> None:
     spectrum = build(noise(2, 1, 8, 9), num_landmarks=10).spectrum()
     torch.testing.assert_close(captured_energy(spectrum, torch.zeros(2, 1, 8, 9)), torch.ones(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("painted", [0.0, 0.2])
+def test_gradients_by_masks_are_right_where_all_are_0(count: int, painted: float) -> None:
+    image = colour("chelsea", 10, 12).double()
+    operator = nonlocal_operator(image, num_landmarks=15)
+    alpha = torch.tensor([[3.0, 2.0, 1.0, 1.0], [0.5, 1.5, 1.0, 1.1]], dtype=torch.float64)[:count]
+    masks = torch.zeros(1, count, 10, 12, dtype=torch.float64)
+    masks[..., :3] = painted
+    weights = noise(*image.shape)
+    given = masks.clone().requires_grad_()
+    filtered = filter_regions(operator, image, given, alpha)
+    assert torch.equal(filtered[..., 3:], image[..., 3:])
+    (found,) = torch.autograd.grad((filtered * weights).sum(), given)
+    for k in range(count):
+        moved = masks.clone()
+        moved[:, k] += 1e-6
+        wanted = ((filter_regions(operator, image, moved, alpha) - filtered.detach()) * weights).sum() / 1e-6
+        assert float(found[:, k].sum()) == pytest.approx(float(wanted), rel=1e-4)

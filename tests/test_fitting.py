@@ -249,3 +249,19 @@ def test_layers_that_are_tiny_multiples_of_others_rest(
     found = fit_alpha(operator, image, target)
     torch.testing.assert_close(found, torch.tensor([[1.5, 1.0, 1.0, 1.1]], dtype=dtype), atol=1e-3, rtol=0)
     assert (polynomial_filter(operator, image, found[0]) - target).abs().max() < 1e-5
+
+
+def test_pixels_that_do_not_count_and_other_images_change_nothing() -> None:
+    images = torch.cat([picture("camera", 24, 32), picture("coffee", 24, 32)])
+    operator = nonlocal_operator(images, num_landmarks=20)
+    edited = polynomial_filter(operator, images, torch.tensor([1.4, 1.2, 1.0, 1.0]))
+    rounded = (edited * 255).round() / 255
+    mask = torch.ones(1, 1, 24, 32)
+    mask[..., :2] = 0
+    other = rounded.clone()
+    other[..., :2] += 0.001
+    wanted = fit_alpha(operator, images, rounded, mask=mask)
+    assert torch.equal(fit_alpha(operator, images, other, mask=mask), wanted)
+    mixed = fit_alpha(operator, images, torch.cat([rounded[:1], edited[1:]]))
+    torch.testing.assert_close(mixed[:1], fit_alpha(operator, images, rounded)[:1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(mixed[1:], fit_alpha(operator, images, edited)[1:], rtol=0, atol=1e-5)

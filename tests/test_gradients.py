@@ -374,3 +374,22 @@ def test_gradient_of_the_factor_is_an_ordinary_tensor_to_whoever_looks() -> None
     wide = weighted(operator @ noise(1, 20, *SIZE, seed=2))  # with so many channels that the full matrix is smaller
     assert not isinstance(gradient(wide), OuterProduct)
     torch.testing.assert_close(gradient(once + wide), gradient(once) + gradient(wide))
+
+
+def test_patch_weights_of_0_have_a_gradient() -> None:
+    guide, image = small().detach(), small(seed=1).detach()
+
+    def total(weights: Tensor) -> Tensor:
+        operator = nonlocal_operator(
+            guide, patch_weights=weights, photometric_bandwidth=0.3, num_landmarks=12, landmarks="random"
+        )
+        return (operator @ image).square().sum()
+
+    cross = torch.tensor([[0.0, 1, 0], [1, 2, 1], [0, 1, 0]], dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(total(cross), cross)
+    for index in range(9):
+        step = torch.zeros_like(cross)
+        step.view(-1)[index] = 1e-5
+        with torch.no_grad():
+            wanted = (total(cross + step) - total(cross)) / 1e-5
+        assert float(found.view(-1)[index]) == pytest.approx(float(wanted), abs=1e-6)

@@ -8,6 +8,7 @@ from torch import nn
 
 from nlfilter_torch import (
     DiffusionMask,
+    Look,
     NonlocalAffinity,
     NonlocalFilter,
     PolynomialSliders,
@@ -129,3 +130,14 @@ def test_gradients_reach_the_network_before_the_layer() -> None:
         assert parameter.grad.isfinite().all()
     assert network.weight.grad.abs().max() > 0
     assert layer.sliders.alpha.grad.abs().min() > 0
+
+
+def test_modules_without_values_can_be_printed() -> None:
+    with torch.device("meta"):
+        layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.1)
+    assert "alpha=(4,) without values" in repr(layer)
+
+
+def test_an_unknown_option_of_a_look_is_refused() -> None:
+    with pytest.raises(TypeError, match="num_landmark"):
+        Look(num_landmark=3)

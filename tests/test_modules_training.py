@@ -8,6 +8,7 @@ import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
+from nlfilter_torch import Look, compose_alpha, filter_regions, nonlocal_operator, spectral_filter
 from tests.layers import backward, everything, image, untouched
 from tests.problems import seeded
 
@@ -143,3 +144,30 @@ def test_the_global_generator_is_not_used() -> None:
     backward(everything(), image())
     backward(everything(generator=seeded(1), landmarks="random"), image())
     assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_autocast_does_not_reach_eigenvectors_sliders_of_regions_and_colours() -> None:
+    operator = nonlocal_operator(image()[:1], num_landmarks=20)
+    size = tuple(image().shape[-2:])
+    masks = torch.zeros(1, 2, *size)
+    masks[:, 0, : size[0] // 2], masks[:, 1, size[0] // 2 :] = 1, 0.7
+    sliders = torch.tensor([[3.0, 3.0, 4.0, 1.05], [1.0, 0.9, 1.1, 1.0]])
+    many = torch.rand(1, 12, *size, generator=seeded(3))
+    look = Look({"matrix": torch.eye(3) + 0.03}, photometric_bandwidth=0.1, num_landmarks=30)
+
+    def results() -> list[torch.Tensor]:
+        spectrum = operator.spectrum()
+        vectors = spectrum.eigenvectors
+        return [
+            vectors,
+            spectral_filter(spectrum, many, torch.sqrt),
+            compose_alpha(masks, sliders),
+            filter_regions(operator, image()[:1], masks, sliders),
+            look(image()[:1]),
+        ]
+
+    wanted = results()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = results()
+    for inside, outside in zip(found, wanted, strict=True):
+        torch.testing.assert_close(inside, outside, rtol=0, atol=0)

@@ -237,3 +237,14 @@ def test_jvp_and_hessian_in_image_and_sliders_of_a_fitted_operator() -> None:
 def test_function_transforms_of_building_an_operator_are_refused() -> None:
     with pytest.raises(TypeError, match=r"must not be transformed by torch\.func"):
         grad(lambda y: NonlocalFilter(**OPTIONS)(y).square().mean())(image())
+
+
+def test_building_inside_a_transform_is_refused_with_a_remedy() -> None:
+    layer, picture = NonlocalFilter(num_landmarks=10), image()
+    parameters = {name: value.detach() for name, value in layer.named_parameters()}
+
+    def loss(values: dict[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(layer, values, (picture,)).square().sum()
+
+    with pytest.raises(TypeError, match=r"inside torch\.func .*; build the operator before"):
+        grad(loss)(parameters)

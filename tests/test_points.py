@@ -10,11 +10,14 @@ from nlfilter_torch import (
     NonlocalOperator,
     captured_energy,
     detail_layers,
+    diffusion_map,
     diffusion_mask,
+    fit_alpha,
     fit_filter,
     nonlocal_operator,
     operator_from_features,
     polynomial_filter,
+    propagate_strokes,
     spectral_filter,
 )
 from nlfilter_torch.operator.newton import damped
@@ -239,3 +242,68 @@ def test_columns_of_other_features_are_checked() -> None:
     assert operator.at(noise(1, 3, 5, dtype=torch.float32)).factor.shape == (1, 4, 5)
     with pytest.raises(ValueError, match="features must have 3 features per point"):
         operator.at(noise(1, 2, 5))
+
+
+def weighted_points() -> tuple[torch.Tensor, torch.Tensor]:
+    """Features (1, 3, 60) and two rows of weights with different totals."""
+    points = torch.rand(1, 3, 60, generator=seeded(0), dtype=torch.float64) / 0.3
+    weights = torch.stack([torch.ones(60), 1 + 7 * torch.rand(60, generator=seeded(1))]).double()
+    return points, weights
+
+
+def test_images_of_a_batch_have_totals_of_their_own() -> None:
+    points, weights = weighted_points()
+    both = operator_from_features(points.expand(2, -1, -1), size=(6, 10), weights=weights, num_landmarks=60)
+    alone = operator_from_features(points, size=(6, 10), weights=weights[1:], num_landmarks=60)
+    region = torch.zeros(1, 1, 6, 10)
+    region[..., :2, :2] = 1
+    strokes, painted = torch.rand(1, 2, 6, 10, generator=seeded(2)), region
+    for compute in (
+        lambda spectrum: diffusion_mask(spectrum, region),
+        lambda spectrum: diffusion_map(spectrum, time=1.0).abs(),
+        lambda spectrum: propagate_strokes(spectrum, strokes, painted),
+    ):
+        torch.testing.assert_close(compute(both.spectrum())[1:], compute(alone.spectrum()), rtol=0, atol=1e-6)
+    found, wanted = both.diagnostics(), alone.diagnostics()
+    assert found.diagonal_share[1:] == pytest.approx(wanted.diagonal_share)
+    assert wanted.pixels == round(float(weights[1].sum()))
+
+
+def test_captured_energy_and_sliders_count_the_pixels_that_points_represent() -> None:
+    points, weights = weighted_points()
+    counts = weights[1].round().long()
+    repeated = points.repeat_interleave(counts, dim=2)
+    image = torch.rand(1, 1, 1, 60, generator=seeded(3), dtype=torch.float64)
+    whole = image.repeat_interleave(counts, dim=3)
+    few = operator_from_features(points, size=(60,), weights=counts[None].double(), num_landmarks=60)
+    landmarks = {"landmarks": "random", "num_landmarks": 60}
+    many = operator_from_features(repeated, size=(len(repeated[0, 0]),), **landmarks)
+    spectrum = operator_from_features(points, size=(60,), weights=counts[None].double(), num_landmarks=10).spectrum()
+    vectors = spectrum.eigenvectors.flatten(2)[0]
+    wanted = (vectors * counts * image.flatten()).sum(1).square().sum() / (counts * image.flatten().square()).sum()
+    assert float(captured_energy(spectrum, image)) == pytest.approx(float(wanted), rel=1e-6)
+
+    generator = seeded(4)
+    target = image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)
+    target_of_all = target.repeat_interleave(counts, dim=3)
+    found = fit_alpha(few, image, target, order=2)
+    torch.testing.assert_close(found, fit_alpha(many, whole, target_of_all, order=2), rtol=0.02, atol=0.02)
+
+
+def test_columns_are_differentiable_in_the_features_of_the_operator() -> None:
+    points = torch.rand(1, 2, 30, generator=seeded(5), dtype=torch.float64) * 2
+    others = torch.rand(1, 2, 5, generator=seeded(6), dtype=torch.float64) * 2
+
+    def total(features: torch.Tensor) -> torch.Tensor:
+        built = operator_from_features(
+            features, size=(30,), num_landmarks=6, landmarks="random", tolerance=1e-13, generator=seeded(0)
+        )
+        return built.at(others).scaling.sum()
+
+    given = points.clone().requires_grad_()
+    (found,) = torch.autograd.grad(total(given), given)
+    for index in range(0, 30, 5):
+        step = torch.zeros_like(points)
+        step[0, 0, index] = 1e-5
+        wanted = float(total(points + step) - total(points - step)) / 2e-5
+        assert float(found[0, 0, index]) == pytest.approx(wanted, rel=1e-4, abs=1e-7)

@@ -314,3 +314,20 @@ def test_pixels_to_compare_do_not_depend_on_other_images() -> None:
         assert 8 <= own.shape[1] <= 16
         assert torch.equal(together[k][:, kept[k] > 0], alone[0])
         assert torch.equal(kept[k][kept[k] > 0], own[0])
+
+
+@pytest.mark.parametrize("step", [4, 2.5])
+def test_weights_of_blocks_are_the_means_of_their_pixels(step: float) -> None:
+    source = InMemory(colour("chelsea", 41, 57))
+    small = source.blocks(step, 1)
+    painted = torch.zeros(1, 1, 41, 57)
+    painted[..., 37:, :], painted[..., 54:] = 1, 0.5
+    found = masks.blocks_of(source.scribbles(painted, None, "mask"), small, source.size, step).planes(small)
+    assert found[0, 0, -1, :10].min() == 1
+    assert found[0, 0, :5, -1].min() == 0.5
+    assert found.max() == 1
+
+
+def test_options_of_the_guide_are_refused() -> None:
+    with pytest.raises(TypeError, match="guide_channels must not be given: masks compare colours and texture"):
+        region_mask(colour("chelsea"), box(8, 8), guide_channels="luminance")

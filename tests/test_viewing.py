@@ -17,6 +17,9 @@ from nlfilter_torch.edits.resizing import resize, resized
 from nlfilter_torch.edits.viewing import viewed_size, within_limits
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.tiled.pictures import Picture
+from nlfilter_torch.tiled.source import Tiled
+from nlfilter_torch.tiled.tiles import Passes
 from tests.problems import colour, luminance
 
 ALPHA = torch.tensor([2.2, 2.2, 2.2, 1.0])
@@ -331,3 +334,17 @@ def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.Cap
     assert (read_photograph(tmp_path / "out.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
     assert main([*arguments, "--spatial-bandwidth", "far"]) == 2
     assert "--spatial-bandwidth must be a positive number of pixels, such as 20, or none" in capsys.readouterr().err
+
+
+def test_weights_are_resized_by_themselves() -> None:
+    mask = torch.zeros(2, 1, 40, 56)
+    mask[..., 5:25, 5:30] = 1
+    mask[0] *= 0.6
+    both = InMemory(torch.zeros(2, 3, 40, 56)).resized_weights(mask, (20, 28), "mask")
+    alone = InMemory(torch.zeros(1, 3, 40, 56)).resized_weights(mask[:1], (20, 28), "mask")
+    assert torch.equal(both[:1], alone)
+    assert both[0].max() == pytest.approx(0.6)
+    rows = mask[:, 0].permute(1, 2, 0).numpy()  # the two as planes of one picture
+    tiled = Tiled(Picture(np.zeros((40, 56, 3), np.float32)), Passes("float32"), "mask")
+    found = torch.from_numpy(np.asarray(tiled.resized_weights(rows, (20, 28), "mask"))).permute(2, 0, 1)
+    torch.testing.assert_close(found, both[:, 0], rtol=0, atol=1e-6)

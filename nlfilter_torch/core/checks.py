@@ -22,6 +22,7 @@ Response = Callable[[Tensor], Tensor]
 LARGEST_PATCH = 101  # features take patch_size^2 times the memory of the guide
 LARGEST_ORDER = 1000  # each order takes a copy of the image
 LARGEST_EIGENVALUE = 1e6
+SHOWN = 16  # values of a tensor in a message; of a larger one, only the first wrong value
 LEAST_WEIGHT = 1e-6  # of a point; the largest is its inverse, above which float32 sums lose the other points
 FAR_OUTSIDE = 16.0  # above the values of HDR pictures with white at 1, below those of 8-bit pictures
 
@@ -176,7 +177,7 @@ def check_weight(value: float | Tensor, name: str, batch: int | None = None) -> 
 
 
 def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:
-    """Raise unless ``value`` is a number, or a tensor of shape () or (batch,), in the given one of :data:`DOMAINS`.
+    """Raise unless ``value`` is a number, or a tensor of shape () or (batch,), in a domain named in :data:`DOMAINS`.
 
     The values of a tensor are not checked if :func:`~nlfilter_torch.core.values.is_hidden`.
     """
@@ -200,7 +201,8 @@ def check_values(value: object, name: str, domain: str, batch: int | None = None
         return
     values = value.detach()
     if not bool((inside(values) & torch.isfinite(values)).all()):
-        raise ValueError(f"{name} must be {wanted}, got {values.tolist()}; {remedy}")
+        wrong = values if values.numel() <= SHOWN else values[~(inside(values) & torch.isfinite(values))][0]
+        raise ValueError(f"{name} must be {wanted}, got {wrong.tolist()}; {remedy}")
 
 
 def check_pair(value: object, name: str) -> None:

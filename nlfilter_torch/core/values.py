@@ -46,14 +46,20 @@ def refuse_transforms(name: str, *values: object) -> None:
         )
     if forward_ad._current_level < 0 and peek_interpreter_stack() is None:
         return
+    transformed = any(is_functorch_wrapped_tensor(value) for value in values if isinstance(value, Tensor))
+    if transformed:
+        raise TypeError(
+            f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
+            "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
+        )
+    if peek_interpreter_stack() is not None:
+        raise TypeError(
+            f"{name} must not be used to build an operator inside torch.func (vmap, grad, jvp), got a call in it; "
+            "build the operator before, and transform a function of its application"
+        )
     for value in values:
         if not isinstance(value, Tensor):
             continue
-        if is_functorch_wrapped_tensor(value):
-            raise TypeError(
-                f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
-                "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
-            )
         if forward_ad.unpack_dual(value).tangent is not None:
             raise TypeError(
                 f"{name} must have no forward-mode derivative while an operator is built, got a tensor with a tangent; "

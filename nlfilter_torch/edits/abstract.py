@@ -65,7 +65,7 @@ def abstract(
         **options: further options of :func:`nonlocal_operator`.
 
     Returns:
-        (B, C, H, W). Differentiable in image and power.
+        (B, C, H, W). Differentiable in image and power; the bandwidth ``"auto"`` counts as a constant.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or an option leaves its range.
@@ -142,10 +142,10 @@ def flattened(
     **options: Any,
 ) -> Planes:
     """Compute ``W^k y``."""
+    options = {"guide_channels": "all"} | options
     options |= {
         "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
         "spatial_bandwidth": nearby(spatial_bandwidth, ABSTRACT["spatial_bandwidth"].share, source.size),
-        "guide_channels": "all",
     }
     operator = source.operator(Guide(options, spectral=True))
     # W preserves constants, but the span of the factor need not contain them: filter without the mean.

@@ -182,7 +182,7 @@ def fit_colorize(
     small = viewed_size(source.size, viewing_size)
     if small != source.size:
         viewed = source.resized(small)
-        scribbles = blocks_of(scribbles, viewed, source.size[1], source.size[1] / small[1])
+        scribbles = blocks_of(scribbles, viewed, source.size, source.size[1] / small[1])
     pixels = small[0] * small[1]
     options["num_landmarks"] = min(num_landmarks, pixels)
     nearness = nearby(spatial_bandwidth, COLORIZE["spatial_bandwidth"].share, small)

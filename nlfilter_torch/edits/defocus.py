@@ -91,6 +91,7 @@ def fit_defocus(
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
     spatial_bandwidth: float | Tensor | None = None,
+    reach: float | Tensor = REACH,
     **options: Any,
 ) -> Fitted:
     """:func:`defocus` for any source."""
@@ -103,7 +104,7 @@ def fit_defocus(
     scribbles = source.scribbles(focus_region, None, "focus_region")
     options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
     spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
-    found = fit_regions(source, [scribbles], [], reach=REACH, spatial_bandwidth=spatial_bandwidth, **options)
+    found = fit_regions(source, [scribbles], [], reach=reach, spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:
         return blur_behind(image, focus_of(masks), blur_radius, aperture)

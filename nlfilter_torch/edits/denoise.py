@@ -64,7 +64,7 @@ def denoise(
 
     Returns:
         (B, C, H, W), equal to ``image`` where the noise level is less than a tenth of a grey level. Differentiable in
-        image and noise level.
+        image and noise level; an estimated level counts as a constant.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or ``noise_level`` is negative.
@@ -150,11 +150,11 @@ def _by_network(source: Source, noise: float | Tensor | Noise, strength: float |
 
 def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Tensor | None, **options: Any) -> Fitted:
     assumed = level.clamp(min=NEGLIGIBLE_NOISE)
+    options = {"guide_channels": "all"} | options
     options |= {
         "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
         "spatial_bandwidth": nearby(options["spatial_bandwidth"], DENOISE["spatial_bandwidth"].share, source.size),
         "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
-        "guide_channels": "all",
     }
     operator = source.operator(Guide(options, blur=GUIDE_BLUR))
     layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)

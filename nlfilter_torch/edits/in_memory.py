@@ -104,8 +104,9 @@ class InMemory:
         """Resize weights."""
         check_same_size(weights, self.size, name, "image")
         weights = weights.to(self.image)
-        ends = weights.detach().aminmax()  # undoes the overshoot of interpolation but leaves invalid weights invalid
-        return resize(weights, size).clamp(ends.min, ends.max)
+        ends = weights.amin((2, 3), keepdim=True), weights.amax((2, 3), keepdim=True)
+        # Undoes the overshoot of interpolation but leaves invalid weights invalid.
+        return resize(weights, size).clamp(*ends)
 
     def all(self, fitted: Fitted) -> Tensor:
         """Apply an edit to all pixels."""

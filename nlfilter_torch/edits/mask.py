@@ -103,7 +103,8 @@ def region_mask(
         scribbles, background and parameters.
 
     Raises:
-        TypeError, ValueError: if a tensor has another size, leaves [0, 1], or holds no painted pixel that counts.
+        TypeError, ValueError: if a tensor has another size, leaves [0, 1], or has no painted pixel that no other
+            scribble overrides.
 
     Example:
         >>> image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 0.2
@@ -218,6 +219,8 @@ def fit_regions(
     Further arguments are those of :func:`region_mask`.
     """
     MASK["reach"].check_argument(reach, source.batch)
+    if "guide_channels" in options:
+        raise TypeError("guide_channels must not be given: masks compare colours and texture; leave it out")
     count, several = len(inside), len(background) > 1
     both = [_against(inside, k, background[k : k + 1] if several else background) for k in range(count)]
 
@@ -230,7 +233,7 @@ def fit_regions(
     blocks = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
     small = viewed.blocks(blocks, FLOATS_PER_PIXEL + options["num_landmarks"])
     step = blocks if viewed is source else blocks * source.size[1] / size[1]
-    marks = [blocks_of(marked, small, source.size[1], step) for marked in both]
+    marks = [blocks_of(marked, small, source.size, step) for marked in both]
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
         if spatial_bandwidth is not None:
@@ -259,24 +262,26 @@ def fit_regions(
     return Regions(small.image, step, small.kept("borders", masks, borders), both)
 
 
-def blocks_of(marked: Scribbles, small: Source, width: int, step: float) -> Scribbles:
+def blocks_of(marked: Scribbles, small: Source, size: tuple[int, int], step: float) -> Scribbles:
     """Scribbles on the reduced picture; weight and colour of a block are the means of its pixels.
 
     Args:
         marked: scribbles on the picture.
         small: the reduced picture.
-        width: W of the picture.
+        size: (H, W) of the picture.
         step: side of a block, in pixels.
     """
     if step == 1:
         return marked
-    row, column = (
-        ((at + 0.5) / step).long().clamp(max=count - 1)
-        for at, count in zip((marked.places // width, marked.places % width), small.size, strict=True)
+    rows, columns = (
+        ((torch.arange(length, device=marked.places.device) + 0.5) / step).long().clamp(max=count - 1)
+        for length, count in zip(size, small.size, strict=True)
     )
+    pixels = torch.outer(rows.bincount(minlength=small.size[0]), columns.bincount(minlength=small.size[1])).flatten()
+    row, column = rows[marked.places // size[1]], columns[marked.places % size[1]]
     places, block = (row * small.size[1] + column).unique(return_inverse=True)
     weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
-    weights = weights.index_add(2, block, marked.weights) / step**2
+    weights = weights.index_add(2, block, marked.weights) / pixels[places]
     colours = marked.colours
     if colours is not None:
         total = marked.weights.sum(1, keepdim=True)

@@ -63,7 +63,7 @@ def estimate_noise(image: Tensor) -> Tensor:
     two grey levels.
 
     Args:
-        image: (B, C, H, W), at least 3x3.
+        image: (B, C, H, W).
 
     Returns:
         (B,), in units of the image; 0 for an image smaller than 3x3. No gradient is propagated.

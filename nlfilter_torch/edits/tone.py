@@ -51,7 +51,8 @@ def adjust_tone(
         **options: further options of :func:`nonlocal_operator`.
 
     Returns:
-        (B, C, H, W) with unchanged mean in every channel; values may leave [0, 1]. Differentiable in image, contrast
+        (B, C, H, W) with nearly the same mean brightness; with ``limits="none"``, exactly the same mean in every
+        channel, and values that may leave [0, 1]. Differentiable in image, contrast
         and clarity.
 
     Raises:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import fold_batch
+from nlfilter_torch.core.blocks import fold_batch, weighted
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_dtype,
@@ -242,11 +242,15 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
     captured = spectral_filter(spectrum, image.to(spectrum.factor.dtype), torch.ones_like)
-    energy = spectrum.among.sum(image.to(spectrum.factor).square().sum((1, 2, 3)))
-    inner = spectrum.among.sum((captured * image.to(spectrum.factor)).sum((1, 2, 3)))  # y^T V V^T y
+    image = image.to(spectrum.factor)
+    energy, inner = (  # |y|^2 and y^T V V^T y, in the sum over weighted points
+        spectrum.among.sum(weighted((planes * image).flatten(2).sum(1), spectrum.weights).sum(1))
+        for planes in (image, captured)
+    )
     return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))
 
 
+@full_precision
 def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
     """Compute per-pixel sliders from per-region sliders: a region's own inside its mask, ones outside all masks.
 
@@ -278,6 +282,10 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
         raise ValueError(
             f"alpha must have shape ({masks.shape[1]}, k+1) or (B, {masks.shape[1]}, k+1), a row of sliders for every "
             f"mask, got {tuple(alpha.shape)}; reshape it"
+        )
+    if alpha.ndim == 3 and len(alpha) != len(masks) and 1 not in (len(alpha), len(masks)):
+        raise ValueError(
+            f"alpha must have the batch of masks, {len(masks)}, or 1, got {len(alpha)}; give a row for each"
         )
     check_finite(alpha, "alpha")
     shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
@@ -327,10 +335,14 @@ def filter_regions(
     check_unit_range(masks, "masks")
     check_same_size(masks, operator.size, "masks", "operator", operator.factor)
     total = masks.sum(1, keepdim=True)
-    # Averaged over the regions with the masks as weights, (B, k+1, H, W).
-    sliders = compose_alpha(masks / total.clamp(min=torch.finfo(masks.dtype).tiny), operator.among.copy_to_group(alpha))
+    outside = total == 0
+    # Averaged over the regions with the masks as weights, (B, k+1, H, W); outside, 1, whose derivatives are those by
+    # the masks.
+    weights = masks / torch.where(outside, 1.0, total)
+    sliders = compose_alpha(weights, operator.among.copy_to_group(alpha))
     filtered = polynomial_filter(operator, image, sliders, residual=residual)
-    return torch.lerp(image, filtered, total.clamp(max=1.0).to(image))
+    edited = torch.lerp(image, filtered, torch.where(outside, 1.0, total.clamp(max=1.0)).to(image))
+    return torch.where(outside, image.detach() + (edited - edited.detach()), edited)
 
 
 def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
@@ -358,6 +370,11 @@ def polynomial_response(eigenvalues: Tensor, alpha: Tensor) -> Tensor:
     if alpha.ndim == 2 and alpha.shape[0] != 1:
         rows = eigenvalues.shape[0] if eigenvalues.ndim else 1
         check_shape(alpha, (rows, alpha.shape[1]), "alpha", "give a row for each row of eigenvalues")
+        if eigenvalues.ndim > 2:
+            raise ValueError(
+                f"eigenvalues must have shape (B, R) for sliders of shape (B, k+1), got {tuple(eigenvalues.shape)}; "
+                "flatten the other dimensions"
+            )
     weights = alpha.to(eigenvalues)
     gain = weights[..., -1:]  # Horner's scheme from the coarsest layer down
     for i in range(weights.shape[-1] - 2, -1, -1):

@@ -66,12 +66,13 @@ def fit_alpha(
         image: y, (B, C, H, W), before the edit.
         target: (B, C, H, W), after it; channels have equal weight.
         order: k, at least 1; k+1 sliders are found.
-        mask: (B, 1, H, W) or (1, 1, H, W), non-negative weights of the pixels; None weighs all equally.
+        mask: (B, 1, H, W) or (1, 1, H, W), non-negative weights of the pixels; None weighs all equally. Points that
+            represent several pixels count for as many.
         ridge: weight of the penalty ``|alpha - 1|^2`` relative to the mean squared error, at least 0.
         shared: one alpha for the whole batch, rather than one for each image.
         rounding: half the step between the values of ``target``, such as 0.5 / 255 for 8 bits. Errors up to it are
-            ignored, and so are values beyond a target of 0 or 1, which a file clips. None is 0.5 / 255 if ``target``
-            holds only multiples of 1 / 255, and 0.0, ordinary least squares, otherwise.
+            ignored, and so are values beyond a target of 0 or 1, which a file clips. None is 0.5 / 255 for each target
+            that, where it counts, holds only multiples of 1 / 255, and 0.0, ordinary least squares, for others.
         loss: ``loss(filtered, target)``, a number to be minimised by L-BFGS from the least-squares solution; None
             returns that solution. Where ``mask`` is 0 both arguments are the target, and in between they are blended.
 
@@ -104,16 +105,22 @@ def fit_alpha(
     check_same_size(image, operator.size, "image", "operator", operator.factor)
     check_same_size(target, operator.size, "target", "image", image)
     _check_not_negative(ridge, "ridge")
-    if rounding is None:
-        rounding = HALF_LEVEL if _is_rounded(target, operator.among) else 0.0
-    _check_not_negative(rounding, "rounding")
+    if rounding is not None:
+        _check_not_negative(rounding, "rounding")
 
     layers = detail_layers(operator, image.to(operator.factor), order=order).double()  # (B, k+1, C, H, W)
+    counted = mask
+    if operator.weights is not None:
+        represented = operator.weights.unflatten(1, operator.size).unsqueeze(1)
+        counted = represented if mask is None else mask * represented
+    weights = _pixel_weights(counted, layers, operator.among).flatten(1)
+    aims = target.detach().double().flatten(1)
+    each = _roundings(aims, weights, operator.among) if rounding is None else aims.new_full((1, 1), rounding)
     problem = _Problem(
         layers=layers.flatten(2),
         edit=(target.double() - layers.sum(1)).flatten(1),
-        dead_zone=_dead_zone(target.detach().double().flatten(1), rounding) if rounding > 0.0 else None,
-        weights=_pixel_weights(mask, layers, operator.among).flatten(1),
+        dead_zone=_dead_zone(aims, each) if bool((each > 0.0).any()) else None,
+        weights=weights,
         ridge=ridge,
         shared=shared,
         precision=operator.factor.dtype,
@@ -143,7 +150,7 @@ def fit_layers(layers: Tensor, image: Tensor, target: Tensor, weights: Tensor, r
     problem = _Problem(
         layers=layers.double()[None],
         edit=aim - image.double()[None],
-        dead_zone=_dead_zone(aim, rounding) if rounding > 0.0 else None,
+        dead_zone=_dead_zone(aim, aim.new_tensor([[rounding]])) if rounding > 0.0 else None,
         weights=(weights.double() / weights.double().sum())[None],
         ridge=0.0,
         shared=False,
@@ -158,16 +165,20 @@ def _check_not_negative(value: float, name: str) -> None:
     check_values(value, name, "not negative", remedy="0.0 is plain least squares")
 
 
-def _is_rounded(target: Tensor, among: Communicator) -> bool:
-    """Whether all values of ``target`` are multiples of 1/255."""
-    levels = target.detach().double() * 255
-    return bool(among.max((levels - levels.round()).abs().max()) < OFF_LEVEL)
+def _roundings(target: Tensor, weights: Tensor, among: Communicator) -> Tensor:
+    """Half a level (B, 1) for targets (B, P) whose values of positive weight are multiples of 1/255, 0 for others."""
+    levels = 255 * target
+    off = torch.where(weights > 0, (levels - levels.round()).abs(), 0.0)
+    return HALF_LEVEL * (among.max(off.amax(1, keepdim=True)) < OFF_LEVEL).double()
 
 
-def _dead_zone(target: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
-    """Range of errors (target minus filtered) that count as zero; unbounded on one side for a clipped pixel."""
-    low = torch.where(target >= 1.0, -math.inf, -rounding)
-    high = torch.where(target <= 0.0, math.inf, rounding)
+def _dead_zone(target: Tensor, rounding: Tensor) -> tuple[Tensor, Tensor]:
+    """Range of errors (target minus filtered) that count as zero; unbounded on one side for a clipped pixel.
+
+    The rounding (B, 1) is 0 for targets without such a range.
+    """
+    low = torch.where((target >= 1.0) & (rounding > 0.0), -math.inf, -rounding)
+    high = torch.where((target <= 0.0) & (rounding > 0.0), math.inf, rounding)
     return low, high
 
 

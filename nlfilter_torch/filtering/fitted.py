@@ -190,8 +190,6 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = weighted(operator.scaling, operator.weights).unsqueeze(1)  # (1, 1, N)
     factor, among = operator.factor, operator.among
-    # Recomputed from the factor, since the operator's own moment has no gradient.
-    balancing = replace(operator.balancing, moment=among.sum(moment(factor, scaling)))
     moments = torch.stack([among.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
     captured = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
-    return FittedFilter(operator.kernel, balancing, moments, captured)
+    return FittedFilter(operator.kernel, operator.differentiable_balancing(), moments, captured)

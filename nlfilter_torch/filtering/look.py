@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_tensor
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.filtering.local_tone import STRENGTHS, LocalCurves, mean_ramps
 from nlfilter_torch.filtering.stretch import KINDS, Stretch, ends_of, tones
@@ -91,6 +92,7 @@ def local_curves(image: Tensor, stretch: Stretch) -> LocalCurves:
     return LocalCurves.of((image.shape[-2], image.shape[-1]), stretch, partial(mean_ramps, image, stretch))
 
 
+@full_precision
 def pointwise(image: Tensor, curves: Tensor, matrix: Tensor, saturation: Tensor) -> Tensor:
     """The image (B, 3, H, W) plus what tone curves, matrix and saturation change."""
     change = matrix - torch.eye(3).to(matrix)

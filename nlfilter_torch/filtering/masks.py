@@ -37,7 +37,8 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_positive(time, "time", spectrum.factor.shape[0])
     gain = spectrum.eigenvalues[:, 1:].pow(torch.as_tensor(time).to(spectrum.factor).reshape(-1, 1))
-    return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * spectrum.pixels**0.5
+    root = torch.as_tensor(spectrum.pixels).to(gain).sqrt().reshape(-1, 1, 1, 1)
+    return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * root
 
 
 @full_precision
@@ -93,7 +94,11 @@ def diffusion_mask(
         weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
     # The constant eigenvector does not contribute to distances, so it is kept, and no eigenvectors need to be formed.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
-    scale = spectrum.pixels / torch.as_tensor(spectrum.among.copy_to_group(width)).to(distances).reshape(-1, 1, 1)
+    pixels, width = (
+        torch.as_tensor(value).to(distances).reshape(-1, 1, 1)
+        for value in (spectrum.pixels, spectrum.among.copy_to_group(width))
+    )
+    scale = pixels / width
     exponents = scale.clamp(max=STEEPEST) * distances  # of the regions, then of negative ones
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = torch.exp(-inner.clamp(max=FARTHEST))
@@ -121,7 +126,7 @@ def check_negative(count: int, regions: int) -> None:
     """Raise unless there is one negative region for all regions, or one for each."""
     if count not in (1, regions):
         raise ValueError(
-            f"negative must have 1 channel or those of region, {regions}, got {count}; give one for all regions "
+            f"negative must have 1 channel or as many as region ({regions}), got {count}; give one for all regions "
             "or one for each"
         )
 

@@ -132,7 +132,7 @@ class FittedStrokes:
 def fit_strokes(
     painted: ScribbledBlocks,
     pairs: RitzPairs,
-    pixels: int,
+    pixels: float | Tensor,
     *,
     strength: float | Tensor,
     reach: float | Tensor,
@@ -142,13 +142,13 @@ def fit_strokes(
     """Fit the regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
     ``painted`` is called more than once and returns an iterable over all scribbled pixels, in blocks of columns of the
-    factor (B, M, n), weights (B, 1, n) and values (B, C, n). ``pixels`` is their number N in the whole image, whose
-    rows are distributed over the ranks of ``among``.
+    factor (B, M, n), weights (B, 1, n) and values (B, C, n). ``pixels`` is the number N of pixels of the whole image,
+    or (B,), whose rows are distributed over the ranks of ``among``.
     """
     walk = _per_image(reach, pairs.root).squeeze(2)  # s, (B or 1, 1)
     basis = pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt())
     half = basis.mT  # R, where X = R R^T
-    effective_weights = EffectiveWeights.of(painted, half, DAB * pixels, among)
+    effective_weights = EffectiveWeights.of(painted, half, _dab(pixels), among)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for factor, weights, values in painted():
@@ -187,17 +187,17 @@ class EffectiveWeights:
     Attributes:
         core: X, (B, M, M).
         gram: ``X G X / v`` with G the sum over the scribbled pixels and v their mean captured variance, (B, M, M).
-        dab: number of pixels in a brush dab.
+        dab: number of pixels in a brush dab, one for all images or (B, 1, 1).
         noise: variance of the values of a dab, (B, 1, 1).
     """
 
     core: Tensor
     gram: Tensor
-    dab: float
+    dab: float | Tensor
     noise: Tensor
 
     @staticmethod
-    def of(painted: ScribbledBlocks, half: Tensor, dab: float, among: Communicator) -> "EffectiveWeights":
+    def of(painted: ScribbledBlocks, half: Tensor, dab: float | Tensor, among: Communicator) -> "EffectiveWeights":
         """Compute the attributes from sums over the scribbled pixels."""
         gram, residual, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
@@ -212,14 +212,21 @@ class EffectiveWeights:
 
     def __call__(self, factor: Tensor, weights: Tensor) -> Tensor:
         """Compute the effective weights (B, 1, n) of pixels with columns (B, M, n)."""
-        noise, own = self.noise.to(weights), diagonal_residual(factor) / min(self.dab, 1.0)
+        dab = self.dab.to(weights) if isinstance(self.dab, Tensor) else self.dab
+        at_most_1 = dab.clamp(max=1.0) if isinstance(dab, Tensor) else min(dab, 1.0)
+        noise, own = self.noise.to(weights), diagonal_residual(factor) / at_most_1
         weights = weights * noise / (noise + own)
-        if self.dab <= 1:
+        if not isinstance(dab, Tensor) and dab <= 1:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
         # Sum of squared correlations with the scribbled pixels.
         similar = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
-        return weights * (self.dab / similar.clamp(min=1.0)).clamp(min=1.0)
+        return weights * (dab / similar.clamp(min=1.0)).clamp(min=1.0)
+
+
+def _dab(pixels: float | Tensor) -> float | Tensor:
+    """Number of pixels in a brush dab."""
+    return DAB * pixels.reshape(-1, 1, 1) if isinstance(pixels, Tensor) else DAB * pixels
 
 
 def diagonal_residual(factor: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.core.precision import as_given
+from nlfilter_torch.core.precision import as_given, full_precision
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
@@ -111,7 +111,7 @@ class NonlocalDenoiser(nn.Module):
             noisy: (B, C, H, W), in [0, 1] apart from the noise, or one image (C, H, W). Three channels are treated as
                 colours; any other number of channels are denoised one by one.
             noise: standard deviation of the noise in units of the image: a number, (B,), or a map (B, 1 or C, H, W).
-                Where it is 0 the image is unchanged.
+                Where it is 0 in all channels the image is unchanged.
             turns: 1, 2 or 4: number of results to average, each from the image rotated by a different angle. More take
                 longer and are better by about 0.1 dB.
 
@@ -134,7 +134,7 @@ class NonlocalDenoiser(nn.Module):
     def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Inner = EVERYWHERE) -> Tensor:
         """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype.
 
-        Values outside ``inner`` may be any.
+        Values outside ``inner`` are unspecified.
         """
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
@@ -240,6 +240,7 @@ def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tens
     return levels.expand(image.shape[0], 1, *image.shape[-2:])
 
 
+@full_precision
 def split_colours(image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Split an image into luminance and two colour differences (B, 3, H, W); return them and their noise (B, 2, H, W).
 
@@ -254,11 +255,14 @@ def split_colours(image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     return torch.einsum("pc,bchw->bphw", _mixture(image), image), deviation.clamp(min=1e-30).sqrt()
 
 
+@full_precision
 def join_colours(planes: Tensor, channels: int) -> Tensor:
     """Invert :func:`split_colours`."""
     if channels == 1:
         return planes[:, :1]
-    return torch.einsum("cp,bphw->bchw", torch.linalg.inv(_mixture(planes)), planes)
+    # Coefficients of differences are orthonormal and add up to 0: the inverse is the transpose but for the luminance.
+    inverse = torch.cat([torch.ones_like(_mixture(planes)[:1]), _mixture(planes)[1:]]).mT
+    return torch.einsum("cp,bphw->bchw", inverse, planes)
 
 
 def in_tiles(

@@ -1,5 +1,6 @@
 """A layer for looks with learned parts."""
 
+import inspect
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -80,6 +81,7 @@ class Look(nn.Module):
                 self.register_parameter(name, nn.Parameter(own))
             else:
                 self.register_buffer(name, own)
+        inspect.signature(nonlocal_operator).bind(None, **options)  # raises TypeError for an unknown option
         self.options = {"photometric_bandwidth": LEVELS / 255, "num_landmarks": LANDMARKS, **options}
 
     def forward(self, image: Tensor, operator: NonlocalOperator | None = None, **parts: Tensor) -> Tensor:

@@ -33,7 +33,9 @@ class Learnable(nn.Module):
     def shown(self, name: str) -> float | str | None:
         """Format a positive option for ``extra_repr``."""
         value: float | str | Tensor | None = getattr(self, name)
-        return f"{value.item():.4g}" if isinstance(value, Tensor) else value
+        if not isinstance(value, Tensor):
+            return value
+        return "..." if value.is_meta else f"{value.item():.4g}"
 
     def _load_from_state_dict(
         self,

@@ -95,6 +95,8 @@ class PolynomialSliders(nn.Module):
 
     def extra_repr(self) -> str:
         """The current sliders."""
+        if self.alpha.is_meta:
+            return f"alpha={tuple(self.alpha.shape)} without values"
         residual = None if self.residual is None else round(self.residual.item(), 4)
         alpha = self.alpha.double().mul(1e4).round().div(1e4).tolist()  # in double, so that 1.05 prints as such
         return f"alpha={alpha}, residual={residual}"

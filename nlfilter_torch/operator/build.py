@@ -196,8 +196,9 @@ def operator_from_features(
     Args:
         features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
         size: (H, W) with H * W = N, the shape of the images to filter; (N,), meaning (1, N), for unordered points.
-        weights: (N,) or (B, N), positive: how many identical pixels each point represents. Landmarks are drawn in
-            proportion to the weights. None means one each. Constant for gradients.
+        weights: (N,) or (B, N), positive: how many identical pixels each point represents. With ``"kmeans"``,
+            landmarks are drawn in proportion to the weights, averaged over a batch. None means one each. Constant for
+            gradients.
         num_landmarks: M; reduced with a warning where there are fewer points.
         landmarks: as for :func:`nonlocal_operator`.
         completion: as for :func:`nonlocal_operator`.
@@ -242,9 +243,9 @@ def sampled_operator(
 ) -> NonlocalOperator:
     """:func:`nonlocal_operator` of some pixels of a guide, each of which stands for as many others.
 
-    Landmarks are those of the whole guide (1, 1, H, W), and so are the results at these pixels, but for the error of
-    sums over a sample. ``places`` of the pixels (n,), along the rows, are even over the picture. The images of the
-    operator have the size (1, n).
+    Landmarks are those of the whole guide (1, 1, H, W); results at these pixels equal those of the whole guide, up to
+    the error of sums over a sample. ``places`` (n,) are row-major indices of pixels that are spread evenly over the
+    picture. The images of the operator have the size (1, n).
     """
     method = Construction(num_landmarks, landmarks, "diagonal", None, generator)
     if isinstance(photometric_bandwidth, str):

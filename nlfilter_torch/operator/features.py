@@ -25,6 +25,8 @@ from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.core.values import is_hidden
 
+FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
+
 GuideChannels = Literal["luminance", "all"]
 Bandwidth = float | Tensor | None
 
@@ -102,7 +104,9 @@ def extract_features(
     """
     batch, channels, height, width = guide.shape
     size = patch_weights.shape[0]
-    scale = patch_weights.to(guide).div(channels).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
+    weights = patch_weights.to(guide).div(channels)
+    # The derivative of the root is infinite at 0, but that of squared distances is not.
+    scale = (weights + FAINT_WEIGHT * (weights == 0)).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
     padded = pad_border(guide, size // 2)
     # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
     padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]

@@ -56,7 +56,7 @@ def choose_landmarks(
 
     Returns:
         (B, D, M), differentiable in the features (for k-means with the assignment held fixed). The same pixels are
-        drawn for all images of a batch, so that a batch gives the same results as single calls.
+        drawn for all images of a batch, so that a batch without weights gives the same results as single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if count == features.shape[-1] and among.size == 1:
@@ -147,8 +147,9 @@ def _grid(size: tuple[int, int], count: int) -> Tensor:
 
 
 def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
-    """Draw ``count`` distinct pixels, one from each of ``count`` equal intervals of pixel indices.
+    """Draw ``count`` pixels, one from each of ``count`` equal intervals of pixel indices.
 
+    They are distinct if an interval has one pixel or at least two; between that, some may be drawn twice.
     In ascending order, since gathering them takes a third of the time that it takes in random order.
     """
     device = generator.device

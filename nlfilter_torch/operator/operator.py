@@ -1,6 +1,6 @@
 """The filter W as an object, with its products, spectrum and diagnostics. Paper: Sec. II."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Target, loadable, moved
+from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
@@ -45,7 +46,7 @@ class Diagnostics:
     """Measures of the quality of an operator; lists have one entry per image.
 
     Attributes:
-        pixels: N.
+        pixels: N; for weighted points the sum of the weights, averaged over the images.
         num_landmarks: M.
         rank: number of eigenvectors above rounding.
         photometric_bandwidth: h_y in units of the guide; 1 for an operator made from features.
@@ -138,6 +139,8 @@ class NonlocalOperator:
     def at(self, features: Tensor) -> Columns:
         """Compute the columns of any points from their own features and from sums over the image.
 
+        Differentiable once in both features, those of the points and those of the operator.
+
         Args:
             features: (B, D, n), of points of this image or another, with the meaning and scale of the features that the
                 operator was made from.
@@ -147,7 +150,15 @@ class NonlocalOperator:
         """
         check_features(features, "features", self.kernel.landmarks.shape[1])
         factor, diagonal = self.kernel.factor(features.to(self.kernel.landmarks))
-        return Columns(factor, *self.balancing(factor, diagonal))
+        return Columns(factor, *self.differentiable_balancing()(factor, diagonal))
+
+    @full_precision
+    def differentiable_balancing(self) -> PixelScaling:
+        """:attr:`balancing`, whose moment has no gradient, with one that has, recomputed from the factor."""
+        if not self.factor.requires_grad:
+            return self.balancing
+        scaling = weighted(self.scaling, self.weights).unsqueeze(1)
+        return replace(self.balancing, moment=self.among.sum(moment(self.factor, scaling)))
 
     def matmul(self, image: Tensor) -> Tensor:
         """Compute ``W y``, also written ``operator @ image``. Paper: eq. (2).
@@ -185,7 +196,7 @@ class NonlocalOperator:
         return self.remainder.unflatten(1, self.size).unsqueeze(1)
 
     def row_sums(self) -> Tensor:
-        """Row sums of W, (B, 1, H, W): one everywhere, with an error of at most :attr:`residual`."""
+        """Row sums of W, (B, 1, H, W): one everywhere, with an error of about :attr:`residual`."""
         batch = self.factor.shape[0]
         return self.matmul(self.factor.new_ones(batch, 1, *self.size))
 
@@ -270,9 +281,10 @@ class NonlocalOperator:
         matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.among)
         kernel_sums = matrix.affinities(matrix.moment(torch.ones_like(self.scaling))) + self.diagonal
         recipe = self.kernel.features
+        pixels = torch.as_tensor(spectrum.pixels).to(self.factor)
         bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)
         return Diagnostics(
-            pixels=spectrum.pixels,
+            pixels=round(float(pixels.mean())),
             num_landmarks=self.factor.shape[1],
             rank=spectrum.support.sum(1).tolist(),
             photometric_bandwidth=bandwidth.expand(self.factor.shape[0]).tolist(),
@@ -282,7 +294,7 @@ class NonlocalOperator:
             largest_eigenvalue=certificate.largest_eigenvalue,
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(self.among.sum(weighted(self.remainder, self.weights).sum(1)) / spectrum.pixels).tolist(),
+            diagonal_share=(self.among.sum(weighted(self.remainder, self.weights).sum(1)) / pixels).tolist(),
         )
 
 

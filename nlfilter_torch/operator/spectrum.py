@@ -118,10 +118,10 @@ class Spectrum(RitzPairs):
         return moved(self, target, dtype)
 
     @property
-    def pixels(self) -> int:
-        """Number of pixels N of the whole image; for weighted points the sum of the weights."""
+    def pixels(self) -> float | Tensor:
+        """Number of pixels N of the whole image; for weighted points the sums of the weights, (B,)."""
         if self.weights is not None:
-            return round(float(self.among.sum(self.weights[0].sum())))
+            return self.among.sum(self.weights.sum(1))
         return self.among.pixels(self.scaling.shape[1])
 
     @property
@@ -141,11 +141,13 @@ class Spectrum(RitzPairs):
         return self._recorded if torch.is_grad_enabled() and self.ritz.matrix.requires_grad else self._constant
 
     @cached_property
+    @full_precision
     def _recorded(self) -> Tensor:
         return self._form(torch.linalg.eigh(self.ritz.matrix).eigenvectors.flip(-1))
 
     @cached_property
     @torch.no_grad()
+    @full_precision
     def _constant(self) -> Tensor:
         """Cached separately, so that a call without gradients does not replace eigenvectors that have a gradient."""
         return self._form(self.ritz.vectors)
@@ -179,6 +181,7 @@ class Spectrum(RitzPairs):
         total = self.among.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
+    @full_precision
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
         """Compute ``V f(S) V^T y``, (B, C, H, W), from a response f and coefficients (B, C, M) of y."""
         check_coefficients(coefficients, self.factor)

@@ -171,16 +171,21 @@ class Tiled:
                 f"{name} must have the height and width of the picture, {self.size}, got {tuple(weights.shape[:2])}; "
                 "resize them"
             )
-        ends: list[float] = []  # of the weights; interpolation may exceed them, but must not hide an invalid weight
+        # Extremes of each plane; interpolation may exceed them, but must not hide an invalid weight.
+        lowest: list[Tensor] = []
+        highest: list[Tensor] = []
 
         def read(start: int, stop: int) -> Tensor:
             rows = torch.from_numpy(np.atleast_3d(np.array(weights[start:stop], np.float32)))
             rows = rows.permute(2, 0, 1)[None]
-            ends.extend((float(rows.min()), float(rows.max())))
+            lowest.append(rows.amin((2, 3), keepdim=True))
+            highest.append(rows.amax((2, 3), keepdim=True))
             return rows
 
-        found = resized(read, self.size, size)  # fills the list
-        return found.clamp(min(ends), max(ends))[0].permute(1, 2, 0).contiguous().numpy()
+        found = resized(read, self.size, size)  # fills the lists
+        return (
+            found.clamp(torch.cat(lowest).amin(0), torch.cat(highest).amax(0))[0].permute(1, 2, 0).contiguous().numpy()
+        )
 
     def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
         """Resize planes of tiles, which are computed by several threads."""
