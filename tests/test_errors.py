@@ -286,3 +286,17 @@ def test_shapes_of_sliders_and_eigenvalues_that_do_not_fit() -> None:
     raises(lambda: polynomial_response(torch.ones(3, 3, 5), torch.ones(3, 4)), ValueError, message)
     message = "alpha must have the batch of masks, 2, or 1, got 3"
     raises(lambda: compose_alpha(torch.ones(2, 1, 4, 4), torch.ones(3, 1, 4)), ValueError, message)
+
+
+@pytest.mark.parametrize(
+    ("outside", "error", "message"),
+    [
+        (torch.ones(2), ValueError, "outside must have shape (4,), got (2,); give as many sliders as alpha has"),
+        ([1.0, 1.0, 1.0, 1.0], TypeError, "outside must be a torch.Tensor, got list; give as many sliders as alpha has"),
+        (torch.ones(4).int(), TypeError, "outside must have a floating-point dtype, got torch.int32; write 1.0"),
+        (torch.full((4,), torch.nan), ValueError, "outside must be"),
+    ],
+)
+def test_bad_sliders_outside_of_regions(outside: Any, error: type[Exception], message: str) -> None:
+    regions = torch.ones(1, 1, 8, 9)
+    raises(lambda: enhance(torch.rand(1, 3, 8, 9), torch.ones(4), regions, outside=outside), error, message)

@@ -13,7 +13,7 @@ SAME_SHAPE = 0.02  # largest difference of log aspect ratios at which an edited 
 MIN_CORRELATION = 0.6  # correlation required between a crop and its position
 SEARCH_SIDE = 400  # short side in pixels of the reduced picture in which a crop is searched for first
 MAX_SHIFT = 0.1  # largest shift, as a share of the short side
-PLAIN = 2.5 / 255  # by which the colours of a frame differ at most, in files of any kind
+PLAIN = 2.5 / 255  # largest difference of colours within a frame, after lossy compression too
 
 
 def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:

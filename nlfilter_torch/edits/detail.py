@@ -8,9 +8,12 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import (
     check_alpha,
+    check_dtype,
+    check_finite,
     check_image,
     check_photograph,
     check_positive,
+    check_shape,
     check_tensor,
     check_weight,
 )
@@ -68,8 +71,8 @@ def enhance(
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
         reach: reach of the masks, in [0, 1); larger includes less similar pixels.
         mask_bandwidth: photometric bandwidth of the masks, in hundredths of Lab.
-        threshold: standard deviation of luminance around a pixel at which detail is amplified half as much as the
-            sliders say, and less where it is smaller; 0 amplifies all detail alike.
+        threshold: standard deviation of luminance around a pixel at which detail gets half the amplification of the
+            sliders; where the deviation is smaller, detail gets less. 0 amplifies all detail alike.
         limits: ``"soft"`` keeps detail in highlights and shadows, ``"none"`` adds the change as it is and lets them
             clip.
         viewing_size: in megapixels; larger images are edited like their reduction to this size, with patches and
@@ -149,6 +152,10 @@ def fit_detail(
     if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
+    if outside is not None:
+        check_shape(outside, (alpha.shape[-1],), "outside", "give as many sliders as alpha has")
+        check_dtype(outside, "outside", "write 1.0 instead of 1")
+        check_finite(outside, "outside")
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
     order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
     sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit

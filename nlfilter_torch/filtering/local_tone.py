@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.stretch import DARKEST, Stretch, brightness
 
-LIMITS = (1.5, 2.0, 3.0, 5.0)  # times as much of a shade as in an even histogram that counts at most: slopes of curves
+LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
 STRENGTHS = 2 * len(LIMITS)  # of luminance, and of the largest channel
 SHADES = 33
 TILES = 8  # along both sides
@@ -82,7 +82,7 @@ class LocalCurves:
         return LocalCurves(torch.stack(changes, dim=2), size, stretch)
 
     def weighed(self, strength: Tensor) -> "LocalCurves":
-        """One curve: the sum of all, each as strong as (2 S,) or (B, 2 S) says."""
+        """The sum of all curves as one, weighted by strengths (2 S,) or (B, 2 S)."""
         weights = strength.to(self.changes).reshape(-1, 2, len(LIMITS), 1, 1, 1)
         return LocalCurves((weights * self.changes).sum(2, keepdim=True), self.size, self.stretch)
 

@@ -21,7 +21,7 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
-DARKEST = 1 / 255  # that has a saturation
+DARKEST = 1 / 255  # smallest value of the largest channel for which saturation is defined
 #: Parts of a look, with their shapes for one image; a letter is any length from 2 on.
 SHAPES: dict[str, tuple[int | str, ...]] = {
     "alpha": ("k+1",),
@@ -78,7 +78,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
 
 
 def acts(gains: Tensor, idle: float = 1.0) -> bool:
-    """Whether gains change anything, which ``idle`` ones do not, or may once they are learned."""
+    """Whether gains differ from ``idle``, at which they have no effect, or are learned."""
     return gains.requires_grad or bool((gains != idle).any())
 
 
@@ -107,7 +107,7 @@ def below_largest(image: Tensor) -> Tensor:
 
 
 def saturation_hats(image: Tensor, count: int) -> Tensor:
-    """How much of each of some equal steps from 0 to 1 there is in the saturation in HSV, (B, K, H, W)."""
+    """Weights (B, K, H, W) of the HSV saturation in K evenly spaced hat functions on [0, 1]."""
     largest, least = image.amax(1, keepdim=True), image.amin(1, keepdim=True)
     share = ((largest - least) / largest.clamp(min=DARKEST)).clamp(0, 1)
     steps = torch.arange(count).to(image).view(-1, 1, 1)
@@ -124,7 +124,7 @@ def tone_curve(image: Tensor, curves: Tensor) -> Tensor:
 
 
 def bands_of(image: Tensor) -> Iterator[Tensor]:
-    """What each of the blurs takes away from an image (B, C, H, W), and last what they leave."""
+    """The band that each blur removes from an image (B, C, H, W), and finally the rest."""
     height, width = image.shape[-2:]
     left, margin = pad_border(image, BAND_MARGIN), BAND_MARGIN
     for level in range(BLURS):
@@ -138,13 +138,13 @@ def bands_of(image: Tensor) -> Iterator[Tensor]:
 
 
 def _blur(image: Tensor, dim: int, step: int) -> Tensor:
-    """Along one axis by the weights 1, 4, 6, 4, 1 of pixels ``step`` apart, which ends 2 steps inside the borders."""
+    """Blur along one axis by weights 1, 4, 6, 4, 1, ``step`` pixels apart, without 2 steps at each border."""
     a, b, c, d, e = (image.narrow(dim, i * step, image.shape[dim] - 4 * step) for i in range(5))
     return (a + e).mul_(1 / 16).add_(b, alpha=0.25).add_(d, alpha=0.25).add_(c, alpha=0.375)
 
 
 def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:
-    """What gains (7,) or (B, 7) of the bands change of an image, around the mean (B, 1, 1, 1) of its luminance."""
+    """Change of an image by gains (7,) or (B, 7) of its bands; the last band is taken about the mean (B, 1, 1, 1)."""
     change = torch.zeros_like(image)
     for number, band in enumerate(bands_of(image)):
         gain = (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1)
@@ -153,7 +153,7 @@ def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:
 
 
 def textures_of(image: Tensor) -> Iterator[Tensor]:
-    """Six bands (B, 1, H, W) of an image's luminance, without edges: less, the more it varies around a pixel."""
+    """Six bands (B, 1, H, W) of an image's luminance, attenuated where it varies much around a pixel, as at edges."""
     light = reduce_channels(image, "luminance")
     low = torch.cat([light, light.square()], dim=1)
     for number, band in enumerate(bands_of(low)):
@@ -165,7 +165,7 @@ def textures_of(image: Tensor) -> Iterator[Tensor]:
 
 
 def texture_change(image: Tensor, gains: Tensor) -> Tensor:
-    """What gains (6,) or (B, 6) of textures change of an image, (B, 1, H, W), for all channels."""
+    """Change of all channels of an image, (B, 1, H, W), by gains (6,) or (B, 6) of its textures."""
     change = torch.zeros_like(image[:, :1])
     for number, texture in enumerate(textures_of(image)):
         change = change + (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1) * texture

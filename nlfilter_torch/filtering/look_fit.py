@@ -1,10 +1,11 @@
 """The look that explains edits best, from small sums over pixels. See :mod:`nlfilter_torch.filtering.look`.
 
-A look is linear in its parameters, so that the sums of products of what they weigh, a column each, decide: for every
-channel a tone curve's hat functions, the three colours, the distance from the largest of them at each saturation, the
-bands of blurs, the changes by automatic levels and by local tone curves, and the layers of the filter. Which parts a
-look has, and how strong a ridge keeps them close to the identity, is chosen by leaving out: pairs, or parts of the
-picture if there is one. A curve is kept from falling by a least-squares problem with bounds.
+A look is linear in its parameters, so the fit needs only the sums of products of its columns, one for each parameter.
+For every channel these are a tone curve's hat functions, the three colours, the distance from the largest of them at
+each saturation, the bands of blurs, the changes by automatic levels and by local tone curves, and the layers of the
+filter. Which parts a look has, and how strong a ridge keeps them close to the identity, is chosen by cross-validation:
+pairs are left out, or parts of the picture if there is a single pair. A least-squares problem with bounds keeps curves
+from falling.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -55,12 +56,12 @@ CHOICES: tuple[Parts, ...] = (
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Weight of a curve's bends beside that of its distance from the identity, all that counts for factors of saturation.
 ROUGHNESS = {"tone": 10.0, "curves": 10.0, "saturation": 0.0}
-SLACK, FAINT = 1.1, 0.0003  # a simpler look may leave so many times as much, and so much of the change more
+SLACK, FAINT = 1.1, 0.0003  # a simpler look may leave SLACK times the best one's share, plus FAINT
 SMALL = 1.0  # weight of the mean change of pairs beside that of one, whose share it is divided by
 MILD = 30.0  # times the least ridge is below the share that looks leave, with several pairs
 STIFFEST = 0.03  # that this share makes tone curves and saturation at most, with several pairs
-UNEXPLAINED = 0.05  # share that is left, from where on curves of a single pair have to be worth it
-WORTH = 1.5  # times what a look without tone curves may leave, beside the best look of a single pair
+UNEXPLAINED = 0.05  # share left above which curves of a single pair must pass WORTH
+WORTH = 1.5  # times the best look's share that a look without tone curves may leave, for a single pair
 SHRINK = 0.5  # of the share that is left of parts of a single pair, by which a look is weaker
 CURVED = {"tone", "curves"}
 MOST = 1 << 16  # pixels of a pair that sums are taken over
@@ -68,7 +69,7 @@ MOST = 1 << 16  # pixels of a pair that sums are taken over
 
 @dataclass(frozen=True)
 class Layout:
-    """Which column of each channel is what.
+    """Layout of the columns of each channel.
 
     Attributes:
         knots: K of a tone curve.
@@ -143,7 +144,7 @@ class Sums:
     power: Tensor
 
     def __add__(self, other: "Sums") -> "Sums":
-        """Of both."""
+        """Add the sums of two sets of pixels."""
         return Sums(self.gram + other.gram, self.cross + other.cross, self.power + other.power)
 
     def left(self, coefficients: Tensor) -> float:

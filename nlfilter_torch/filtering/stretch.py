@@ -62,5 +62,5 @@ class Stretch:
         return torch.stack([moved[:, :1].expand_as(image), scaled, moved[:, 2:]], dim=1)
 
     def change(self, image: Tensor, strengths: Tensor) -> Tensor:
-        """The sum (B, C, H, W) of all kinds, each as strong as (KINDS,) or (B, KINDS) says."""
+        """The sum (B, C, H, W) of all kinds, weighted by strengths (KINDS,) or (B, KINDS)."""
         return (strengths.to(image).reshape(-1, KINDS, 1, 1, 1) * self.changes(image)).sum(1)
