@@ -292,7 +292,7 @@ def test_shapes_of_sliders_and_eigenvalues_that_do_not_fit() -> None:
     ("outside", "error", "message"),
     [
         (torch.ones(2), ValueError, "outside must have shape (4,), got (2,); give as many sliders as alpha has"),
-        ([1.0, 1.0, 1.0, 1.0], TypeError, "outside must be a torch.Tensor, got list; give as many sliders as alpha has"),
+        ([1.0, 1.0, 1.0, 1.0], TypeError, "outside must be a torch.Tensor, got list; give as many"),
         (torch.ones(4).int(), TypeError, "outside must have a floating-point dtype, got torch.int32; write 1.0"),
         (torch.full((4,), torch.nan), ValueError, "outside must be"),
     ],
