@@ -225,7 +225,7 @@ def test_a_negative_region_takes_its_likes_out(spectrum) -> None:
     both = diffusion_mask(spectrum, regions(2), negative=other)
     torch.testing.assert_close(both[:, :1], held)
     with pytest.raises(
-        ValueError, match=r"negative must have 1 channel or those of region, 2, got 3; give one for all"
+        ValueError, match=r"negative must have 1 channel or as many as region \(2\), got 3; give one for all"
     ):
         diffusion_mask(spectrum, regions(2), negative=regions(3))
     with pytest.raises(ValueError, match=r"negative must hold a pixel of positive weight in every mask"):

@@ -194,7 +194,7 @@ def test_a_worker_without_the_folder_says_so(tmp_path: Path) -> None:
             ("in.zarr", "out.zarr", "--cluster", "tcp://127.0.0.1:9"),
             "--cluster must be the address of a Dask scheduler",
         ),
-        (("in.zarr", "out.zarr", "--cluster", "tcp://127.0.0.1:9", "--workers", "2"), "leave out one of them"),
+        (("in.zarr", "out.zarr", "--cluster", "tcp://127.0.0.1:9", "--workers", "2"), "omit one of them"),
     ],
 )
 def test_refusals(

@@ -90,12 +90,12 @@ def fit(
     paths = _paths(before, after)
     regions = _regions(mask or [], paths, Path(before).is_dir())
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
-    if preset.suffix.lower() != ".json":
-        raise ValueError(f"PRESET must end in .json, got {preset}; rename it")
     read = {"photographs": chain(*paths), "mask": chain(*regions)}
     inputs = {what: list(files) for what, files in read.items()}
     for path in results:
         check_file(path)
+        if path.suffix.lower() != ".json":
+            raise ValueError(f"PRESET must end in .json, got {path}; rename it")
         check_apart("PRESET", path, **inputs)
     for option, picture in (("--preview", preview), ("--map", left)):
         if picture is not None:

@@ -91,7 +91,6 @@ def fit_defocus(
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
     spatial_bandwidth: float | Tensor | None = None,
-    reach: float | Tensor = REACH,
     **options: Any,
 ) -> Fitted:
     """:func:`defocus` for any source."""
@@ -102,9 +101,11 @@ def fit_defocus(
     blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
     check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
-    options = {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
+    options = (
+        {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | {"reach": REACH} | options
+    )
     spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
-    found = fit_regions(source, [scribbles], [], reach=reach, spatial_bandwidth=spatial_bandwidth, **options)
+    found = fit_regions(source, [scribbles], [], spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:
         return blur_behind(image, focus_of(masks), blur_radius, aperture)

@@ -115,11 +115,15 @@ def fit_alpha(
         counted = represented if mask is None else mask * represented
     weights = _pixel_weights(counted, layers, operator.among).flatten(1)
     aims = target.detach().double().flatten(1)
-    each = _roundings(aims, weights, operator.among) if rounding is None else aims.new_full((1, 1), rounding)
+    if rounding is None:
+        zone = _roundings(aims, weights, operator.among)
+        ignored = bool((zone > 0.0).any())
+    else:
+        zone, ignored = aims.new_full((1, 1), rounding), rounding > 0.0
     problem = _Problem(
         layers=layers.flatten(2),
         edit=(target.double() - layers.sum(1)).flatten(1),
-        dead_zone=_dead_zone(aims, each) if bool((each > 0.0).any()) else None,
+        dead_zone=_dead_zone(aims, zone) if ignored else None,
         weights=weights,
         ridge=ridge,
         shared=shared,
