@@ -90,7 +90,7 @@ QUICK := \
 	'fuzz --cases 20'
 
 # Trains the denoiser from scratch, first one pass of it, on small crops and then in two parts on larger ones, and then
-# both passes, and copies its weights, results and learning curves: 8 hours on one core with AMX, two to three times as
+# both passes, and copies its weights, results and learning curves: 10 hours on one core with AMX, two to three times as
 # long without. A stopped training is resumed.
 TRAIN := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser
 PARTS := out/denoiser
@@ -101,11 +101,15 @@ train: $(VENV)/.installed-test
 	$(TRAIN) --half --passes 1 --start $(PARTS)/second/denoiser.safetensors --steps 31000 --fall 1.0 --side 80 --seed 2 \
 	--textured 0.25 --out $(PARTS)/third
 	$(TRAIN) --start $(PARTS)/third/denoiser.safetensors --steps 11500 --fall 1.0 --rate 0.002 --seed 40 \
-	--textured 0.2 --out $(PARTS)
+	--textured 0.2 --out $(PARTS)/fourth
+	$(TRAIN) --start $(PARTS)/fourth/denoiser.safetensors --steps 6000 --fall 1.0 --rate 0.002 --side 80 --rim 8 \
+	--seed 50 --textured 0.25 --contrast 80 --misstated 0.25 --out $(PARTS)/fifth
+	$(TRAIN) --start $(PARTS)/fifth/denoiser.safetensors --steps 1900 --fall 1.0 --rate 0.001 --side 80 --rim 8 \
+	--seed 52 --textured 0.25 --contrast 80 --misstated 0.15 --out $(PARTS)
 	cp $(PARTS)/denoiser.safetensors nlfilter_torch/nn/
 	cp $(PARTS)/denoiser.json docs/
 	cp $(PARTS)/curve.png docs/denoiser.png
-	for part in first second third; do cp $(PARTS)/$$part/curve.png docs/denoiser_$$part.png; done
+	for part in first second third fourth fifth; do cp $(PARTS)/$$part/curve.png docs/denoiser_$$part.png; done
 
 # The pictures of the README and of docs/.
 pictures: $(VENV)/.installed
