@@ -336,8 +336,8 @@ def filter_regions(
     check_same_size(masks, operator.size, "masks", "operator", operator.factor)
     total = masks.sum(1, keepdim=True)
     outside = total == 0
-    # Averaged over the regions with the masks as weights, (B, k+1, H, W); outside, 1, whose derivatives are those by
-    # the masks.
+    # Averaged over the regions with the masks as weights, (B, k+1, H, W). Outside all regions they are 1, but depend on
+    # the masks, and so does the filtered image, from which the result has its gradient there.
     weights = masks / torch.where(outside, 1.0, total)
     sliders = compose_alpha(weights, operator.among.copy_to_group(alpha))
     filtered = polynomial_filter(operator, image, sliders, residual=residual)
