@@ -11,10 +11,9 @@ state.pt               the state of the training: the same command resumes a sto
                        steps continues a finished one.
 
 ``--start FILE`` starts from trained weights, or from the mean of those of several files, and raises the learning rate
-again. ``--passes 1`` trains a single pass of
-the network, in half the time; the second pass of its weights repeats the first. ``--plain`` trains the same network
-with a further convolution in place of the filter, for comparison. Equal arguments give equal weights on the same
-machine with the same number of threads.
+again. ``--passes 1`` trains a single pass of the network, in half the time; the second pass of its weights repeats the
+first. ``--plain`` trains the same network with a further convolution in place of the filter, for comparison. Equal
+arguments give equal weights on the same machine with the same number of threads.
 """
 
 import argparse

@@ -90,8 +90,7 @@ def fit(
     paths = _paths(before, after)
     regions = _regions(mask or [], paths, Path(before).is_dir())
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
-    read = {"photographs": chain(*paths), "mask": chain(*regions)}
-    inputs = {what: list(files) for what, files in read.items()}
+    inputs = {"photographs": [*chain(*paths)], "mask": [*chain(*regions)]}
     for path in results:
         check_file(path)
         if path.suffix.lower() != ".json":

@@ -60,13 +60,8 @@ def _bits_of_avif(path: Path) -> int:
 def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
     """Convert an image to one of the modes L, LA, RGB, RGBA."""
     transparent = "transparency" in image.info
-    modes = {
-        "1": "LA" if transparent else "L",
-        "L": "LA" if transparent else "L",
-        "LA": "LA",
-        "PA": "RGBA",
-        "RGBA": "RGBA",
-    }
+    modes = {"LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
+    modes |= dict.fromkeys(("1", "L"), "LA" if transparent else "L")
     modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
     if image.mode not in modes:
         sentence = f"{path} is stored in {image.mode} colours, which are not supported; convert it to grey or RGB"

@@ -183,9 +183,8 @@ class Tiled:
             return rows
 
         found = resized(read, self.size, size)  # fills the lists
-        return (
-            found.clamp(torch.cat(lowest).amin(0), torch.cat(highest).amax(0))[0].permute(1, 2, 0).contiguous().numpy()
-        )
+        found = found.clamp(torch.cat(lowest).amin(0), torch.cat(highest).amax(0))
+        return found[0].permute(1, 2, 0).contiguous().numpy()
 
     def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
         """Resize planes of tiles, which are computed by several threads."""
