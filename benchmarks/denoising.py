@@ -35,7 +35,7 @@ from torch import Tensor
 
 from benchmarks.photographs import photograph, pictures
 from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
-from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.io.writing import open_beside
 from nlfilter_torch.operator.features import reduce_channels
 
 HELD_OUT = ("camera", "coffee", "chelsea", "retina", "page")

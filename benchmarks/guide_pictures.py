@@ -31,7 +31,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.io.writing import open_beside
 from nlfilter_torch.plotting import plot_response, show_eigenvectors, show_images, show_layers
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import CONTRASTS, MISSTATED, Crops
-from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.io.writing import open_beside
 from nlfilter_torch.nn.denoiser import ADDED, PASSES, PLANES, WIDTH, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.plotting import save_figure

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.filtering.filters import polynomial_response
-from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.io.writing import open_beside
 from nlfilter_torch.operator.spectrum import Spectrum
 
 DPI = 100

@@ -19,7 +19,7 @@ from nlfilter_torch.cli import folders, interrupts, main, workers
 from nlfilter_torch.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
 from nlfilter_torch.cli.workers import DEATHS
 from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.io.writing import open_beside
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
 ROOT = Path(__file__).parents[1]

@@ -19,8 +19,9 @@ import torch
 import nlfilter_torch
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.declaration import shown
-from nlfilter_torch.io import photographs as files
-from nlfilter_torch.io.photographs import Photograph, open_beside, read_photograph, write_photograph
+from nlfilter_torch.io import writing as files
+from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.io.writing import open_beside
 
 LONG = "9" * 400
 HEAVY = ("torch", "kornia", "skimage", "numpy", "PIL")
@@ -311,7 +312,7 @@ def test_signals_while_a_file_is_written(
             raise AssertionError("the signal was lost")
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(files, "encode", interrupted)
+    monkeypatch.setattr("nlfilter_torch.io.photographs.encode", interrupted)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -25,11 +25,11 @@ from nlfilter_torch.io.photographs import (
     check_memory,
     check_output,
     first_bytes,
-    open_beside,
     read_photograph,
     write_photograph,
 )
 from nlfilter_torch.io.rows import TILED, WHOLE, usual_memory
+from nlfilter_torch.io.writing import open_beside
 from nlfilter_torch.tiled.parts import Parts, Rectangle
 from nlfilter_torch.tiled.recipe import edit_rows
 from nlfilter_torch.tiled.sampling import Report, in_silence

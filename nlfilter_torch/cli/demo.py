@@ -28,7 +28,7 @@ def demo(folder: Folder = Path("out")) -> None:
     from nlfilter_torch.edits.colour import edit_luminance
     from nlfilter_torch.filtering.filters import detail_layers, polynomial_filter
     from nlfilter_torch.filtering.masks import diffusion_mask
-    from nlfilter_torch.io.photographs import check_folder
+    from nlfilter_torch.io.writing import check_folder
     from nlfilter_torch.operator.build import nonlocal_operator
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.plotting import (

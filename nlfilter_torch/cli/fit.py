@@ -85,7 +85,8 @@ def fit(
     from nlfilter_torch.cli.editing import check_apart, read_masks
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.fit_look import fit_look
-    from nlfilter_torch.io.photographs import check_file, check_type, open_beside
+    from nlfilter_torch.io.photographs import check_type
+    from nlfilter_torch.io.writing import check_file, open_beside
 
     paths = _paths(before, after)
     regions = _regions(mask or [], paths, Path(before).is_dir())

@@ -1,7 +1,7 @@
 """A folder of photographs edited by worker processes: those of joblib on this machine, or those of a cluster.
 
 Needs the ``cli`` extra, and ``cluster`` or ``ray`` for a cluster. A file is done when the output folder has a file of
-its name, since a name appears only when its file is complete (:func:`~nlfilter_torch.io.photographs.open_beside`). An
+its name, since a name appears only when its file is complete (:func:`~nlfilter_torch.io.writing.open_beside`). An
 interrupted run continues when it is started again.
 """
 
@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from nlfilter_torch.cli.workers import DEATHS, Workers, is_death, worker_pool
-from nlfilter_torch.io.photographs import SUFFIXES, check_folder, open_beside, remove_stale
+from nlfilter_torch.io.photographs import SUFFIXES
+from nlfilter_torch.io.writing import check_folder, open_beside, remove_stale
 
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
 

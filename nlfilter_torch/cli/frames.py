@@ -154,7 +154,8 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     from nlfilter_torch.cli.folders import pictures
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.io.films import is_film
-    from nlfilter_torch.io.photographs import check_folder, check_output, read_photograph, write_photograph
+    from nlfilter_torch.io.photographs import check_output, read_photograph, write_photograph
+    from nlfilter_torch.io.writing import check_folder
 
     if source.is_file():
         raise ValueError(f"{source} must be a film (.mp4, .m4v or .mov) or a folder; convert it")

@@ -56,7 +56,8 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
     from nlfilter_torch.cli.editing import viewed_within_memory
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.edits.resizing import resize
-    from nlfilter_torch.io.photographs import check_folder, open_beside, read_photograph
+    from nlfilter_torch.io.photographs import read_photograph
+    from nlfilter_torch.io.writing import check_folder, open_beside
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.plotting import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
 

@@ -94,7 +94,7 @@ def _install(repeat: Callable[[int], None]) -> dict[int, signal.Handlers]:
 
 def _handle(number: int, frame: FrameType | None, repeat: Callable[[int], None]) -> None:
     """Raise an exception; during an import, which could catch it, end the process or send the signal again later."""
-    files = sys.modules.get("nlfilter_torch.io.photographs")
+    files = sys.modules.get("nlfilter_torch.io.writing")
     if _importing(frame):
         if getattr(files, "unfinished", None):
             repeat(number)

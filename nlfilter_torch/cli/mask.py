@@ -54,8 +54,9 @@ def mask(
     from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
-    from nlfilter_torch.io.photographs import Photograph, check_file, check_memory, check_output, write_photograph
+    from nlfilter_torch.io.photographs import Photograph, check_memory, check_output, write_photograph
     from nlfilter_torch.io.rows import TILED, check_place, open_picture, write_picture
+    from nlfilter_torch.io.writing import check_file
     from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.scribbles import RegionRows
     from nlfilter_torch.tiled.source import Tiled

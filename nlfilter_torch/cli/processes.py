@@ -15,8 +15,8 @@ from tempfile import gettempdir
 from typing import Any
 
 from nlfilter_torch.cli.workers import DEATHS, Workers, is_death, worker_pool
-from nlfilter_torch.io.photographs import claimed, part_beside
 from nlfilter_torch.io.rows import ZarrRows, write_band, zarr_package
+from nlfilter_torch.io.writing import claimed, part_beside
 from nlfilter_torch.tiled.pictures import RowSource
 from nlfilter_torch.tiled.tiles import Tiling
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from nlfilter_torch.io.photographs import check_file, claimed, first_bytes, link_target, part_beside
+from nlfilter_torch.io.photographs import first_bytes
+from nlfilter_torch.io.writing import check_file, claimed, link_target, part_beside
 
 if TYPE_CHECKING:
     from av.container import InputContainer, OutputContainer

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nlfilter_torch.io.photographs import open_beside
+from nlfilter_torch.io.writing import open_beside
 
 PFM = ".pfm"
 

@@ -3,14 +3,6 @@
 Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
-import os
-import re
-import secrets
-import shutil
-import sys
-import time
-from collections.abc import Container, Iterator
-from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -26,10 +18,8 @@ from nlfilter_torch.io import cameras, tiff
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io.by_pillow import read_by_pillow
 from nlfilter_torch.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
+from nlfilter_torch.io.writing import check_file, open_beside
 from nlfilter_torch.tiled.pictures import Picture, stored_as
-
-if sys.platform != "win32":
-    import fcntl
 
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 Pixels = NDArray[np.generic]
@@ -51,8 +41,6 @@ ENCODING: dict[str, dict[str, object]] = {
 LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500}  # pixels
 LONGEST_EXIF = 65533  # bytes, in JPEG
 CONVERTED = 1 << 18  # pixels that are converted at a time between files and floats
-PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
-unfinished: set[Path] = set()  # files being written; read by the command line when interrupted
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 
@@ -261,125 +249,6 @@ def check_type(
             f"{len(exif or b'')}; write a PNG, TIFF or WebP file"
         )
     return kind
-
-
-def check_file(path: str | Path) -> None:
-    """Raise ValueError unless a file can be created at ``path``."""
-    path = link_target(path)
-    if path.is_symlink():
-        raise ValueError(f"{path} is a symbolic link that leads back to itself; choose another name")
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; add a file name to it")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is a pipe, a socket or a device, not a file; choose another name")
-    _check_parent(path)
-
-
-def check_folder(folder: str | Path) -> None:
-    """Raise ValueError unless ``folder`` is writable or can be created."""
-    folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file, not a folder; choose a folder for the output")
-    _check_parent(folder / "file" if folder.exists() else folder)
-
-
-def _check_parent(path: Path) -> None:
-    if not path.parent.is_dir():
-        raise ValueError(f"{path} cannot be written because the folder {path.parent} does not exist; make it first")
-    if not os.access(path.parent, os.W_OK):
-        raise ValueError(f"{path} cannot be written because the folder {path.parent} is read-only; choose another")
-
-
-@contextmanager
-def open_beside(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a binary file that is renamed to ``path`` when the block succeeds, and removed when it fails.
-
-    >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> with open_beside(folder / "note.txt") as stream:
-    ...     _ = stream.write(b"whole")
-    >>> [file.name for file in folder.iterdir()]
-    ['note.txt']
-    """
-    path = link_target(path)
-    with part_beside(path) as beside:
-        beside.touch(exist_ok=False)
-        with claimed(beside):
-            with beside.open("r+b") as stream:
-                yield stream
-            if path.exists():
-                shutil.copymode(path, beside)
-            beside.replace(path)
-
-
-@contextmanager
-def part_beside(path: Path) -> Iterator[Path]:
-    """Reserve a unique hidden name beside ``path`` for a file or folder, which is removed when the block ends."""
-    # Not tempfile: the file needs the usual permissions and must be on the same file system.
-    beside = name_beside(path)
-    unfinished.add(beside)
-    try:
-        remove_stale(path.parent, {path.name})
-        yield beside
-    except OSError as error:
-        if error.errno is None or not str(error.filename or beside).startswith(str(beside)):
-            raise
-        # A full disk, a quota or missing permission: the system's message does not name the path.
-        raise OSError(
-            f"{path} cannot be written: {error.strerror}; free some space there or write elsewhere"
-        ) from error
-    finally:
-        _remove(beside)
-        unfinished.discard(beside)
-
-
-def link_target(path: str | Path) -> Path:
-    """Return ``path``, or its target if it is a symbolic link."""
-    path = Path(path)
-    return Path(os.path.realpath(path)) if path.is_symlink() else path
-
-
-def name_beside(path: Path) -> Path:
-    """Return a unique hidden name in the same folder for a file that is being written."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-
-
-@contextmanager
-def claimed(part: Path) -> Iterator[None]:
-    """Lock a file or folder, so that :func:`remove_stale` in other processes does not remove it."""
-    with ExitStack() as stack:
-        if sys.platform != "win32":  # open files cannot be removed there
-            stack.callback(os.close, handle := os.open(part, os.O_RDONLY))
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-
-
-def _is_claimed(part: Path) -> bool:
-    if sys.platform == "win32":
-        return False
-    with suppress(OSError), ExitStack() as stack:
-        stack.callback(os.close, handle := os.open(part, os.O_RDONLY))
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return False
-    return True
-
-
-def remove_stale(folder: Path, names: Container[str]) -> None:
-    """Remove unfinished files of killed processes in a folder; ``names`` are the names of the finished files."""
-    for part in folder.glob(".*.part"):
-        if PART.fullmatch(part.name) and part.name[1:].rsplit(".", 2)[0] in names and not _is_claimed(part):
-            _remove(part)
-
-
-def _remove(part: Path) -> None:
-    with suppress(OSError):  # no such file, or the name is too long
-        if part.is_dir():
-            for pause in (0.0, 0.1, 0.4):  # after an interrupt, a zarr thread may still be writing its last chunk
-                time.sleep(pause)
-                shutil.rmtree(part, ignore_errors=True)
-        else:
-            part.unlink()
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:

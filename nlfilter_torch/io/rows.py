@@ -20,19 +20,9 @@ from numpy.typing import NDArray
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
 from nlfilter_torch.io.extras import NO_EXTRAS, Extras, read_extras
-from nlfilter_torch.io.photographs import (
-    check_file,
-    check_type,
-    claimed,
-    encode,
-    first_bytes,
-    link_target,
-    name_beside,
-    open_beside,
-    part_beside,
-    read_channels,
-)
+from nlfilter_torch.io.photographs import check_type, encode, first_bytes, read_channels
 from nlfilter_torch.io.tiff import TiffRows
+from nlfilter_torch.io.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
 from nlfilter_torch.tiled.pictures import Rows, RowSource
 from nlfilter_torch.tiled.tiles import Tiling
 
