@@ -15,7 +15,7 @@ plain            the network without the filter, with ``--plain FILE`` of ``benc
 ``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` evaluates other weights than those of the
 package, and may be given several times. Without ``--pictures``, the photographs are camera, coffee, chelsea and the
 left halves of retina and page. ``--wrong`` adds noise levels misstated by a fifth, noise that depends on brightness,
-and clean photographs.
+and clean photographs. ``--megapixel`` measures only the CPU time and memory of ours and BM3D at a megapixel.
 """
 
 import argparse
@@ -33,6 +33,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.memory import forget_peak, resident
 from benchmarks.photographs import photograph, pictures
 from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
 from nlfilter_torch.io.writing import open_beside
@@ -274,6 +275,23 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
         print(f"  {name:20}" + "".join(f"{value:8.2f}" for value in found))
 
 
+def megapixel(level: float) -> None:
+    """Print CPU time and peak memory, above that before the call, on the left half of retina at full size, in grey."""
+    whole = reduce_channels(photograph("retina"), "luminance")
+    clean = whole[..., : whole.shape[-1] // 2]
+    case = Case("retina", clean, with_noise(clean, level / 255, 0), level / 255)
+    print(f"\nretina, {clean.shape[-1]}x{clean.shape[-2]} pixels, grey, noise {level:g}")
+    seconds = {}
+    for name in ("ours", "BM3D"):
+        before = resident("VmRSS")
+        forget_peak()
+        figures = judge(METHODS[name], case)
+        seconds[name] = figures.seconds
+        peak = resident("VmHWM") - before
+        print(f"{name:22}{figures.psnr:8.2f} dB{figures.seconds:8.2f} s{peak:8.0f} MiB", flush=True)
+    print(f"ours takes {seconds['ours'] / seconds['BM3D']:.3f} of the CPU time")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description="Comparison of denoisers.")
@@ -292,9 +310,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--wrong", action="store_true", help="also test misstated and estimated noise, and clean photographs"
     )
+    parser.add_argument(
+        "--megapixel", action="store_true", help="only CPU time and memory at a megapixel, for the first noise level"
+    )
     parser.add_argument("--quick", action="store_true", help="small parts of two photographs, to check that it runs")
     parser.add_argument("--out", type=Path, help="JSON file to which all measurements are added")
     options = parser.parse_args(arguments)
+    if options.megapixel:
+        megapixel(options.noise[0])
+        return
     methods = {name: METHODS[name] for name in options.methods}
     methods |= {path.parent.name: network(path) for path in options.weights}
     methods |= {

@@ -346,9 +346,11 @@ def _centred(planes: Tensor) -> Tensor:
 
 
 def _trust(corrections: Tensor) -> Tensor:
-    """1 where all corrections (B, C, H, W) nearby are plausible, 0 where one is twice as large as plausible."""
-    largest = F.max_pool2d(corrections.abs().amax(1, keepdim=True), 2 * AROUND + 1, stride=1, padding=AROUND)
-    return (2 - largest / LARGEST).clamp(0.0, 1.0)
+    """1 where all corrections (B, C, H, W) nearby are plausible, 0 where one is larger by a noise level or more."""
+    largest = corrections.abs().amax(1, keepdim=True)
+    for size, padding in (((2 * AROUND + 1, 1), (AROUND, 0)), ((1, 2 * AROUND + 1), (0, AROUND))):
+        largest = F.max_pool2d(largest, size, stride=1, padding=padding)
+    return (1 + LARGEST - largest).clamp(0.0, 1.0)
 
 
 def _activated(features: Tensor) -> Tensor:
