@@ -331,3 +331,5 @@ def test_weights_of_blocks_are_the_means_of_their_pixels(step: float) -> None:
 def test_options_of_the_guide_are_refused() -> None:
     with pytest.raises(TypeError, match="guide_channels must not be given: masks compare colours and texture"):
         region_mask(colour("chelsea"), box(8, 8), guide_channels="luminance")
+    with pytest.raises(TypeError, match="photometric_bandwidth must be a number or a tensor, got str; pass a number"):
+        region_mask(colour("chelsea"), box(8, 8), photometric_bandwidth="auto")

@@ -78,7 +78,7 @@ def batch(
     step_of(EDITS["detail"], given)
 
     from nlfilter_torch.cli.editing import allowed_memory
-    from nlfilter_torch.cli.folders import Tally, edit_folder, pictures, prepare
+    from nlfilter_torch.cli.folders import Tally, edit_folder, left_out, pictures, prepare
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.core.checks import check_patch_size
     from nlfilter_torch.io.rows import WHOLE, free_memory
@@ -106,6 +106,8 @@ def batch(
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[preset])
     paths = pictures(folder)
     prepare(paths, target, settings)
+    if others := left_out(folder):
+        _tell(f"left out {others}; convert them to PNG, JPEG, TIFF, WebP or AVIF if they are photographs")
     tally, interrupted = Tally(), False
     count = min(workers or _cores(), len(paths))
     room = memory  # of each; None is as much as the command of an edit uses

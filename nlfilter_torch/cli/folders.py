@@ -9,6 +9,7 @@ import contextlib
 import io
 import json
 import warnings
+from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,6 +54,16 @@ def pictures(folder: Path, what: str = "photographs") -> list[Path]:
     if not paths:
         raise ValueError(f"{folder} holds no PNG, JPEG, TIFF, WebP or AVIF file; put the {what} there")
     return paths
+
+
+def left_out(folder: Path) -> str:
+    """Count the other files of a folder by suffix, such as ``3 .heic``; without hidden ones and settings (.json)."""
+    suffixes = Counter(
+        path.suffix.lower() or "without a suffix"
+        for path in folder.iterdir()
+        if path.is_file() and path.suffix.lower() not in {*SUFFIXES, ".json"} and not path.name.startswith(".")
+    )
+    return ", ".join(f"{count} {suffix}" for suffix, count in sorted(suffixes.items()))
 
 
 def prepare(paths: Sequence[Path], target: Path, settings: Mapping[str, object]) -> None:

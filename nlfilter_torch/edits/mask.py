@@ -226,6 +226,7 @@ def fit_regions(
 
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
+    check_positive(options["photometric_bandwidth"], "photometric_bandwidth", source.batch)
     check_count(options["num_landmarks"], "num_landmarks")
     # The size of a preview, so that masks are the same in a preview and in the photograph.
     size = viewed_size(source.size, VIEWED)
