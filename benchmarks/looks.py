@@ -300,9 +300,14 @@ def report(
     """A table for a number of pairs that are fitted at once."""
     print(f"\nafter {count} pair{'s' * (count > 1)}: fitted mean, held out mean (lowest), in percent")
     print(f"{'':34}" + "".join(f"{name:>21}" for name in methods))
-    best, tied, ended = 0, 0, time.perf_counter()
+    best, tied, judged, ended = 0, 0, 0, time.perf_counter()
     for edit, some in pairs.items():
-        cells, means = [], {}
+        half = len(some) // 2
+        parts = some[:half] if count == 1 else some[:count], some[half:]
+        if not all(any(is_changed(*pair) for pair in part) for part in parts):
+            print(f"{edit:34}  left out, since it changes none of the fitted or of the held-out photographs")
+            continue
+        judged, cells, means = judged + 1, [], {}
         for method, fit in methods.items():
             fitted, held = judge(fit, some, count)
             means[method] = statistics.mean(held)
@@ -313,7 +318,7 @@ def report(
         verdict = "" if own > other else "  tied" if own == other else "  lost"
         print(f"{edit:34}" + "".join(f"{cell:>21}" for cell in cells) + verdict, flush=True)
     if len(methods) > 1:
-        print(f"best of all on {best} of {len(pairs)}, held out, and tied on {tied}")
+        print(f"best of all on {best} of {judged}, held out, and tied on {tied}")
     print(f"{time.perf_counter() - ended:.0f} s")
 
 
