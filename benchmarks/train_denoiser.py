@@ -10,10 +10,10 @@ curve.png              the loss on validation crops;
 state.pt               the state of the training: the same command resumes a stopped training, and a larger number of
                        steps continues a finished one.
 
-``--start FILE`` starts from trained weights, or from the mean of those of several files, and raises the learning rate
-again. ``--passes 1`` trains a single pass of the network, in half the time; the second pass of its weights repeats the
-first. ``--plain`` trains the same network with a further convolution in place of the filter, for comparison. Equal
-arguments give equal weights on the same machine with the same number of threads.
+``--start FILE`` starts from trained weights and raises the learning rate again. ``--passes 1`` trains a single pass of
+the network, in half the time; the second pass of its weights repeats the first. ``--plain`` trains the same network
+with a further convolution in place of the filter, for comparison. Equal arguments give equal weights on the same
+machine with the same number of threads.
 """
 
 import argparse
@@ -107,7 +107,7 @@ class Training:
         side: of crops, in pixels.
         half: whether convolutions run in bfloat16.
         rate: of Muon, for kernels of convolutions; those of Adam are in proportion.
-        start: files of weights, which are averaged for the initial weights; without any they are drawn.
+        start: file of the initial weights; None draws them.
         fall: final share of the steps, over which the learning rate falls to zero.
         textured: share of crops with an added texture.
         contrast: largest standard deviation of such a texture.
@@ -124,7 +124,7 @@ class Training:
         side: int = SIDE,
         half: bool = False,
         rate: float = RATE,
-        start: Sequence[Path] = (),
+        start: Path | None = None,
         fall: float = FALL,
         textured: float = 0.0,
         contrast: float = CONTRASTS[1],
@@ -133,10 +133,8 @@ class Training:
         passes: int = PASSES,
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed, passes=passes).to(memory_format=torch.channels_last)
-        if start:
-            files = [read_weights(path, shapes_of(self.model), ADDED) for path in start]
-            means = {name: torch.stack([weights[name] for weights in files]).mean(0) for name in files[0]}
-            self.model.load_state_dict(means)
+        if start is not None:
+            self.model.load_state_dict(read_weights(start, shapes_of(self.model), ADDED))
         self.model.again.requires_grad_(passes > 1)
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
         named = {name: weight for name, weight in self.model.named_parameters() if weight.requires_grad}
@@ -273,14 +271,7 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--fall", type=float, default=FALL, help="final share of the steps, with a falling rate; default %(default)s"
     )
-    parser.add_argument(
-        "--start",
-        type=Path,
-        metavar="FILE",
-        nargs="+",
-        default=[],
-        help="initial weights, the mean of these; default: drawn at random",
-    )
+    parser.add_argument("--start", type=Path, metavar="FILE", help="initial weights; default: drawn at random")
     parser.add_argument(
         "--textured", type=float, default=0.0, help="share of crops with an added texture; default %(default)s"
     )
@@ -328,9 +319,8 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rim must be at least 0 and less than half of --side, got {options.rim}; 8 does well")
     if options.passes < 1:
         parser.error(f"--passes must be at least 1, got {options.passes}; {PASSES} are what the package has")
-    for path in options.start:
-        if not path.is_file():
-            parser.error(f"--start must be files of weights, got {path}, which is not there; train one first")
+    if options.start is not None and not options.start.is_file():
+        parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
     if options.out.exists() and not options.out.is_dir():
         parser.error(f"--out must be a folder, got the file {options.out}; name another")
     return options
@@ -367,11 +357,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             *("textured", "contrast", "misstated", "rim", "passes", "plain", "half"),
         )
     }
-    if options.start:
-        figures["start"] = []
-        for path in options.start:
-            with safe_open(path, "pt") as weights:
-                figures["start"].append(weights.metadata())
+    if options.start is not None:
+        with safe_open(options.start, "pt") as weights:
+            figures["start"] = weights.metadata()
     training.run(options.steps, options.out)
     figures |= {"weights": parameters, "seconds": round(training.seconds), "loss": round(training.curve[-1], 4)}
     save(options.out, training, figures)

@@ -80,27 +80,13 @@ def test_the_command_writes_weights_figures_and_a_curve_and_goes_on(
 def test_a_training_starts_from_weights_of_another(more: list[str], tmp_path: Path) -> None:
     main(["--steps", "2", "--side", "16", "--out", str(tmp_path / "first"), *more])
     start = tmp_path / "first" / "denoiser.safetensors"
-    begun = Training(1, side=16, start=[start], plain=bool(more))
+    begun = Training(1, side=16, start=start, plain=bool(more))
     for name, value in load_file(start).items():
         torch.testing.assert_close(begun.model.state_dict()[name], value, rtol=0, atol=0)
     main(["--steps", "1", "--side", "20", "--start", str(start), "--out", str(tmp_path), *more])
     figures = json.loads((tmp_path / "denoiser.json").read_text())
-    (before,) = figures["start"]
+    before = figures["start"]
     assert (before["side"], before["steps"], figures["side"]) == ("16", "2", 20)
-
-
-def test_a_training_starts_from_the_mean_of_several_weights(tmp_path: Path) -> None:
-    files = []
-    for seed in (1, 2):
-        folder = tmp_path / str(seed)
-        main(["--steps", "1", "--side", "16", "--seed", str(seed), "--out", str(folder)])
-        files.append(folder / "denoiser.safetensors")
-    first, second = (load_file(file)["first.weight"] for file in files)
-    begun = Training(3, side=16, start=files)
-    torch.testing.assert_close(begun.model.first.weight.detach(), (first + second) / 2)
-    main(["--steps", "1", "--side", "16", "--start", *map(str, files), "--out", str(tmp_path)])
-    figures = json.loads((tmp_path / "denoiser.json").read_text())
-    assert [start["seed"] for start in figures["start"]] == ["1", "2"]
 
 
 def test_errors_in_the_rim_of_crops_do_not_count() -> None:
@@ -120,7 +106,7 @@ def test_the_second_pass_is_not_trained_with_the_first_alone(tmp_path: Path) -> 
     assert json.loads((tmp_path / "denoiser.json").read_text())["passes"] == 1
     weights = load_file(tmp_path / "denoiser.safetensors")
     assert weights["again.weight"].abs().max() == 0
-    begun = Training(1, side=16, start=[tmp_path / "denoiser.safetensors"])
+    begun = Training(1, side=16, start=tmp_path / "denoiser.safetensors")
     begun.run(2)
     assert begun.model.again.weight.abs().max() > 0
 
@@ -254,7 +240,7 @@ def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> 
         (["--misstated", "-1"], "--misstated must be 0 to 1, got -1"),
         (["--contrast", "1"], "--contrast must be 2 to 255, got 1"),
         (["--side", "16", "--rim", "8"], "--rim must be at least 0 and less than half of --side, got 8"),
-        (["--start", "absent"], "--start must be files of weights, got absent, which is not there"),
+        (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
         (["--steps", "many"], "--steps: invalid int value: 'many'"),
     ],
 )
