@@ -256,8 +256,15 @@ def test_parts_that_are_being_written_stay(tmp_path: Path) -> None:
     assert not files.unfinished
 
 
+@pytest.mark.parametrize("letter", ["x", "é"])
+def test_the_longest_names_can_be_written(letter: str, photo: Path, tmp_path: Path) -> None:
+    out = tmp_path / f"{letter * (251 // len(letter.encode()))}.png"
+    assert main(["detail", str(photo), str(out), "--alpha", "1,1"]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([photo.name, out.name])
+
+
 def test_names_too_long_are_told(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "cannot be written: " in refused(capsys, "detail", photo, tmp_path / f"{'x' * 250}.png")
+    assert "File name too long" in refused(capsys, "detail", photo, tmp_path / f"{'x' * 252}.png")
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ if sys.platform != "win32":
     import fcntl
 
 PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)  # names made by name_beside
+LONGEST_STEM = 240  # bytes of the file's own name in these
 unfinished: set[Path] = set()  # files being written; read by the command line when interrupted
 
 
@@ -95,8 +96,14 @@ def link_target(path: str | Path) -> Path:
 
 
 def name_beside(path: Path) -> Path:
-    """Return a unique hidden name in the same folder for a file that is being written."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    """Return a unique hidden name in the same folder for a file that is being written.
+
+    It is not longer than file systems allow, 255 bytes; of a longer one, what a killed process leaves is not removed.
+    """
+    name, encoded = path.name, os.fsencode(path.name)
+    if len(encoded) > LONGEST_STEM:
+        name = encoded[:LONGEST_STEM].decode(errors="ignore")
+    return path.with_name(f".{name}.{secrets.token_hex(4)}.part")
 
 
 @contextmanager
