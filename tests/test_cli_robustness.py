@@ -264,7 +264,8 @@ def test_the_longest_names_can_be_written(letter: str, photo: Path, tmp_path: Pa
 
 
 def test_names_too_long_are_told(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "File name too long" in refused(capsys, "detail", photo, tmp_path / f"{'x' * 252}.png")
+    told = refused(capsys, "detail", photo, tmp_path / f"{'x' * 252}.png")
+    assert told.endswith(": File name too long; check the name and the permissions\n")
 
 
 @pytest.mark.parametrize(

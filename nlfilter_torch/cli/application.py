@@ -97,7 +97,11 @@ def run(arguments: list[str] | None = None) -> int:
             status = app(args=arguments or ["--help"], prog_name=NAME, standalone_mode=False)
         except typer.TyperException as error:  # a wrong option or argument
             return _refuse(error.format_message())
-        except (ValueError, OSError, MemoryError) as error:  # a bad file or value, found by the library
+        except OSError as error:  # the library's own sentence, or the system's code, file and message
+            ours = error.filename is None or error.strerror is None
+            told = str(error) if ours else f"{error.filename}: {error.strerror}; check the name and the permissions"
+            return _refuse(told)
+        except (ValueError, MemoryError) as error:  # a bad file or value, found by the library
             return _refuse(str(error))
     if status == INTERRUPTED:
         return tell()
