@@ -39,7 +39,7 @@ BRIGHTEST = 2.0  # images of larger magnitude, which do not occur in training, a
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
 BORDER = 8  # width in pixels of the border added to images, so that their own border does not affect results
-TILE_BATCH = 8  # tiles processed at once
+TILE_BATCH = 6  # tiles processed at once; more leave the cache of the processor
 
 
 class NonlocalDenoiser(nn.Module):
