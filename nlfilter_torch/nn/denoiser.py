@@ -346,7 +346,7 @@ def _centred(planes: Tensor) -> Tensor:
 
 
 def _trust(corrections: Tensor) -> Tensor:
-    """1 where all corrections (B, C, H, W) nearby are plausible, 0 where one is larger by a noise level or more."""
+    """1 where all corrections (B, C, H, W) nearby are plausible, 0 where one exceeds the limit by a noise level."""
     largest = corrections.abs().amax(1, keepdim=True)
     for size, padding in (((2 * AROUND + 1, 1), (AROUND, 0)), ((1, 2 * AROUND + 1), (0, AROUND))):
         largest = F.max_pool2d(largest, size, stride=1, padding=padding)
