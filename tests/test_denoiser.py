@@ -353,10 +353,11 @@ def test_where_the_second_pass_diverges_the_first_result_is_kept(monkeypatch: py
     clean = CAT[..., :64, :64]
     image = noisy(clean, 4 / 255)
     with torch.no_grad():
-        denoiser.again.bias += 60.0
-        assert decibels(denoiser(image, 4 / 255), clean) > decibels(image, clean) + 1
+        for further in (60.0, 140.0):
+            denoiser.again.bias += further
+            assert decibels(denoiser(image, 4 / 255), clean) > decibels(image, clean) + 1
         monkeypatch.setattr(module, "LARGEST", 1e6)
-        assert decibels(denoiser(image, 4 / 255), clean) < decibels(image, clean) - 5
+        assert decibels(denoiser(image, 4 / 255), clean) < 20
 
 
 def test_passes_are_counted() -> None:
