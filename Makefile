@@ -77,6 +77,7 @@ QUICK := \
 	'streaming_cpu --quick' \
 	'streaming_busy --quick' \
 	'app --side 96 --megapixels 0.05' \
+	'denoising --quick --megapixel' \
 	'looks --quick' \
 	'look_costs --quick' \
 	'detail --quick' \

@@ -244,19 +244,21 @@ def shares(predict: Predict, pairs: Pairs) -> list[float]:
     return [explained(*pair, predict(pair[0])) for pair in pairs if is_changed(*pair)]
 
 
-def judge(fit: Callable[[Pairs], Predict], pairs: Pairs, count: int) -> tuple[list[float], list[float]]:
-    """What is explained of the fitted pairs, and of those that are held out, after ``count`` pairs.
+def judge(
+    fit: Callable[[Pairs], Predict], fitted: Pairs, held: Pairs, *, at_once: bool
+) -> tuple[list[float], list[float]]:
+    """What is explained of the fitted pairs, and of those that are held out.
 
-    One pair at a time is fitted for each of the first five, and judged on itself; three and five are fitted at once.
+    Unless they are fitted ``at_once``, each pair is fitted alone and judged on itself, and the first fit is also judged
+    on the held-out pairs.
     """
-    half = len(pairs) // 2
-    if count > 1:
-        predict = fit(pairs[:count])
-        return shares(predict, pairs[:count]), shares(predict, pairs[half:])
-    changed = [pair for pair in pairs[:half] if is_changed(*pair)]
+    if at_once:
+        predict = fit(fitted)
+        return shares(predict, fitted), shares(predict, held)
+    changed = [pair for pair in fitted if is_changed(*pair)]
     predicts = [fit([pair]) for pair in changed]
-    fitted = [share for pair, predict in zip(changed, predicts, strict=True) for share in shares(predict, [pair])]
-    return fitted, shares(predicts[0], pairs[half:])
+    own = [share for pair, predict in zip(changed, predicts, strict=True) for share in shares(predict, [pair])]
+    return own, shares(predicts[0], held)
 
 
 def main() -> None:
@@ -303,15 +305,15 @@ def report(
     best, tied, judged, ended = 0, 0, 0, time.perf_counter()
     for edit, some in pairs.items():
         half = len(some) // 2
-        parts = some[:half] if count == 1 else some[:count], some[half:]
-        if not all(any(is_changed(*pair) for pair in part) for part in parts):
+        fitted, held = some[: half if count == 1 else count], some[half:]
+        if not all(any(is_changed(*pair) for pair in part) for part in (fitted, held)):
             print(f"{edit:34}  left out, since it changes none of the fitted or of the held-out photographs")
             continue
         judged, cells, means = judged + 1, [], {}
         for method, fit in methods.items():
-            fitted, held = judge(fit, some, count)
-            means[method] = statistics.mean(held)
-            cells.append(f"{statistics.mean(fitted):6.1f} {means[method]:6.1f} ({min(held):4.0f})")
+            of_fitted, of_held = judge(fit, fitted, held, at_once=count > 1)
+            means[method] = statistics.mean(of_held)
+            cells.append(f"{statistics.mean(of_fitted):6.1f} {means[method]:6.1f} ({min(of_held):4.0f})")
         others = [value for name, value in means.items() if name != "look"]
         own, other = (round(value, 1) for value in (means["look"], max(others, default=-float("inf"))))
         best, tied = best + (own > other), tied + (own == other)
