@@ -245,6 +245,14 @@ def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
     assert torch.equal(found, found.mT)
 
 
+def test_denormal_numbers_are_zero_in_kernels_only(level: int, threads: Any) -> None:
+    threads(2)
+    tiny, scaling = torch.full((1, 2, 100_000), 1e-39), torch.full((1, 100_000), 1e30)
+    assert (sum_grams(tiny, scaling, None, 1) == 0).all()
+    assert (sum_grams(100 * tiny, scaling, None, 1) > 0).all()
+    assert (0.5 * tiny > 0).all()  # on both threads
+
+
 def test_tensors_of_any_layout(level: int) -> None:
     factor, vectors, images = random(1, 300, 6).mT, random(1, 6, 3).mT, random(1, 300, 3).mT
     torch.testing.assert_close(spread(vectors, factor), vectors @ factor)

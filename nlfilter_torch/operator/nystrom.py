@@ -18,6 +18,7 @@ from nlfilter_torch.core.values import is_hidden
 Completion = Literal["diagonal", "none"]
 
 CANCELLATION = 1e-7  # error of a squared distance above which distances are not computed from matrix products
+LARGEST_SQUARE = 60.0  # distance: smaller affinities would become denormal numbers of float32, which are slow
 JITTER = 1e-5  # added to the landmark block; limits the amplification of rounding by the inverse factor to 316 times
 
 
@@ -28,7 +29,8 @@ def inverse_cholesky(landmarks: Tensor) -> Tensor:
     squared = _squared_distances(points)
     identity = torch.eye(landmarks.shape[2], dtype=torch.float64, device=landmarks.device)
     # The distance of a landmark to itself is zero by definition, whatever the rounding of the three terms.
-    return invert(torch.exp(-squared.clamp(min=0.0) * (1 - identity)) + JITTER * identity).to(landmarks)
+    squared = squared.clamp(0.0, LARGEST_SQUARE) * (1 - identity)
+    return invert(torch.exp(-squared) + JITTER * identity).to(landmarks)
 
 
 @register(

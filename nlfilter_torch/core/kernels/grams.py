@@ -6,6 +6,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import buffered_blocks, strip_count, strips
 from nlfilter_torch.core.kernels.library import by_rows, register, run_on_factor
 
+NEGLIGIBLE = 1e-15  # entries of F in float32 that count as zero: their products would be denormal, which is slow
+
 
 def _fake_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
     batch, landmarks, _ = factor.shape
@@ -34,6 +36,8 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
     total = factor.new_zeros(len(factor), count, landmarks, landmarks, dtype=torch.float64)
     for block, (rows, weighted) in buffered_blocks(factor, 2):
         left = torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)
+        if left.dtype == torch.float32:
+            torch.ops.aten.hardshrink.out(left, NEGLIGIBLE, out=left)
         for j in range(count):
             if j:
                 left = torch.mul(left, weights[:, :, block], out=weighted)

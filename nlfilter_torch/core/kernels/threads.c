@@ -9,10 +9,8 @@
 
 #if defined(__x86_64__)
 #define PAUSE() __builtin_ia32_pause()
-#elif defined(__aarch64__)
-#define PAUSE() __asm__ volatile("yield")
 #else
-#define PAUSE()
+#define PAUSE() __asm__ volatile("yield")
 #endif
 
 /* Wheels must run on any glibc that torch supports. Newer ones have another version of this function, which is the
@@ -23,9 +21,28 @@ __asm__(".symver pthread_create, pthread_create@GLIBC_2.2.5");
 __asm__(".symver pthread_create, pthread_create@GLIBC_2.17");
 #endif
 
+/* Floating-point control of this thread. With `flushed`, denormal numbers (below 1.2e-38) count as zero: on Intel
+ * processors an operation on one takes about a hundred times as long as on others. */
+#if defined(__x86_64__)
+static uint64_t control(void) { return __builtin_ia32_stmxcsr(); }
+static void set_control(uint64_t control) { __builtin_ia32_ldmxcsr((unsigned)control); }
+static uint64_t flushed(uint64_t control) { return control | 0x8040; } /* results (FTZ) and operands (DAZ) */
+#else
+static uint64_t control(void)
+{
+    uint64_t control;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(control));
+    return control;
+}
+static void set_control(uint64_t control) { __asm__ volatile("msr fpcr, %0" : : "r"(control)); }
+static uint64_t flushed(uint64_t control) { return control | 1 << 24; } /* FZ */
+#endif
+
 static void run_worker(void *argument)
 {
     struct work *work = argument;
+    const uint64_t before = control();
+    set_control(flushed(before));
     float *scratch = aligned_alloc(64, padded((work->floats + 1) * sizeof(float), 64));
     if (!scratch)
         work->failed = 1;
@@ -37,6 +54,7 @@ static void run_worker(void *argument)
         work->run(work, image, piece, first, last < work->pixels ? last : work->pixels, scratch);
     }
     free(scratch);
+    set_control(before);
 }
 
 /* GOMP_parallel, once its address is known. OpenMP's threads, which torch uses too, keep spinning for a while after a
