@@ -369,3 +369,42 @@ def test_gradients_by_masks_are_right_where_all_are_0(count: int, painted: float
         moved[:, k] += 1e-6
         wanted = ((filter_regions(operator, image, moved, alpha) - filtered.detach()) * weights).sum() / 1e-6
         assert float(found[:, k].sum()) == pytest.approx(float(wanted), rel=1e-4)
+
+
+def test_numbers_are_as_exact_as_tensors_in_double_precision() -> None:
+    image = noise(1, 1, 20, 20)
+    operator = nonlocal_operator(image, photometric_bandwidth=0.2, num_landmarks=20)
+    alpha = torch.tensor([3.0, 2.0, 1.0]).double()
+    number, tensor = (
+        polynomial_filter(operator, image, alpha, residual=value) for value in (0.3, torch.tensor(0.3).double() * 1)
+    )
+    exact = polynomial_filter(operator, image, alpha, residual=torch.tensor(0.3, dtype=torch.float64))
+    torch.testing.assert_close(number, exact, atol=1e-15, rtol=0)
+    assert (tensor - exact).abs().max() > 1e-12  # 0.3 rounded to float32
+
+
+def test_captured_energy_of_large_and_small_images() -> None:
+    image = noise(1, 1, 20, 20).float()
+    spectrum = nonlocal_operator(image, photometric_bandwidth=0.2, num_landmarks=20).spectrum()
+    expected = captured_energy(spectrum, image)
+    for scale in (1e18, 1e-25):
+        torch.testing.assert_close(captured_energy(spectrum, scale * image), expected, rtol=1e-5, atol=0)
+
+
+def test_half_precision_masks_do_not_round_the_sliders() -> None:
+    image = noise(1, 1, 16, 16).float()
+    operator = nonlocal_operator(image, photometric_bandwidth=0.2, num_landmarks=20)
+    alpha = torch.tensor([[3.1, 2.3, 4.7, 1.05]])
+    mask = torch.ones(1, 1, 16, 16)
+    expected = filter_regions(operator, image, mask, alpha)
+    assert torch.equal(filter_regions(operator, image, mask.bfloat16(), alpha), expected)
+
+
+def test_patch_weights_in_half_precision_do_not_overflow() -> None:
+    image = noise(1, 1, 16, 16).float()
+    options = {"photometric_bandwidth": 0.2, "num_landmarks": 20}
+    found, expected = (
+        nonlocal_operator(image, patch_weights=weights, **options) @ image
+        for weights in (torch.full((5, 5), 3000.0).half(), torch.ones(5, 5))
+    )
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)

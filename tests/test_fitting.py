@@ -265,3 +265,16 @@ def test_pixels_that_do_not_count_and_other_images_change_nothing() -> None:
     mixed = fit_alpha(operator, images, torch.cat([rounded[:1], edited[1:]]))
     torch.testing.assert_close(mixed[:1], fit_alpha(operator, images, rounded)[:1], rtol=0, atol=1e-5)
     torch.testing.assert_close(mixed[1:], fit_alpha(operator, images, edited)[1:], rtol=0, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")
+def test_forward_mode_of_fitted_sliders_is_their_slope() -> None:
+    image, tangent = noise(1, 1, 20, 20), noise(1, 1, 20, 20, seed=2)
+    operator = nonlocal_operator(image, photometric_bandwidth=0.2, num_landmarks=20)
+
+    def fitted(image: torch.Tensor) -> torch.Tensor:
+        return fit_alpha(operator, image, noise(1, 1, 20, 20) ** 1.3, order=2, rounding=0.0)
+
+    step = 1e-6
+    slope = (fitted(image + step * tangent) - fitted(image - step * tangent)) / (2 * step)
+    torch.testing.assert_close(torch.func.jvp(fitted, (image,), (tangent,))[1], slope, rtol=1e-5, atol=1e-6)

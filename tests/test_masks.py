@@ -347,3 +347,16 @@ def test_sliders_that_do_not_fit(masks: torch.Tensor, alpha: torch.Tensor, sente
 def test_sliders_are_a_tensor() -> None:
     with pytest.raises(TypeError, match=r"alpha must be a torch.Tensor, got list; convert it with torch.tensor"):
         compose_alpha(torch.ones(1, 1, 2, 2), [1.0, 2.0])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("opposed", [False, True])
+def test_gradient_of_a_tiny_width_is_finite(opposed: bool) -> None:
+    image, region = noise(1, 1, 16, 16).float(), torch.zeros(1, 1, 16, 16)
+    region[..., 3:6, 3:6] = 1
+    spectrum = nonlocal_operator(image, photometric_bandwidth=0.2, num_landmarks=20).spectrum()
+    logarithm = torch.tensor(-60.0, requires_grad=True)
+    mask = diffusion_mask(spectrum, region, width=logarithm.exp(), negative=region.flip(3) if opposed else None)
+    mask.sum().backward()
+    assert mask.isfinite().all()
+    assert logarithm.grad is not None
+    assert logarithm.grad.isfinite()

@@ -141,3 +141,11 @@ def test_modules_without_values_can_be_printed() -> None:
 def test_an_unknown_option_of_a_look_is_refused() -> None:
     with pytest.raises(TypeError, match="num_landmark"):
         Look(num_landmark=3)
+
+
+def test_patch_weights_that_need_a_gradient_are_constants_of_the_layer() -> None:
+    layer = NonlocalFilter(patch_weights=torch.ones(3, 3, requires_grad=True), photometric_bandwidth=0.3)
+    image = noise(1, 1, 12, 12, dtype=torch.float32).requires_grad_()
+    for _ in range(2):
+        copy.deepcopy(layer)(image).sum().backward()
+    assert image.grad is not None

@@ -1,5 +1,6 @@
 """Operators of weighted points, compared with those of the pixels that the points represent, and of guides."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from nlfilter_torch import (
     operator_from_features,
     polynomial_filter,
     propagate_strokes,
+    segment_mask,
     spectral_filter,
 )
 from nlfilter_torch.operator.newton import damped
@@ -134,6 +136,88 @@ def test_points_may_stand_for_less_than_a_pixel() -> None:
     )
     torch.testing.assert_close(few.row_sums(), many.row_sums(), atol=1e-6, rtol=0)
     assert (few @ image).isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("weight", [1 / 150, 0.1, 0.5])
+def test_small_weights_give_the_dense_operator(dtype: torch.dtype, weight: float) -> None:
+    features, image = noise(1, 2, 150, seed=1) / 0.2, noise(1, 1, 1, 150, seed=2)
+    weights = weight * (0.5 + noise(1, 150, seed=3))
+    operator = operator_from_features(
+        features.to(dtype), size=(150,), weights=weights.to(dtype), num_landmarks=150, completion="diagonal"
+    )
+    kernel = torch.exp(-(features[0].T[:, None] - features[0].T).square().sum(2))
+    scaling = torch.ones(150, dtype=torch.float64)
+    for _ in range(200):
+        scaling = (scaling / (kernel @ (weights[0] * scaling))).sqrt()
+    expected = scaling * (kernel @ (weights[0] * scaling * image.flatten()))
+    torch.testing.assert_close((operator @ image.to(dtype)).flatten().double(), expected, atol=1e-3, rtol=0)
+    columns = operator.at(features.to(dtype))
+    torch.testing.assert_close(columns.scaling, operator.scaling, atol=1e-4, rtol=1e-4)
+
+
+def test_one_operator_evaluates_a_batch_of_points_and_several_operators_one_set() -> None:
+    features, points = noise(2, 3, 60, seed=1).float(), noise(3, 3, 40, seed=2).float()
+    both = operator_from_features(features, size=(60,), num_landmarks=20)
+    single = operator_from_features(features[:1], size=(60,), num_landmarks=20)
+    many, one = single.at(points), both.at(points[:1])
+    for found, expected in (
+        *((many.factor[i : i + 1], single.at(points[i : i + 1]).factor) for i in range(3)),
+        *((many.scaling[i : i + 1], single.at(points[i : i + 1]).scaling) for i in range(3)),
+        (one.factor, both.at(points[:1].repeat(2, 1, 1)).factor),
+        (one.scaling, both.at(points[:1].repeat(2, 1, 1)).scaling),
+    ):
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    with pytest.raises(ValueError, match="features must have batch size 1 or 2, like the operator, got 3"):
+        both.at(points)
+
+
+def test_evaluation_leaves_autocast() -> None:
+    features, points = noise(1, 3, 60, seed=1).float(), noise(1, 3, 40, seed=2).float()
+    operator = operator_from_features(features.requires_grad_(), size=(60,), num_landmarks=20)
+    expected = operator.at(points)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = operator.at(points)
+    assert torch.equal(found.factor, expected.factor)
+    assert torch.equal(found.scaling, expected.scaling)
+
+
+def test_arguments_may_be_changed_after_building() -> None:
+    image, bandwidth = noise(1, 1, 12, 12).float(), torch.tensor(0.2)
+    fitted = fit_filter(nonlocal_operator(image, photometric_bandwidth=bandwidth, num_landmarks=20), image)
+    layers = fitted.layers(image)
+    bandwidth.mul_(3)
+    assert torch.equal(fitted.layers(image), layers)
+    features, weights = noise(1, 2, 50, seed=1), noise(1, 50, seed=2) + 0.5
+    operator = operator_from_features(features, size=(50,), weights=weights, num_landmarks=50)
+    points = noise(1, 2, 5, seed=3)
+    factor = operator.at(points).factor
+    features.add_(1)
+    weights.mul_(2)
+    assert torch.equal(operator.at(points).factor, factor)
+    assert (operator.row_sums() - 1).abs().max() <= 1e-9
+
+
+@pytest.mark.parametrize("mask", [torch.ones(50), torch.ones(1, 1, 1, 1), 1.0, torch.ones(7), [1]])
+def test_masks_of_weighted_points_are_checked(mask: Any) -> None:
+    operator = operator_from_features(noise(1, 2, 50), size=(50,), weights=torch.ones(50).double(), num_landmarks=20)
+    image = noise(1, 1, 1, 50, seed=2)
+    with pytest.raises((TypeError, ValueError), match=r"^mask must"):
+        fit_alpha(operator, image, image**2, mask=mask)
+
+
+def test_segments_of_small_total_weight_have_their_own_centres() -> None:
+    generator = torch.Generator().manual_seed(0)
+    places = [0.2 * torch.randn(20, generator=generator) + centre for centre in (0.0, 1.5, 3.0)]
+    features = torch.stack([torch.cat(places), torch.zeros(60)])[None].double()
+    weights = torch.tensor([10.0, 1e-3, 10.0]).double().repeat_interleave(20)
+    regions = torch.eye(3).repeat_interleave(20, dim=1).view(1, 3, 1, 60).double()
+    spectrum = operator_from_features(features, size=(60,), weights=weights, num_landmarks=59).spectrum()
+    scaled, rescaled = (
+        segment_mask(replace(spectrum, weights=factor * weights[None], scaling=spectrum.scaling), regions)
+        for factor in (1.0, 1e4)
+    )
+    assert torch.equal(scaled, rescaled)
 
 
 def test_damped_steps_balance_weighted_points() -> None:

@@ -180,3 +180,32 @@ def test_a_look_at_the_eigenvectors_takes_no_gradient_away() -> None:
     with torch.no_grad():
         constant = build(guide, photometric_bandwidth=0.4, num_landmarks=12).spectrum()
     assert not constant.eigenvectors.requires_grad
+
+
+def test_the_first_eigenvector_stays_constant_in_double_precision() -> None:
+    """An operator balanced in float32 has eigenvalues of 1 that differ by more than the rounding of float64."""
+    image = 0.02 * noise(1, 3, 32, 32).float()
+    image[..., 10:20] += 0.4
+    image[..., 20:] += 0.9
+    operator = nonlocal_operator(image, photometric_bandwidth=0.06, num_landmarks=20, patch_size=1)
+    for spectrum in (
+        operator.spectrum(),
+        operator.spectrum().to(torch.float64),
+        operator.to(torch.float64).spectrum(),
+    ):
+        first = spectrum.eigenvectors[0, 0]
+        assert first.std() <= 1e-5 * first.mean()
+
+
+def test_eigenvectors_formed_in_inference_mode_serve_training() -> None:
+    spectrum = nonlocal_operator(noise(1, 1, 12, 12), num_landmarks=10, photometric_bandwidth=0.2).spectrum()
+    with torch.inference_mode():
+        assert spectrum.eigenvectors.isfinite().all()
+    weight = torch.ones(1, dtype=torch.float64, requires_grad=True)
+    (spectrum.eigenvectors * weight).sum().backward()
+    assert weight.grad is not None
+
+
+def test_an_empty_batch_has_an_empty_spectrum() -> None:
+    operator = nonlocal_operator(noise(1, 1, 12, 12)[:0], num_landmarks=10, photometric_bandwidth=0.2)
+    assert operator.spectrum().eigenvalues.shape[0] == 0

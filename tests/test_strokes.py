@@ -1,12 +1,14 @@
 """Propagated strokes: against a dense computation of the same estimate, invariants, gradients and bad input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch import Spectrum, nonlocal_operator, propagate_strokes
+from nlfilter_torch import Spectrum, nonlocal_operator, operator_from_features, propagate_strokes
 from nlfilter_torch.filtering.scribbles import DAB, NOISE
 from tests.images import two_colours
 from tests.problems import build, guides, noise, options, picture, seeded
@@ -231,3 +233,34 @@ def test_bad_input(spectrum: Spectrum, changes: dict, sentence: str) -> None:
     arguments = {"strokes": noise(1, 1, 20, 24), "stroke_mask": spots(*PLACES), **changes}
     with pytest.raises(ValueError, match=sentence):
         propagate_strokes(spectrum, **arguments)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_isolated_pixels_do_not_make_values_nan(recorded: bool) -> None:
+    """The columns of isolated pixels are zero, and so is their captured variance."""
+    features, mask = noise(1, 2, 1700), torch.zeros(1, 1, 1, 1700, dtype=torch.float64)
+    operator = operator_from_features(features / 0.2, size=(1700,), num_landmarks=20)
+    alone = torch.zeros(1, 1, 1700, dtype=torch.bool)
+    alone[..., -40:] = True
+    spectrum = replace(operator, factor=operator.factor * ~alone).spectrum()
+    mask[..., :5], mask[..., -40:] = 1, 1 - recorded
+    found = propagate_strokes(spectrum, noise(1, 2, 1, 1700, seed=2), mask.requires_grad_(recorded))
+    assert found.isfinite().all()
+    if recorded:
+        found.sum().backward()
+        assert mask.grad is not None
+        assert mask.grad.isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")
+def test_forward_mode_in_the_mask_is_reverse_mode() -> None:
+    image = noise(1, 1, 20, 20)
+    spectrum = nonlocal_operator(image, photometric_bandwidth=0.2, num_landmarks=20).spectrum()
+    mask, tangent = torch.zeros_like(image), noise(1, 1, 20, 20, seed=2)
+    mask[..., 3:6, 3:6] = 0.5
+
+    def total(mask: torch.Tensor) -> torch.Tensor:
+        return propagate_strokes(spectrum, image, mask).sum()
+
+    forward, reverse = torch.func.jvp(total, (mask,), (tangent,))[1], torch.func.grad(total)(mask)
+    torch.testing.assert_close(forward, (reverse * tangent).sum(), rtol=1e-9, atol=0)

@@ -54,7 +54,7 @@ def strips(planes: Tensor, count: int) -> Tensor:
 
 def block_length(batch: int, device: torch.device, length: int) -> int:
     """Number of pixels of each image in a block of about ``length`` pixels per core."""
-    return max(256, (length * cores() if device.type == "cpu" else ACCELERATED) // batch)
+    return max(256, (length * cores() if device.type == "cpu" else ACCELERATED) // max(batch, 1))
 
 
 def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = CACHED) -> Iterator[slice]:

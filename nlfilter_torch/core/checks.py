@@ -378,7 +378,7 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
         raise ValueError(
             f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; pass one each"
         )
-    weights = weights.detach().to(features).expand(batch, points).contiguous()
+    weights = weights.detach().to(features).expand(batch, points).clone(memory_format=torch.contiguous_format)
     if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
         allowed, found = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
         raise ValueError(f"weights must be from {allowed}, got {found}; drop points of negligible weight")

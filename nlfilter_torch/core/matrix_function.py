@@ -12,9 +12,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from nlfilter_torch.core.autograd import once_differentiable
 from nlfilter_torch.core.precision import uncompiled
+from nlfilter_torch.core.values import are_derived
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
 # and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,
@@ -58,7 +60,12 @@ class SymmetricMatrix:
         points = torch.where(support, self.eigenvalues, torch.ones_like(self.eigenvalues))
         values = torch.where(support, function(points), torch.zeros_like(points))
         if not self.matrix.requires_grad:
-            return (self.vectors * values.unsqueeze(-2)) @ self.vectors.mT
+            constant = (self.vectors * values.unsqueeze(-2)) @ self.vectors.mT
+            if not are_derived([self.matrix]):
+                return constant
+            change = self.matrix - self.matrix.detach()  # zero, with a forward-mode derivative
+            inner = self.vectors.mT @ ((change + change.mT) / 2) @ self.vectors
+            return constant + self.vectors @ (self._differences(function, values, support) * inner) @ self.vectors.mT
         result: Tensor = _SpectralFunction.apply(  # type: ignore[no-untyped-call]
             self.matrix, values, self.vectors, self._differences(function, values, support)
         )
@@ -78,6 +85,9 @@ class SymmetricMatrix:
     @staticmethod
     def _slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
         """Derivative of f at ``points`` (B, M, M); f may differ between the images of a batch."""
+        if is_functorch_wrapped_tensor(points):  # in torch.func
+            slope: Tensor = torch.func.grad(lambda flat: function(flat).sum())(points.detach().flatten(1))
+            return slope.view_as(points)
         with torch.enable_grad():
             points = points.detach().requires_grad_()
             flat = points.flatten(1)

@@ -23,6 +23,11 @@ def working_dtype(tensor: Tensor) -> torch.dtype:
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
 
 
+def per_image(value: float | Tensor, like: Tensor, dimensions: int) -> Tensor:
+    """A number or a tensor of shape () or (B,), as (1 or B, 1, ...) in the dtype and on the device of ``like``."""
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1, *[1] * (dimensions - 1))
+
+
 def as_given(result: Tensor, image: Tensor) -> Tensor:
     """Convert a result (B, C, H, W) to the dtype of ``image``, and to channels-last if ``image`` is."""
     result = result.to(image.dtype)

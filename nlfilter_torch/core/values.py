@@ -5,6 +5,9 @@ without data: on the device "meta", as fake tensors, under ``torch.compile`` and
 of values are skipped, and iterations run a fixed number of steps.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor, peek_interpreter_stack
@@ -27,6 +30,17 @@ def is_hidden(tensor: Tensor) -> bool:
 def is_fake(tensor: Tensor) -> bool:
     """Whether a tensor is fake (has a shape but no data), or fake tensor mode is active."""
     return isinstance(tensor, FakeTensor) or torch._C._get_dispatch_mode(_FAKE) is not None
+
+
+def are_derived(arguments: Sequence[Any]) -> bool:
+    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
+    if torch.is_grad_enabled():
+        for argument in arguments:  # before every product; a loop takes half the time of a generator
+            if isinstance(argument, Tensor) and argument.requires_grad:
+                return True
+    if forward_ad._current_level < 0:
+        return False
+    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
 
 def refuse_transforms(name: str, *values: object) -> None:

@@ -18,7 +18,7 @@ from nlfilter_torch.core.checks import (
     check_weight,
     checked_response,
 )
-from nlfilter_torch.core.precision import as_given, full_precision
+from nlfilter_torch.core.precision import as_given, full_precision, per_image
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, Spectrum
 
@@ -155,7 +155,7 @@ def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, rem
     entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
     powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
     gain = weigh_layers(layers_between(powers), alpha)
-    return (torch.as_tensor(weight).to(residual).reshape(-1, 1, 1, 1) - gain) * (1 - remainder) * residual
+    return (per_image(weight, residual, 4) - gain) * (1 - remainder) * residual
 
 
 @full_precision
@@ -217,7 +217,7 @@ def spectral_filter(
         check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
     if isinstance(residual, int | float) and residual == 0:
         return as_given(spectrum.synthesize(response, coefficients), image)
-    rho = torch.as_tensor(spectrum.among.copy_to_group(residual)).to(spectrum.root).reshape(-1, 1)
+    rho = per_image(spectrum.among.copy_to_group(residual), spectrum.root, 2)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y, still in two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
     return as_given(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
@@ -242,12 +242,13 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_image(image, "image")
     captured = spectral_filter(spectrum, image.to(spectrum.factor.dtype), torch.ones_like)
-    image = image.to(spectrum.factor)
-    energy, inner = (  # |y|^2 and y^T V V^T y, in the sum over weighted points
-        spectrum.among.sum(weighted((planes * image).flatten(2).sum(1), spectrum.weights).sum(1))
-        for planes in (image, captured)
+    exact = image.double()
+    energy, inner = (  # |y|^2 and y^T V V^T y, in the sum over weighted points; in float32 they might overflow
+        spectrum.among.sum(weighted((planes * exact).flatten(2).sum(1), spectrum.weights).sum(1))
+        for planes in (exact, captured)
     )
-    return torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), torch.ones_like(energy))
+    share = torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), 1.0)
+    return share.to(spectrum.factor)
 
 
 @full_precision
@@ -334,6 +335,7 @@ def filter_regions(
     check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
     check_unit_range(masks, "masks")
     check_same_size(masks, operator.size, "masks", "operator", operator.factor)
+    masks = masks.to(operator.factor)
     total = masks.sum(1, keepdim=True)
     outside = total == 0
     # Averaged over the regions with the masks as weights, (B, k+1, H, W). Outside all regions they are 1, but depend on

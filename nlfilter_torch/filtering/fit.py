@@ -109,11 +109,7 @@ def fit_alpha(
         _check_not_negative(rounding, "rounding")
 
     layers = detail_layers(operator, image.to(operator.factor), order=order).double()  # (B, k+1, C, H, W)
-    counted = mask
-    if operator.weights is not None:
-        represented = operator.weights.unflatten(1, operator.size).unsqueeze(1)
-        counted = represented if mask is None else mask * represented
-    weights = _pixel_weights(counted, layers, operator.among).flatten(1)
+    weights = _pixel_weights(mask, operator, layers).flatten(1)
     aims = target.detach().double().flatten(1)
     if rounding is None:
         zone = _roundings(aims, weights, operator.among)
@@ -339,19 +335,21 @@ class _Problem:
         return change_of(coefficients.detach())
 
 
-def _pixel_weights(mask: Tensor | None, layers: Tensor, among: Communicator) -> Tensor:
+def _pixel_weights(mask: Tensor | None, operator: NonlocalOperator, layers: Tensor) -> Tensor:
     """Weights (B, C, H, W) or (1, C, H, W) of the pixels, of unit sum for every image."""
     batch, _, channels, height, width = layers.shape
-    if mask is None:
-        pixels = among.pixels(height * width)
-        return layers.new_full((1, channels, height, width), 1.0 / (channels * pixels))
-    check_image(mask, "mask", channels=1, batch=batch)
-    check_same_size(mask, (height, width), "mask", "image")
-    if not is_hidden(mask) and bool((mask < 0).any()):
-        raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
-    total = among.sum(mask.double().sum((2, 3), keepdim=True))
-    if not is_hidden(mask) and bool((total <= 0).any()):
+    counted = layers.new_ones(1, 1, height, width)
+    if mask is not None:
+        check_image(mask, "mask", channels=1, batch=batch)
+        check_same_size(mask, (height, width), "mask", "image")
+        if not is_hidden(mask) and bool((mask < 0).any()):
+            raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
+        counted = mask.double()
+    if operator.weights is not None:
+        counted = counted * operator.weights.unflatten(1, operator.size).unsqueeze(1)
+    total = operator.among.sum(counted.sum((2, 3), keepdim=True))
+    if not is_hidden(counted) and bool((total <= 0).any()):
         raise ValueError(
             "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"
         )
-    return (mask.double() / (channels * total)).expand(-1, channels, -1, -1)
+    return (counted / (channels * total)).expand(-1, channels, -1, -1)

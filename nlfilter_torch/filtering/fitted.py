@@ -5,7 +5,7 @@ pixels of the image that W was made from. With these vectors fixed, equal patche
 an edit does not flicker. On the image it was fitted to, the fitted filter equals the original filter.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -122,10 +122,7 @@ class FittedFilter:
             check_image(guide, "guide", batch=image.shape[0])
             guide = guide.expand(image.shape[0], -1, -1, -1)
             check_same_size(guide, size, "guide", "image", image)
-        batch = (image.shape[0], -1, -1)
-        landmarks, inverse = (matrix.expand(batch) for matrix in (self.kernel.landmarks, self.kernel.inverse_cholesky))
-        kernel = replace(self.kernel, landmarks=landmarks, inverse_cholesky=inverse)
-        factor, diagonal = kernel.factor(kernel.recipe(image if guide is None else guide, origin=origin, halo=halo))
+        factor, diagonal = self.kernel.columns(image if guide is None else guide, origin=origin, halo=halo)
         columns = Columns(factor, *self.balancing(factor, diagonal))
         pixels = image[..., halo[0] : size[0] - halo[1], :].to(factor).flatten(2)
         planes = layers_of_columns(columns, self.moments, pixels)

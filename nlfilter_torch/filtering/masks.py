@@ -6,12 +6,12 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import CACHED, block_length, weighted
 from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size, warn
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.core.values import is_hidden
 from nlfilter_torch.operator.spectrum import Spectrum
 
 FARTHEST = 60.0  # limit of the exponent; keeps masks positive, so that their products and ratios are defined
-STEEPEST = 1e30  # limit of pixels / width; keeps a distance of 0 from becoming NaN
+NARROWEST = 1e-12  # lower limit of the width, whose inverse square is a factor of the gradient
 CAPTURED = 0.005  # captured share of a region's kernel below which its diffusion coordinates are nearly 0
 CHECKED = 4096  # maximum number of pixels of a region that are compared with the landmarks
 ITERATIONS = 20  # maximum iterations of k-means, which starts close to the solution
@@ -36,8 +36,8 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_positive(time, "time", spectrum.factor.shape[0])
-    gain = spectrum.eigenvalues[:, 1:].pow(torch.as_tensor(time).to(spectrum.factor).reshape(-1, 1))
-    root = torch.as_tensor(spectrum.pixels).to(gain).sqrt().reshape(-1, 1, 1, 1)
+    gain = spectrum.eigenvalues[:, 1:].pow(per_image(time, spectrum.factor, 2))
+    root = per_image(spectrum.pixels, gain, 4).sqrt()
     return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * root
 
 
@@ -86,7 +86,7 @@ def diffusion_mask(
     check_positive(time, "time", spectrum.factor.shape[0])
     check_positive(width, "width", max(spectrum.factor.shape[0], weights.shape[0]))
     _warn_of_unlike(spectrum, weights)
-    exponent = torch.as_tensor(spectrum.among.copy_to_group(time)).to(spectrum.root).reshape(-1, 1)
+    exponent = per_image(spectrum.among.copy_to_group(time), spectrum.root, 2)
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
     if others is not None:
         check_negative(others.shape[1], weights.shape[1])
@@ -94,12 +94,9 @@ def diffusion_mask(
         weights = torch.cat([weights.expand(images, -1, -1), others.expand(images, -1, -1)], dim=1)
     # The constant eigenvector does not contribute to distances, so it is kept, and no eigenvectors need to be formed.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
-    pixels, width = (
-        torch.as_tensor(value).to(distances).reshape(-1, 1, 1)
-        for value in (spectrum.pixels, spectrum.among.copy_to_group(width))
-    )
-    scale = pixels / width
-    exponents = scale.clamp(max=STEEPEST) * distances  # of the regions, then of negative ones
+    pixels = per_image(spectrum.pixels, distances, 3)
+    width = per_image(spectrum.among.copy_to_group(width), distances, 3)
+    exponents = pixels / width.clamp(min=NARROWEST) * distances  # of the regions, then of negative ones
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = torch.exp(-inner.clamp(max=FARTHEST))
     mask = mask if negative is None else mask * torch.sigmoid((outer - inner).clamp(min=-20.0))
@@ -188,7 +185,7 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_positive(time, "time", spectrum.factor.shape[0])
-    exponent = torch.as_tensor(time).to(spectrum.root).reshape(-1, 1)
+    exponent = per_image(time, spectrum.root, 2)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions").expand(len(spectrum.factor), -1, -1)  # (B, K, N)
         basis = spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent))  # to coordinates, (B, M, M)
@@ -198,7 +195,8 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
             members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
             counts = weighted(members, spectrum.weights).sum(2, dtype=torch.float64)
             sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
-            centres = torch.where(sizes > 0, _sums(spectrum, basis, members) / sizes.clamp(min=1.0), centres)
+            empty = sizes == 0
+            centres = torch.where(empty, centres, _sums(spectrum, basis, members) / torch.where(empty, 1.0, sizes))
             previous, assignment = assignment, _nearest(spectrum, basis, centres)
             if is_hidden(members):  # a comparison would wait for the device
                 continue

@@ -25,8 +25,8 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.precision import full_precision, per_image
+from nlfilter_torch.core.values import are_derived, is_hidden
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 DAB = 25 / 38400  # area of a brush dab, relative to the image: 5x5 pixels of 160x240
@@ -96,7 +96,7 @@ def propagate_strokes(
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
-    if not weights.requires_grad:  # pixels of weight 0 matter only for the gradient of the weights
+    if not are_derived([weights]):  # pixels of weight 0 matter only for the gradient of the weights
         painted = (weights > 0).any(0).squeeze(0).nonzero().squeeze(1)
         factor, weights, values = factor[:, :, painted], weights[:, :, painted], values[:, :, painted]
     fitted = fit_strokes(
@@ -145,7 +145,7 @@ def fit_strokes(
     factor (B, M, n), weights (B, 1, n) and values (B, C, n). ``pixels`` is the number N of pixels of the whole image,
     or (B,), whose rows are distributed over the ranks of ``among``.
     """
-    walk = _per_image(reach, pairs.root).squeeze(2)  # s, (B or 1, 1)
+    walk = per_image(reach, pairs.root, 2)  # s, (B or 1, 1)
     basis = pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt())
     half = basis.mT  # R, where X = R R^T
     effective_weights = EffectiveWeights.of(painted, half, _dab(pixels), among)
@@ -163,7 +163,7 @@ def fit_strokes(
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, where the inverted matrix is symmetric and positive definite.
     inner = half.mT @ gram @ half
     # Noise variance of a single pixel of a dab.
-    noise = _per_image(smoothness, gram) * effective_weights.dab * effective_weights.noise
+    noise = per_image(smoothness, gram, 3) * effective_weights.dab * effective_weights.noise
     identity = torch.eye(inner.shape[1]).to(inner)
     lower = torch.linalg.cholesky_ex(inner + noise * identity).L
     solution = half @ torch.cholesky_solve(half.mT @ target, lower)  # (B, M, C+1)
@@ -172,7 +172,7 @@ def fit_strokes(
     # squares computes the mean from the residuals of both; pixels that are not determined get a share of the mean.
     residual = sums - (target[:, :, -1:].mT @ solution).squeeze(1)  # (B, C+1)
     mean = residual[:, :-1] / residual[:, -1:]
-    share = _per_image(strength, solution) * mean.unsqueeze(1)  # (B, 1, C)
+    share = per_image(strength, solution, 3) * mean.unsqueeze(1)  # (B, 1, C)
     return FittedStrokes((solution[:, :, :-1] - solution[:, :, -1:] * share).mT, share.mT)
 
 
@@ -220,7 +220,8 @@ class EffectiveWeights:
             return weights
         variance = (factor * (self.core.to(factor) @ factor)).sum(1, keepdim=True)  # (B, 1, n)
         # Sum of squared correlations with the scribbled pixels.
-        similar = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True) / variance
+        similar = (factor * (self.gram.to(factor) @ factor)).sum(1, keepdim=True)
+        similar = similar / variance.clamp(min=torch.finfo(variance.dtype).tiny)  # 0 at isolated pixels, as both are
         return weights * (dab / similar.clamp(min=1.0)).clamp(min=1.0)
 
 
@@ -245,8 +246,3 @@ def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, among: Comm
             f"{name} must hold a painted pixel in every image, got none in image(s) "
             f"{empty.nonzero().squeeze(1).tolist()}; paint at least one"
         )
-
-
-def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
-    """Reshape a number or a tensor of shape () or (B,) to (1 or B, 1, 1) in the dtype of ``like``."""
-    return torch.as_tensor(value).to(like).reshape(-1, 1, 1)

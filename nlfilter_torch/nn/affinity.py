@@ -66,7 +66,7 @@ class NonlocalAffinity(Learnable):
         check_choice(guide_channels, "guide_channels", ("luminance", "all"))
         Construction(num_landmarks, landmarks, completion, tolerance, generator)  # checks the options
         check_group(group)
-        window = unit_window(patch_size, patch_weights)
+        window = unit_window(patch_size, patch_weights).detach()  # learned only with learn=("patch_weights",)
         self.patch_size = patch_size
         self.num_landmarks = num_landmarks
         self.landmarks: Sampling = landmarks

@@ -186,13 +186,14 @@ def balance_in_rounds(
     *,
     completed: bool,
     among: Communicator = ALONE,
+    weights: Tensor | None = None,
 ) -> Rounds[Found]:
     """Balance a kernel. If it is ``completed``, remove isolated pixels and repeat until there are none."""
     found, worst = balanced(factor, diagonal)
     before: list[Tensor] = []
     removed: Tensor | None = None
     while completed and len(before) < Rounds.MOST:
-        alone = isolated(found.scaling.detach(), worst)
+        alone = isolated(found.scaling.detach(), diagonal.detach(), worst, weights)
         if not bool(among.max(alone.any().to(factor))):
             break
         before.append(found.moment)

@@ -169,6 +169,10 @@ def nonlocal_operator(
         farthest = torch.full_like(largest, max(height, width))
         check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial_bandwidth = among.copy_to_group(spatial_bandwidth)
+    if isinstance(bandwidth, Tensor):  # copied, since the caller may change it in place
+        bandwidth = bandwidth.clone()
+    if isinstance(spatial_bandwidth, Tensor):
+        spatial_bandwidth = spatial_bandwidth.clone()
     recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
     features = recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo)
     return _assemble(features, size, method, recipe=recipe, among=among)
@@ -300,7 +304,9 @@ def _assemble(
         worst, goal = 0.0, tolerance or TOLERANCE[factor.dtype]
         factor, diagonal, balancing, before = balance_in_graph(factor, diagonal, goal, completed, bound)
     else:
-        rounds = balance_in_rounds(factor, diagonal, balanced, completed=completed and watched, among=among)
+        rounds = balance_in_rounds(
+            factor, diagonal, balanced, completed=completed and watched, among=among, weights=weights
+        )
         factor, diagonal, balancing = rounds.factor, rounds.diagonal, rounds.found
         worst, before = rounds.residual, rounds.before
     scaling, residual = balancing.scaling, balancing.residual
@@ -315,6 +321,7 @@ def _assemble(
         sums = limited.row_sums(scaling.detach(), limited.moment(scaling.detach()))
         residual = among.max((sums - 1).abs().amax(1))
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
+    least = None if weights is None else -among.max(-weights.amin(1, keepdim=True))
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,
@@ -322,7 +329,7 @@ def _assemble(
         size=size,
         kernel=kernel,
         remainder=remainder,
-        balancing=PixelScaling(balancing.moment, completed, worst, before),
+        balancing=PixelScaling(balancing.moment, completed, worst, before, least),
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,

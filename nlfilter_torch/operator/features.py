@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import (
     check_tensor,
 )
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
-from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
 from nlfilter_torch.core.values import is_hidden
 
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
@@ -63,7 +63,9 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
         raise ValueError(
             "patch_weights must be non-negative with a positive sum, got other values; take their softmax or square"
         )
-    return patch_weights / patch_weights.sum()
+    weights = patch_weights.to(working_dtype(patch_weights))
+    weights = weights / weights.detach().max()  # so that the sum does not overflow
+    return weights / weights.sum()
 
 
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
@@ -106,7 +108,7 @@ def extract_features(
     size = patch_weights.shape[0]
     weights = patch_weights.to(guide).div(channels)
     # The derivative of the root is infinite at 0, but that of squared distances is not.
-    scale = (weights + FAINT_WEIGHT * (weights == 0)).sqrt() / _per_image(photometric_bandwidth, guide).view(-1, 1, 1)
+    scale = (weights + FAINT_WEIGHT * (weights == 0)).sqrt() / per_image(photometric_bandwidth, guide, 3)
     padded = pad_border(guide, size // 2)
     # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
     padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
@@ -121,7 +123,7 @@ def extract_features(
     rows = origin[0] + halo[0] + stride * torch.arange(height, dtype=guide.dtype, device=guide.device)
     columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
     grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
-    coordinates = grid / _per_image(spatial_bandwidth, guide).view(-1, 1, 1)
+    coordinates = grid / per_image(spatial_bandwidth, guide, 3)
     return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
 
 
@@ -186,11 +188,6 @@ def blur(planes: Tensor, sigma: float) -> Tensor:
     size = 2 * margin + 1
     blurred = gaussian_blur2d(pad_border(planes, margin), (size, size), (sigma, sigma))
     return blurred[..., margin:-margin, margin:-margin]
-
-
-def _per_image(value: float | Tensor, like: Tensor) -> Tensor:
-    """A bandwidth as a tensor of shape (1,) or (B,) in the dtype and on the device of ``like``."""
-    return torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1)
 
 
 # The paper's 0.6 applies to its own patch weights, whose squares sum to 0.056; with weights of unit sum the same kernel

@@ -87,6 +87,11 @@ class Kernel:
         return self.factor(self.recipe(guide, origin=origin, halo=halo))
 
     def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n)."""
-        factor, diagonal = nystrom_factor(features, self.landmarks, self.inverse_cholesky, self.completion)
+        """Compute factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n).
+
+        Landmarks with a batch size of 1 serve for all images.
+        """
+        shape = (features.shape[0], -1, -1)
+        landmarks, inverse = self.landmarks.expand(shape), self.inverse_cholesky.expand(shape)
+        factor, diagonal = nystrom_factor(features, landmarks, inverse, self.completion)
         return factor if self.limiter is None else self.limiter @ factor, diagonal

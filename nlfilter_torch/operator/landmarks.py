@@ -60,7 +60,7 @@ def choose_landmarks(
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if count == features.shape[-1] and among.size == 1:
-        return features
+        return features.clone()
     pixels = (
         _candidates_by_weight(weights.mean(0), count, generator)
         if weights is not None and sampling == "kmeans"

@@ -136,6 +136,7 @@ class NonlocalOperator:
         """
         return moved(self, target, dtype)
 
+    @full_precision
     def at(self, features: Tensor) -> Columns:
         """Compute the columns of any points from their own features and from sums over the image.
 
@@ -143,12 +144,20 @@ class NonlocalOperator:
 
         Args:
             features: (B, D, n), of points of this image or another, with the meaning and scale of the features that the
-                operator was made from.
+                operator was made from. A batch of 1, of points or of the operator, serves for all of the other.
 
         Raises:
-            TypeError, ValueError: if ``features`` is not a finite floating-point tensor with the operator's D.
+            TypeError, ValueError: if ``features`` is not a finite floating-point tensor with the operator's D, or its
+                batch size does not fit.
         """
         check_features(features, "features", self.kernel.landmarks.shape[1])
+        images, batch = len(self.factor), len(features)
+        if 1 not in (images, batch) and images != batch:
+            raise ValueError(
+                f"features must have batch size 1 or {images}, like the operator, got {batch}; pass one set of points "
+                "for each image"
+            )
+        features = features if batch > 1 else features.expand(images, -1, -1)
         factor, diagonal = self.kernel.factor(features.to(self.kernel.landmarks))
         return Columns(factor, *self.differentiable_balancing()(factor, diagonal))
 
@@ -231,7 +240,9 @@ class NonlocalOperator:
         if rank is not None:
             check_count(rank, "rank")
         remainder = self.remainder if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(self.factor, self.scaling, remainder, self.size, rank, self.among, self.weights)
+        return compute_spectrum(
+            self.factor, self.scaling, remainder, self.size, rank, self.residual, self.among, self.weights
+        )
 
     @full_precision
     @torch.no_grad()

@@ -82,12 +82,15 @@ class KernelMatrix:
         return self.among.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
 
 
-def isolated(scaling: Tensor, residual: float) -> Tensor:
+def isolated(scaling: Tensor, diagonal: Tensor, residual: float, weights: Tensor | None = None) -> Tensor:
     """Find pixels (B, n) whose affinities to all others sum to less than zero, for a kernel with a unit diagonal.
 
     The diagonal entry of W is d^2 and the other entries of the row sum to 1 - d^2, so d exceeds 1 at these pixels. It
-    must exceed 1 by more than ``residual``, the error of row sums.
+    must exceed 1 by more than ``residual``, the error of row sums. A point that represents only a share w of a pixel
+    has ``d^2 (c + w (1 - c))`` in place of d^2.
     """
+    if weights is not None:
+        scaling = scaling * (diagonal + weights.clamp(max=1.0) * (1 - diagonal)).clamp(min=0.0).sqrt()
     return scaling > 1 + max(EXCESS[scaling.dtype], residual)
 
 
@@ -100,12 +103,14 @@ class PixelScaling:
         completed: whether the kernel has a unit diagonal.
         residual: largest deviation of a row sum from 1.
         before: moments of earlier rounds of balancing, after each of which isolated pixels were removed.
+        least: smallest weight of the points that the moment is a sum over, (B, 1); None means one.
     """
 
     moment: Tensor
     completed: bool
     residual: float = 0.0
     before: tuple[Tensor, ...] = ()
+    least: Tensor | None = None
 
     def __call__(self, factor: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
         """Compute d and r, the diagonal part of W, (B, n), of pixels with factor (B, M, n) and diagonal (B, n).
@@ -116,7 +121,8 @@ class PixelScaling:
         remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
         if not self.completed:
             return scaling, remainder
-        alone = isolated(scaling, self.residual)
+        alone = isolated(scaling, diagonal, self.residual, self.least)
         for total in self.before:
-            alone = alone | isolated(scaling_from_moment(factor, diagonal, total.to(factor)), self.residual)
+            earlier = scaling_from_moment(factor, diagonal, total.to(factor))
+            alone = alone | isolated(earlier, diagonal, self.residual, self.least)
         return torch.where(alone, 0.0, scaling), torch.where(alone, 1.0, remainder)

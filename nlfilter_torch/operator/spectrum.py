@@ -100,6 +100,7 @@ class Spectrum(RitzPairs):
         scaling: d, (B, N).
         size: (H, W).
         largest: the first eigenvalue before it was clamped to 1, (B,).
+        residual: that of the operator, (B,).
         weights: number of pixels that each point represents, (B, N), or None. Eigenvectors are orthonormal in the sum
             over points with these weights.
         among: ranks that the rows of the image are distributed over.
@@ -110,6 +111,7 @@ class Spectrum(RitzPairs):
     scaling: Tensor
     size: tuple[int, int]
     largest: Tensor
+    residual: Tensor
     weights: Tensor | None = None
     among: Communicator = ALONE
 
@@ -146,6 +148,7 @@ class Spectrum(RitzPairs):
         return self._form(torch.linalg.eigh(self.ritz.matrix).eigenvectors.flip(-1))
 
     @cached_property
+    @torch.inference_mode(False)
     @torch.no_grad()
     @full_precision
     def _constant(self) -> Tensor:
@@ -195,7 +198,9 @@ class Spectrum(RitzPairs):
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
         with torch.no_grad():
             ones = self.among.sum(moment(self.factor, self.mass.unsqueeze(1)))  # F 1, (B, M, 1)
-            cluster = self.eigenvalues > 1 - CLUSTER[self.factor.dtype]
+            # The residual is larger if the operator was balanced in float32 and converted to float64.
+            distance = (10 * self.residual).clamp(CLUSTER[self.factor.dtype], CLUSTER[torch.float32])
+            cluster = self.eigenvalues > 1 - distance.unsqueeze(1)
             cluster[:, :1] = True
             target = (vectors.mT @ self.root @ ones).squeeze(2) * cluster  # (B, R)
             mirror = target / target.norm(dim=1, keepdim=True).clamp(min=1e-12)
@@ -217,6 +222,7 @@ def compute_spectrum(
     remainder: Tensor | None,
     size: tuple[int, int],
     rank: int | None,
+    residual: Tensor,
     among: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Spectrum:
@@ -225,17 +231,19 @@ def compute_spectrum(
     count = 1 if remainder is None else 2
     each = root_weighted(scaling, weights)
     pairs = RitzPairs.of_sums(among.sum(compute_grams(factor, each, remainder, count)), factor.dtype)
-    checked = factor.dtype == torch.float32 and not is_hidden(factor)
+    seen = factor.shape[0] > 0 and not is_hidden(factor)
+    checked = factor.dtype == torch.float32 and seen
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
         grams = compute_grams(factor, each, remainder, count, exact=True)
         pairs = RitzPairs.of_sums(among.sum(grams), factor.dtype)
-    shown = factor.shape[1] if is_hidden(factor) else int(pairs.support.sum(1).max())
+    shown = int(pairs.support.sum(1).max()) if seen else factor.shape[1]
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
     # First-order perturbation: the derivative of an eigenvalue is v^T dT v, also for repeated ones.
     vectors = pairs.ritz.vectors
     values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
+    largest = values[:, 0].detach()
     return Spectrum(
-        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, values[:, 0].detach(), weights, among
+        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, largest, residual, weights, among
     )

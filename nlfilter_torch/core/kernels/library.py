@@ -13,9 +13,9 @@ from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from nlfilter_torch.core import instruction_sets
+from nlfilter_torch.core.values import are_derived
 
 SMALL = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
 OPERATORS = torch.library.Library("nlfilter", "DEF")
@@ -96,7 +96,7 @@ def register(
             return definition(*arguments) if found is None else found
 
         def under_autograd(keys: Any, *arguments: Any) -> Any:
-            if _are_derived(arguments):
+            if are_derived(arguments):
                 return definition(*arguments)
             keys = keys & below
             if keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU:  # same as redispatching, but saves 4 us
@@ -116,11 +116,9 @@ def register(
     return decorate
 
 
-# The next two functions run before every product; loops take half the time of generators.
-
-
 def _suit(arguments: Sequence[Any]) -> bool:
     """Whether the kernels support all arguments: all tensors are float32 and not empty."""
+    # Runs before every product; a loop takes half the time of a generator.
     for argument in arguments:
         if isinstance(argument, Tensor):
             if argument.dtype is not torch.float32 or argument.numel() == 0:
@@ -128,17 +126,6 @@ def _suit(arguments: Sequence[Any]) -> bool:
         elif isinstance(argument, list) and not _suit(argument):
             return False
     return True
-
-
-def _are_derived(arguments: Sequence[Any]) -> bool:
-    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
-    if torch.is_grad_enabled():
-        for argument in arguments:
-            if isinstance(argument, Tensor) and argument.requires_grad:
-                return True
-    if forward_ad._current_level < 0:
-        return False
-    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
 
 def by_rows(planes: Tensor) -> Tensor:
