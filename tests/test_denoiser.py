@@ -398,3 +398,24 @@ def test_weights_in_half_precision_denoise_colours(dtype: torch.dtype) -> None:
     with torch.no_grad():
         found = NonlocalDenoiser.trained(dtype=dtype)(noisy, 0.1)
     assert (found - 0.5).std() < 0.04
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_gradient_by_the_noise_where_it_is_zero(channels: int) -> None:
+    network = NonlocalDenoiser.trained(dtype=torch.float64)
+    image = colour("chelsea")[:, :channels, :16, :16].double()
+    direction = torch.ones(1, 1, 16, 16, dtype=torch.float64)
+    level = torch.zeros(1, 1, 16, 16, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(network(image, level).sum(), level)
+    step = 1e-7
+    change = (network(image, step * direction) - network(image, 0 * direction)).sum() / step
+    torch.testing.assert_close((slope * direction).sum(), change.detach(), rtol=1e-3, atol=1e-3)
+
+
+def test_half_precision_has_a_finite_gradient_by_the_noise() -> None:
+    network, image = NonlocalDenoiser.trained().bfloat16(), colour("chelsea")[..., :32, :32].bfloat16()
+    level = torch.full((1, 1, 32, 32), 0.1, dtype=torch.bfloat16)
+    level[..., :5] = 0
+    network(image, level.requires_grad_()).sum().backward()
+    assert level.grad is not None
+    assert level.grad.isfinite().all()

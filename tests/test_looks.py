@@ -239,3 +239,29 @@ def test_the_layer_takes_what_was_found() -> None:
 def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         apply_look(CAT, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("part", ["alpha", "local", "texture"])
+def test_half_precision_pictures_are_computed_in_float32(part: str, dtype: torch.dtype) -> None:
+    exact = CAT.to(dtype).float()
+    parts = {
+        "alpha": torch.tensor([2.5, 1.7, 1.3, 1.0]),
+        "local": torch.full((8,), 0.1),
+        "texture": torch.full((6,), 1.3),
+    }
+    look = Look({part: parts[part]}, num_landmarks=20)
+    expected, found = look(exact), look(exact.to(dtype))
+    assert found.dtype == dtype
+    torch.testing.assert_close(found, expected.to(dtype), atol=0, rtol=0)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(look(exact), expected)
+
+
+@pytest.mark.parametrize(("name", "value"), [("bands", torch.nan), ("curves", torch.inf)])
+def test_parts_that_are_not_finite_are_refused(name: str, value: float) -> None:
+    part = torch.full((7,) if name == "bands" else (3, 17), value)
+    with pytest.raises(ValueError, match=f"{name} must be finite"):
+        Look()(CAT, **{name: part})
+    with pytest.raises(ValueError, match=f"{name} must be finite"):
+        Look({name: part})

@@ -1,5 +1,7 @@
 """Single precision on images and bandwidths that break other implementations: finite results, guarantees hold."""
 
+import subprocess
+import sys
 import warnings
 
 import pytest
@@ -80,3 +82,28 @@ def test_values_far_outside_of_0_to_1() -> None:
     with pytest.warns(UserWarning, match="guide must be in"):
         shifted = nonlocal_operator(image + 100, photometric_bandwidth=0.1, landmarks="uniform") @ image
     torch.testing.assert_close(shifted, plain, atol=2e-3, rtol=0)
+
+
+FIRST_CALLS = """
+import contextlib
+import torch
+from nlfilter_torch import denoise, enhance
+image = torch.linspace(0.1, 0.9, 3 * 48 * 48, dtype=torch.float64).view(1, 3, 48, 48)
+calls = [
+    lambda image: denoise(image, noise_level=0.1),
+    lambda image: enhance(image, torch.tensor([2.0, 2.0, 1.0, 1.0]), viewing_size=0.0008, num_landmarks=20),
+]
+for call in calls:
+    with FIRST, contextlib.suppress(RuntimeError):  # kornia refuses another default device
+        call(image.to(DEVICE))
+    call(image.clone().requires_grad_()).sum().backward()
+"""
+
+
+@pytest.mark.parametrize(
+    ("first", "device"), [("torch.inference_mode()", "'cpu'"), ("torch.device('meta')", "'meta'")], ids=str
+)
+def test_later_calls_do_not_depend_on_the_mode_of_the_first(first: str, device: str) -> None:
+    """Constants are computed in the first call, in a process of its own here."""
+    code = FIRST_CALLS.replace("FIRST", first).replace("DEVICE", device)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)

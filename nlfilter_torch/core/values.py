@@ -5,8 +5,9 @@ without data: on the device "meta", as fake tensors, under ``torch.compile`` and
 of values are skipped, and iterations run a fixed number of steps.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import lru_cache, wraps
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -14,6 +15,8 @@ from torch._C._functorch import is_functorch_wrapped_tensor, peek_interpreter_st
 from torch._subclasses.fake_tensor import FakeTensor
 from torch.autograd import forward_ad
 
+P = ParamSpec("P")
+R = TypeVar("R")
 _FAKE = torch._C._TorchDispatchModeKey.FAKE
 
 
@@ -25,6 +28,23 @@ def is_hidden(tensor: Tensor) -> bool:
         or is_functorch_wrapped_tensor(tensor)
         or is_fake(tensor)
     )
+
+
+def cached_constants(function: Callable[P, R]) -> Callable[P, R]:
+    """Cache tensors that a function computes from hashable arguments, for later calls in any mode.
+
+    Tensors are created on the CPU and are ordinary ones, even in inference mode or with another default device. Fake
+    tensors are not cached.
+    """
+    cached = cast(Callable[P, R], lru_cache(maxsize=8)(function))
+
+    @wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        with torch.inference_mode(False), torch.device("cpu"):
+            fake = torch._C._get_dispatch_mode(_FAKE) is not None
+            return function(*args, **kwargs) if fake else cached(*args, **kwargs)
+
+    return wrapper
 
 
 def is_fake(tensor: Tensor) -> bool:

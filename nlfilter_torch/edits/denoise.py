@@ -4,7 +4,6 @@ Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
 import inspect
-from functools import cache
 from typing import Any, Literal
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count, check_photograph
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.core.values import is_fake
+from nlfilter_torch.core.values import cached_constants
 from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.noise import Noise, noise_of
@@ -121,15 +120,10 @@ def fit_denoise(
     return _by_rule(source, level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1), **options)
 
 
-@cache
-def _trained_network(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
+@cached_constants
+def _network(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
+    """Return the trained network with frozen weights."""
     return NonlocalDenoiser.trained(device=device, dtype=dtype).requires_grad_(False)
-
-
-def _network(image: Tensor) -> NonlocalDenoiser:
-    """Return the trained network with frozen weights, read once per device and dtype."""
-    read = _trained_network.__wrapped__ if is_fake(image) else _trained_network  # fake weights must not be cached
-    return read(image.device, image.dtype)
 
 
 def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
@@ -143,7 +137,7 @@ def _by_network(source: Source, noise: float | Tensor | Noise, strength: float |
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
         level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
-        return image - _network(image).estimate_in_tiles(image, level, turns=1, inner=inner)
+        return image - _network(image.device, image.dtype).estimate_in_tiles(image, level, turns=1, inner=inner)
 
     return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
 

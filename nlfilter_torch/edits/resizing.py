@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable, Iterator
-from functools import lru_cache, partial
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from nlfilter_torch.core.values import cached_constants
 
 Read = Callable[[int, int], Tensor]  # returns the rows (B, C, n, W) of a picture from start to stop
 BLOCK = 64  # rows resized at once
@@ -60,7 +62,7 @@ def _part(rows: Callable[[], Tensor], weights: Tensor, across: tuple[slice, Tens
     return torch.einsum("rn,bcnw->bcrw", weights.to(planes), planes)
 
 
-@lru_cache(maxsize=8)  # strips of one picture have the same columns
+@cached_constants  # strips of one picture have the same columns
 def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tensor]:
     """Return the part of an axis that positions of the resized axis depend on, and weights (places, part) in float64.
 

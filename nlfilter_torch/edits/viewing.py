@@ -16,13 +16,13 @@ reduced, is nearly the small result, which the editor shows while a slider moves
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.values import cached_constants
 from nlfilter_torch.edits.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
 from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes, corner
 from nlfilter_torch.edits.resizing import interpolation, resized
@@ -224,7 +224,7 @@ def _smoothed(planes: Tensor, kernel: Tensor, dim: int) -> Tensor:
     return found
 
 
-@lru_cache(maxsize=8)
+@cached_constants
 def _round_trip_kernel(stride: float) -> Tensor:
     """Kernel (2 ROUND_TRIP_RADIUS + 1,) of :func:`enlarged_and_reduced` along an axis, averaged over the phases."""
     length, places = 64, range(28, 36)

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_tensor
+from nlfilter_torch.core.checks import check_dtype, check_finite, check_tensor
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.filtering.local_tone import STRENGTHS, LocalCurves, mean_ramps
@@ -38,6 +38,7 @@ NAMES = tuple(SHAPES)
 IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0}
 
 
+@full_precision
 def filter_look(image: Tensor, parts: Mapping[str, Tensor], operator: NonlocalOperator | None) -> Tensor:
     """An image (B, 3, H, W) under a look of all :data:`NAMES`, whose parts may differ between the images.
 
@@ -66,6 +67,8 @@ def filter_look(image: Tensor, parts: Mapping[str, Tensor], operator: NonlocalOp
 def check_part(value: Tensor, name: str, batch: int) -> None:
     """Raise unless a part of a look has its shape."""
     check_tensor(value, name)
+    check_dtype(value, name, f"convert it with {name}.float()")
+    check_finite(value, name)
     shape, wanted = tuple(value.shape), SHAPES[name]
     own = shape[-len(wanted) :]
     fits = len(own) == len(wanted) and all(

@@ -18,7 +18,7 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.core.precision import as_given, full_precision
+from nlfilter_torch.core.precision import as_given, full_precision, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
@@ -250,9 +250,12 @@ def split_colours(image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     if image.shape[1] == 1:
         nothing = torch.zeros_like(image)
         return torch.cat([image, nothing, nothing], dim=1), torch.cat([noise, torch.zeros_like(noise)], dim=1)
-    variance = noise.expand(-1, 3, -1, -1).square()
+    planes = torch.einsum("pc,bchw->bphw", _mixture(image), image)
+    if noise.shape[1] == 1:
+        return planes, torch.cat([noise / math.sqrt(3), noise], dim=1)
+    variance = noise.to(working_dtype(noise)).square()
     deviation = torch.cat([variance.sum(1, keepdim=True) / 9, variance.mean(1, keepdim=True)], dim=1)
-    return torch.einsum("pc,bchw->bphw", _mixture(image), image), deviation.clamp(min=1e-30).sqrt()
+    return planes, deviation.clamp(min=1e-30).sqrt().to(noise)
 
 
 @full_precision

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_count, check_image
+from nlfilter_torch.core.precision import as_given, working_dtype
 from nlfilter_torch.filtering.local_tone import STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
 from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
@@ -96,7 +97,8 @@ class Look(nn.Module):
         check_image(image, "image", channels=3)
         check_learn(list(parts), NAMES, "parts")
         used = {name: parts.get(name, getattr(self, name)) for name in NAMES}
+        exact = image.to(working_dtype(image))
         if operator is None and acts(used["alpha"]):
             near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
-            operator = nonlocal_operator(reduce_channels(image, "luminance"), **near | self.options)
-        return filter_look(image, used, operator)
+            operator = nonlocal_operator(reduce_channels(exact, "luminance"), **near | self.options)
+        return as_given(filter_look(exact, used, operator), image)
