@@ -248,11 +248,12 @@ def test_files_of_other_types_are_mentioned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fill(tmp_path / "in", 1)
-    for name in ("a.HEIC", "b.heic", "notes", "000.png.json", ".hidden.txt"):
+    for name in ("a.HEIC", "b.heic", "notes", "000.png.json", ".hidden.txt", "._000.png"):
         (tmp_path / "in" / name).touch()
     (tmp_path / "in" / "folder.dng").mkdir()
     monkeypatch.setattr("nlfilter_torch.cli.folders.edit_folder", lambda *_, **__: None)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 0
+    assert [path.name for path in pictures(tmp_path / "in")] == ["000.png"]
     assert capsys.readouterr().err == (
         "nlfilter-torch: left out 2 .heic, 1 without a suffix; convert them to PNG, JPEG, TIFF, WebP or AVIF if they "
         "are photographs\n"

@@ -193,7 +193,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),
         (["--bandwidth", "inf"], "--bandwidth must be a positive number of grey levels"),
         (["--spatial-bandwidth", "-2"], "--spatial-bandwidth must be a positive number of pixels, such as 20, or none"),
-        (["--patch-size", "4"], "patch_size must be odd and at least 1, got 4; try 5"),
+        (["--patch-size", "4"], "--patch-size must be odd and at least 1, got 4; try 5"),
         (["--landmarks", "0"], "Invalid value for '--landmarks': "),
         (["--sampling", "best"], "Invalid value for '--sampling': 'best' is not one of"),
         (["--channels", "red"], "Invalid value for '--channels': 'red' is not one of"),

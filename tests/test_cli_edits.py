@@ -199,6 +199,25 @@ def test_rectangles() -> None:
     assert Rectangle.parse("63,47,1,1:", "--region", (48, 64)).note == ""
 
 
+def test_percentages_are_exact() -> None:
+    for percent in range(100):
+        found = Rectangle.parse(f"{percent}%,{percent}%,{100 - percent}%,{100 - percent}%", "--region", (100, 300))
+        assert (found.rows, found.columns) == (slice(percent, 100), slice(3 * percent, 300))
+
+
+@pytest.mark.usefixtures("tiled")
+@pytest.mark.parametrize("arguments", [("look",), ("tone", "--contrast", 1), ("detail", "--alpha", "1,1")])
+def test_an_edit_that_changes_nothing_says_so(
+    photo: Path, tmp_path: Path, arguments: tuple[object, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, *options = map(str, arguments)
+    assert main([verb, str(photo), str(tmp_path / "out.png"), *options]) == 0
+    note = f"nlfilter-torch: note: {verb} changes nothing with these options: the photograph is written as it is\n"
+    assert note in capsys.readouterr().err
+    assert main(["detail", str(photo), str(tmp_path / "out.png"), "--alpha", "1,1", "--region", "2,2,5,5:2,1"]) == 0
+    assert "changes nothing" not in capsys.readouterr().err
+
+
 def test_what_is_transparent_in_a_mask_is_not_selected(tmp_path: Path) -> None:
     planes = torch.ones(1, 3, HEIGHT, WIDTH)
     write_photograph(Photograph(planes, "uint8", box(8, 10, 6, 8)), tmp_path / "layer.png")

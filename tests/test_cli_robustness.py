@@ -1,6 +1,7 @@
 """The command line with bad numbers, odd files, links and signals: one sentence, and no files left."""
 
 import ast
+import errno
 import fcntl
 import importlib
 import json
@@ -376,3 +377,32 @@ def test_public_names_are_one_table() -> None:
         assert getattr(nlfilter_torch, name).__name__ == name
     with pytest.raises(AttributeError, match="has no attribute 'sharpenn'"):
         _ = nlfilter_torch.sharpenn
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="is a device of Linux")
+def test_output_that_cannot_be_written() -> None:
+    with open("/dev/full", "w") as full:
+        arguments = [sys.executable, "-m", "nlfilter_torch", "presets"]
+        told = subprocess.run(arguments, stdout=full, stderr=subprocess.PIPE, text=True)
+    sentence = "the output cannot be written: No space left on device; free some space there"
+    assert (told.returncode, told.stderr) == (2, f"nlfilter-torch: {sentence}\n")
+
+
+def test_errors_of_the_system(photo: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for error, sentence in (
+        (OSError(errno.ENOSPC, "Full", "out"), "out cannot be written: Full; free some space there"),
+        (OSError(errno.EIO, "Damaged"), "reading or writing failed: Damaged; check the disk, and try again"),
+        (OSError(errno.EACCES, "Closed", "out"), "out: Closed; check the name and the permissions"),
+        (OSError("Said already"), "Said already"),
+    ):
+
+        def fail(*_: object, error: OSError = error, **__: object) -> None:
+            raise error
+
+        monkeypatch.setattr("nlfilter_torch.cli.editing.edit_file", fail)
+        assert refused(capsys, "tone", photo, photo.with_name("out.png")) == f"nlfilter-torch: {sentence}\n"
+
+
+def test_a_command_without_presets_says_where_they_are(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = refused(capsys, "look", photo, photo.with_name("out.png"), "--preset", "crisp")
+    assert told == "nlfilter-torch: No such option: --preset; use nlfilter-torch detail or apply, which have it\n"

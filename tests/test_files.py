@@ -391,6 +391,15 @@ def test_a_read_only_folder_is_no_output(tmp_path: Path, monkeypatch: pytest.Mon
         check_folder(tmp_path)
 
 
+def test_a_read_only_file_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "out.png").write_bytes(b"kept")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).is_dir())  # root may write anywhere
+    with pytest.raises(ValueError, match=r"out\.png is read-only; allow writing to it, or choose another name"):
+        write_photograph(photograph(stored_values(3, "uint8")), tmp_path / "out.png")
+    assert (tmp_path / "out.png").read_bytes() == b"kept"
+    write_photograph(photograph(stored_values(3, "uint8")), tmp_path / "new.png")
+
+
 def test_output_folders(tmp_path: Path) -> None:
     check_folder(tmp_path)
     check_folder(tmp_path / "new")

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import skimage.data
 import tifffile
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 
 from nlfilter_torch.cli import main
 from nlfilter_torch.io.cameras import is_heic
 from nlfilter_torch.io.photographs import TooLarge, read_photograph
 
 SCENE = skimage.data.astronaut()[60:124, 130:210]
+PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 # From CIE XYZ to linear sRGB, the colour space of this camera.
 SRGB = np.linalg.inv([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 
@@ -103,6 +104,23 @@ def test_deep_heic_is_read_at_sixteen_bits(tmp_path: Path, monkeypatch: pytest.M
     assert found.depth == "uint16"
     assert np.abs(found.pixels[0].permute(1, 2, 0).numpy() - grey / 65535).max() < 4 / 1023
     assert float(found.pixels.max()) == 1
+
+
+def test_colours_that_heic_describes_by_numbers(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    picture = heif.from_pillow(Image.fromarray(SCENE))
+    picture.save(tmp_path / "a.heic", color_primaries=12, transfer_characteristics=13)
+    with pytest.warns(
+        UserWarning, match=r"a\.heic has Display P3 without a colour profile, which the output will not say"
+    ):
+        assert read_photograph(tmp_path / "a.heic").icc is None
+    picture.save(tmp_path / "b.heic", color_primaries=9, transfer_characteristics=16)
+    with pytest.raises(ValueError, match=r"b\.heic is an HDR picture \(PQ\), which is not supported; convert it"):
+        read_photograph(tmp_path / "b.heic")
+    with_profile = Image.fromarray(SCENE)
+    with_profile.info["icc_profile"] = PROFILE
+    heif.from_pillow(with_profile).save(tmp_path / "c.heic")
+    assert read_photograph(tmp_path / "c.heic").icc == PROFILE
 
 
 def test_avif_is_no_heic() -> None:

@@ -1,11 +1,12 @@
 """XMP and the print resolution are copied from every file type to every other, in memory and in tiles."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from nlfilter_torch.cli import main
 from nlfilter_torch.io.extras import JPEG_LIMIT, Extras, read_extras
@@ -56,6 +57,17 @@ def test_what_other_programs_wrote(tmp_path: Path) -> None:
     assert read_extras(tmp_path / "plain.tif") == Extras()
 
 
+@pytest.mark.parametrize("depth", ["uint8", "uint16"])
+def test_xmp_behind_the_pixels_of_a_png(tmp_path: Path, depth: str) -> None:
+    path = tmp_path / "a.png"
+    write_photograph(Photograph(cat(4), depth), path)  # type: ignore[arg-type]
+    whole, text = path.read_bytes(), io.BytesIO()
+    PngImagePlugin.putchunk(text, b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + XMP)
+    path.write_bytes(whole[:-12] + text.getvalue() + whole[-12:])
+    assert read_extras(path).xmp == UPRIGHT
+    assert read_photograph(path).extras.xmp == UPRIGHT
+
+
 @pytest.mark.usefixtures("tiled")
 @pytest.mark.parametrize(("name", "depth"), [("in.tif", "uint16"), ("in.jpg", "uint8")])
 def test_commands_carry_them(tmp_path: Path, name: str, depth: str) -> None:
@@ -74,7 +86,8 @@ def test_fields_without_sense_are_dropped(tmp_path: Path) -> None:
 
 def test_what_a_file_cannot_hold_is_left_out(tmp_path: Path) -> None:
     long = Extras(b"<x>" + b" " * JPEG_LIMIT + b"</x>")
-    write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.jpg")
+    with pytest.warns(UserWarning, match="is left out, as JPEG holds at most 65000; write a PNG, TIFF, WebP or AVIF"):
+        write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.jpg")
     assert read_extras(tmp_path / "a.jpg") == Extras()
     write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.png")
     assert read_extras(tmp_path / "a.png").xmp == long.xmp

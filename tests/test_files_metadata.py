@@ -1,13 +1,15 @@
 """Metadata of image files: invalid fields are ignored, and the others are kept."""
 
+import io
 import struct
 from pathlib import Path
 
 import pytest
 import tifffile
 import torch
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, PngImagePlugin
 
+from nlfilter_torch.io.exif import writable
 from nlfilter_torch.io.photographs import read_photograph, write_photograph
 from tests.test_files import photograph, stored_values, tags
 
@@ -60,11 +62,113 @@ def test_tags_of_tiff_without_sense_are_ignored(tmp_path: Path, tag: tuple[objec
     assert found.icc is None
 
 
-def test_text_beyond_ascii_is_kept_in_tiff(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "depth"),
+    [
+        (".png", "uint8"),
+        (".png", "uint16"),
+        (".jpg", "uint8"),
+        (".tif", "uint8"),
+        (".webp", "uint8"),
+        (".avif", "uint8"),
+    ],
+)
+def test_text_beyond_ascii_is_kept(tmp_path: Path, suffix: str, depth: str) -> None:
     exif = Image.Exif()
-    exif[ExifTags.Base.Artist] = "Jörg"
+    exif[ExifTags.Base.Artist] = "Jörg".encode()
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[ExifTags.Base.LensModel] = writable("Görlitz")  # latin-1
+    exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSMapDatum] = "Süd".encode()
+    places = (ExifTags.Base.Artist, ExifTags.Base.LensModel, ExifTags.GPS.GPSMapDatum)
+    write_photograph(photograph(stored_values(3, depth), exif=exif.tobytes()), tmp_path / "in.png")
+    write_photograph(read_photograph(tmp_path / "in.png"), tmp_path / f"between{suffix}")
+    write_photograph(read_photograph(tmp_path / f"between{suffix}"), tmp_path / f"out{suffix}")
+    found = read_photograph(tmp_path / f"out{suffix}").exif
+    texts = [table[place] for table, place in zip(tags(found), places, strict=True)]
+    # Pillow reads latin-1.
+    assert [str(text).encode("latin-1") for text in texts] == ["Jörg".encode(), b"G\xf6rlitz", "Süd".encode()]
+
+
+def test_text_beyond_ascii_is_kept_beside_invalid_fields(tmp_path: Path) -> None:
+    exif = odd_exif("rational").replace(b"Maker\0", b"M\xe4her\0")
+    Image.fromarray(stored_values(3, "uint8")).save(tmp_path / "in.png", exif=exif)
+    main, _, _ = tags(read_photograph(tmp_path / "in.png").exif)
+    assert main[ExifTags.Base.Make] == "Mäher"
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_the_table_inside_the_table_of_exif_is_kept(tmp_path: Path, suffix: str) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {1: "R98", 2: b"0100"}
     write_photograph(photograph(stored_values(3, "uint8"), exif=exif.tobytes()), tmp_path / "in.png")
-    found = read_photograph(tmp_path / "in.png")
-    write_photograph(found, tmp_path / "out.tif")
-    main, _, _ = tags(read_photograph(tmp_path / "out.tif").exif)
-    assert main[ExifTags.Base.Artist] == tags(found.exif)[0][ExifTags.Base.Artist]
+    write_photograph(read_photograph(tmp_path / "in.png"), tmp_path / f"out{suffix}")
+    with Image.open(tmp_path / f"out{suffix}") as image:
+        assert image.getexif().get_ifd(ExifTags.IFD.Interop) == {1: "R98", 2: b"0100"}
+
+
+def test_a_pointer_of_exif_to_nothing_is_left_out(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[ExifTags.IFD.Interop], details[ExifTags.Base.LensModel] = 9999, "a lens"
+    write_photograph(photograph(stored_values(3, "uint8"), exif=exif.tobytes()), tmp_path / "out.tif")
+    with Image.open(tmp_path / "out.tif") as image:
+        assert image.getexif().get_ifd(ExifTags.IFD.Exif) == {ExifTags.Base.LensModel: "a lens"}
+
+
+# --- colours described by numbers
+
+
+def with_chunk(path: Path, name: bytes, content: bytes) -> None:
+    """Write a PNG file with a chunk before the pixels."""
+    Image.fromarray(stored_values(3, "uint8")).save(path)
+    chunk, whole = io.BytesIO(), path.read_bytes()
+    PngImagePlugin.putchunk(chunk, name, content)
+    path.write_bytes(whole[:33] + chunk.getvalue() + whole[33:])
+
+
+WIDE = (31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        (b"gAMA", struct.pack(">I", 100_000), "has a gamma of 1 without a colour profile, which the output will not"),
+        (b"cHRM", struct.pack(">8I", *WIDE), "has other primaries than sRGB without a colour profile"),
+        (b"cICP", bytes((12, 13, 0, 1)), "has Display P3 without a colour profile"),
+        (b"cICP", bytes((9, 8, 0, 1)), "has BT.2020 and linear light without a colour profile"),
+    ],
+)
+def test_colours_that_png_describes_by_numbers(tmp_path: Path, name: bytes, content: bytes, sentence: str) -> None:
+    path = tmp_path / "in.png"
+    with_chunk(path, name, content)
+    with pytest.warns(UserWarning, match=sentence):
+        found = read_photograph(path)
+    assert torch.equal(found.pixels, photograph(stored_values(3, "uint8")).pixels)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        (b"gAMA", struct.pack(">I", 45_455)),
+        (b"gAMA", bytes(4)),
+        (b"cHRM", struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)),
+        (b"cICP", bytes((1, 13, 0, 1))),
+        (b"cICP", bytes((2, 2, 0, 1))),
+    ],
+)
+def test_usual_colours_of_png_cause_no_warning(tmp_path: Path, name: bytes, content: bytes) -> None:
+    with_chunk(tmp_path / "in.png", name, content)
+    read_photograph(tmp_path / "in.png")
+
+
+def test_colours_that_avif_describes_by_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "in.avif"
+    Image.fromarray(stored_values(3, "uint8")).save(path)
+    whole = path.read_bytes()
+    place = whole.index(b"colrnclx") + 8
+    path.write_bytes(whole[:place] + struct.pack(">HH", 12, 13) + whole[place + 4 :])
+    with pytest.warns(UserWarning, match=r"in\.avif has Display P3 without a colour profile"):
+        read_photograph(path)
+    path.write_bytes(whole[:place] + struct.pack(">HH", 9, 18) + whole[place + 4 :])
+    with pytest.raises(ValueError, match=r"in\.avif is an HDR picture \(HLG\), which is not supported; convert it"):
+        read_photograph(path)

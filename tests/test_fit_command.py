@@ -171,8 +171,9 @@ def test_it_fits_folders_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture
     for command in ("detail", "apply"):
         assert main([command, str(before), str(out), "--preset", str(look)]) == 0
         assert (read_photograph(out).pixels - in_bytes(CUP**0.6)).abs().mean() < 2 / 255
-    assert main(["detail", str(before), str(out), "--preset", str(look), "--alpha", "1,2"]) == 2
-    assert "must not be combined with other options of detail" in capsys.readouterr().err
+    for sliders in ("1,2", "2.2,2.2,2.2,1"):  # the latter are the default
+        assert main(["detail", str(before), str(out), "--preset", str(look), "--alpha", sliders]) == 2
+        assert "must not be combined with other options of detail" in capsys.readouterr().err
 
 
 def test_it_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -287,3 +288,33 @@ def test_large_photographs_are_judged_at_the_viewing_size(
     assert fit(before, before.with_name("after.png"), before.with_name("look.json"), "--preview", seen) == 0
     assert 2500 < read_photograph(seen).pixels[0, 0].numel() / 4 < 3500 < height * width
     assert float(re.search(r"explained: ([\d.]+) %", capsys.readouterr().out)[1]) > 99  # type: ignore[index]
+
+
+def test_pairs_in_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after, look = tmp_path / "before", tmp_path / "after", tmp_path / "look.json"
+    for folder in (before, after):
+        (folder / "d.png").mkdir(parents=True)
+        (folder / "._cat.png").write_bytes(b"of macOS")
+    for folder, name, image in (
+        (before, "cat.png", CAT),
+        (after, "cat.png", CAT**0.6),
+        (after, "cat.tif", 1 - CAT),
+        (before, "cup.png", CUP),
+        (after, "cup.tif", CUP**0.6),
+    ):
+        write_photograph(Photograph(image), folder / name)
+    assert fit(before, after, look) == 0
+    assert float(capsys.readouterr().out.split("explained: ")[1].split(" %")[0]) > 98
+    look.unlink()
+
+    def refused() -> str:
+        assert fit(before, after, look) == 2
+        assert not look.exists()
+        return capsys.readouterr().err
+
+    write_photograph(Photograph(CUP), after / "cup.jpg")
+    sentence = "must hold one photograph of the name of cup.png, got cup.jpg and cup.tif; remove all but one"
+    assert f"{after} {sentence}" in refused()
+    (after / "cup.jpg").unlink()
+    write_photograph(Photograph(CUP), before / "cup.jpg")
+    assert f"{before} must hold one photograph for {after / 'cup.tif'}, got cup.jpg and cup.png; remove" in refused()

@@ -227,11 +227,13 @@ def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     for _ in range(2):  # the folder may be there
         assert main([*arguments, "--references", "2"]) == 0
     assert capsys.readouterr().out.splitlines()[0] == f"4 frames in {tmp_path / 'out'}"
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.tif", "3.png"]
+    edited = sorted((tmp_path / "out").glob("[0-9]*"))
+    assert [path.name for path in edited] == ["0.png", "1.png", "2.tif", "3.png"]
+    assert [path.name for path in (tmp_path / "out").iterdir() if path not in edited] == [".nlfilter-frames.json"]
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").glob("[0-9]*"))]
     recipe = Recipe((Step("detail", alpha=(3.0, 3.0, 1.0), landmarks=40),))
     edit = FilmEdit(recipe, [rows_of(stored[0]), rows_of(stored[3])], Passes("float32"))
-    for path, frame in zip(sorted((tmp_path / "out").iterdir()), stored, strict=True):
+    for path, frame in zip(edited, stored, strict=True):
         found = read_photograph(path)
         assert np.abs(rows_of(found.pixels) - edit(rows_of(frame)).clip(0, 1)).max() < 0.6 / 255
         assert found.depth == ("uint16" if path.suffix == ".tif" else "uint8")
@@ -246,7 +248,7 @@ def test_frames_by_every_preset(name: str, tmp_path: Path) -> None:
     arguments = ["frames", str(tmp_path / "film"), str(tmp_path / "out"), "--landmarks", "40", "--references", "1"]
     assert main([*arguments, "--preset", name]) == 0
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").iterdir())]
-    paths = sorted((tmp_path / "out").iterdir())
+    paths = sorted((tmp_path / "out").glob("[0-9]*"))
     step = preset.step.changed(landmarks=40, spatial_bandwidth="none")
     wanted = apply_step(step, stored[0])  # the frame that the filter was fitted to
     assert (read_photograph(paths[0]).pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
@@ -270,3 +272,63 @@ def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "is a file, not a folder" in refused(tmp_path / "film", tmp_path / "film" / "a.png")
     assert "must have the size and channels of the first frame" in refused(tmp_path / "film", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> Path:
+    """A folder of two frames, a.png and b.png."""
+    (tmp_path / "shots").mkdir()
+    for name, frame in zip("ab", pan(2, 3, 20, 24), strict=True):
+        write_photograph(Photograph(frame), tmp_path / "shots" / f"{name}.png")
+    return tmp_path / "shots"
+
+
+def edit_frames(source: Path, target: Path) -> int:
+    return main(["frames", str(source), str(target), "--landmarks", "20", "--references", "1"])
+
+
+def test_files_of_others_are_not_replaced(shots: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = shots.with_name("out")
+    out.mkdir()
+    (out / "b.png").write_bytes(b"of another program")
+    assert edit_frames(shots, out) == 2
+    assert f"{out} already contains b.png, which this command did not write; name a" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["b.png"]
+    assert (out / "b.png").read_bytes() == b"of another program"
+    (out / "b.png").unlink()
+    assert edit_frames(shots, out) == 0
+    shots.joinpath("b.png").rename(shots / "c.png")
+    (out / "c.png").touch()
+    assert edit_frames(shots, out) == 2
+    assert "already contains c.png" in capsys.readouterr().err
+    (out / "c.png").unlink()
+    for _ in range(2):
+        assert edit_frames(shots, out) == 0
+    (out / ".nlfilter-frames.json").write_text("5")
+    assert edit_frames(shots, out) == 2
+
+
+def test_links_to_frames_are_not_followed(shots: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, before = shots.with_name("out"), shots.joinpath("b.png").read_bytes()
+    assert edit_frames(shots, out) == 0
+    (out / "b.png").unlink()
+    (out / "b.png").symlink_to(shots / "b.png")
+    assert edit_frames(shots, out) == 2
+    assert f"b.png is a link to {shots.resolve() / 'b.png'}, which is one of the frames" in capsys.readouterr().err
+    assert (shots / "b.png").read_bytes() == before
+
+
+def test_what_is_beside_the_output_does_not_matter(shots: Path) -> None:
+    (shots.parent / "a.png").mkdir()
+    (shots / "._a.png").write_bytes(b"of macOS")
+    assert edit_frames(shots, shots.with_name("out")) == 0
+    assert sorted(path.name for path in shots.with_name("out").glob("*.png")) == ["a.png", "b.png"]
+
+
+def test_a_first_frame_that_cannot_be_written_leaves_no_folder(shots: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in list(shots.iterdir()):
+        write_photograph(Photograph(read_photograph(path).pixels, "uint16"), path)
+        path.rename(path.with_suffix(".jpg"))
+    assert edit_frames(shots, shots.with_name("out")) == 2
+    assert "JPEG has no 16 bits per channel" in capsys.readouterr().err
+    assert not shots.with_name("out").exists()

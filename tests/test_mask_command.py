@@ -86,6 +86,7 @@ def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         ([], "give --region X,Y,W,H or --mask FILE to mark part of the object"),
         (["--region", "70,60,20,20"], "--region must lie within the photograph"),
         (["--region", REGION, "--background", REGION], "background must hold a painted pixel outside the scribbles"),
+        (["--region", REGION, "--depth", "float"], "cannot hold this picture: PNG has no floats per channel"),
         (["--region", REGION, "--background", "0,0,0,0"], "--background must be at least 1 pixel wide and high"),
     ],
 )
@@ -95,3 +96,30 @@ def test_errors(
     assert main(["mask", str(photograph), str(tmp_path / "out.png"), *options]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out.png").exists()
+
+
+@pytest.mark.usefixtures("tiled")
+def test_depths_of_floats(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for depth in ("8", "16"):
+        assert run(photograph, tmp_path / "out.pfm", "--depth", depth) == 2
+        told = capsys.readouterr().err
+        assert f"--depth must be float for a .pfm file, got {depth}; leave it out, or write a .tif or .png file" in told
+        assert not (tmp_path / "out.pfm").exists()
+    assert run(photograph, tmp_path / "out.pfm", "--depth", "float") == 0
+
+
+def test_channels_of_unsupported_types_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    signed, plain, preset = tmp_path / "signed.tif", tmp_path / "plain.tif", tmp_path / "look.json"
+    tifffile.imwrite(signed, np.full(SIZE, 9, np.int16))
+    tifffile.imwrite(plain, np.full(SIZE, 9, np.uint16))
+    preset.write_text('{"alpha": [2, 1]}')
+    tiles = ("--memory", "0.001")
+    for arguments in (
+        ("mask", signed, tmp_path / "out.png", "--region", REGION, *tiles),
+        ("apply", plain, tmp_path / "out.png", "--preset", preset, "--mask", signed, *tiles),
+        ("detail", plain, tmp_path / "out.png", "--mask", signed, *tiles),
+    ):
+        assert main([str(argument) for argument in arguments]) == 2
+        told = capsys.readouterr().err
+        assert f"{signed} stores its channels as int16, which is not supported; convert it" in told
+        assert not (tmp_path / "out.png").exists()

@@ -162,10 +162,11 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("nlfilter_torch.tiled.tiles.TemporaryFile", lambda **_: Full())
-    sentence = "No space left on device, for a temporary file of 0.0 GB between two steps of the edit"
+    sentence = "No space left on device, for a temporary file of 1 MB"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)
     assert raised.value.filename == str(tmp_path)
+    assert raised.value.errno == errno.ENOSPC
 
 
 def test_negative_regions_come_with_regions_of_their_number() -> None:

@@ -1,5 +1,6 @@
 """The assembled command line, and how it reports invalid input."""
 
+import errno
 import math
 import reprlib
 import sys
@@ -25,6 +26,7 @@ from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 from nlfilter_torch.edits.parameters import EDITS
 
 NAME = "nlfilter-torch"
+FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Verb(TyperCommand):
@@ -96,16 +98,28 @@ def run(arguments: list[str] | None = None) -> int:
         try:
             status = app(args=arguments or ["--help"], prog_name=NAME, standalone_mode=False)
         except typer.TyperException as error:  # a wrong option or argument
-            return _refuse(error.format_message())
-        except OSError as error:  # the library's own sentence, or the system's code, file and message
-            ours = error.filename is None or error.strerror is None
-            told = str(error) if ours else f"{error.filename}: {error.strerror}; check the name and the permissions"
-            return _refuse(told)
+            message = error.format_message()
+            if message.startswith("No such option: --preset"):
+                message = "No such option: --preset; use nlfilter-torch detail or apply, which have it"
+            return _refuse(message)
+        except OSError as error:
+            return _refuse(_sentence(error))
         except (ValueError, MemoryError) as error:  # a bad file or value, found by the library
             return _refuse(str(error))
     if status == INTERRUPTED:
         return tell()
     return status if isinstance(status, int) else 0
+
+
+def _sentence(error: OSError) -> str:
+    """The library's own sentence, or one made of the system's code, file and message."""
+    if error.strerror is None:
+        return str(error)
+    if error.errno in FULL:
+        return f"{error.filename or 'the output'} cannot be written: {error.strerror}; free some space there"
+    if error.filename is None:
+        return f"reading or writing failed: {error.strerror}; check the disk, and try again"
+    return f"{error.filename}: {error.strerror}; check the name and the permissions"
 
 
 def _refuse(message: str) -> int:

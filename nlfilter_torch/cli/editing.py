@@ -129,6 +129,7 @@ class Job:
     def open(self, path: Path) -> StoredPicture:
         """Open another picture to be read by rows; it is closed at the end of the job."""
         found = self.files.enter_context(open_picture(path, self.memory))
+        check_depth(path, found.rows.dtype)
         self.memory -= found.cached
         return found
 

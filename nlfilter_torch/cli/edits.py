@@ -158,13 +158,21 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[.
 def command(edit: Edit) -> Callable[..., None]:
     """Create the command of an edit."""
 
-    def run(source: str, target: str, **given: Any) -> None:
-        edit_photograph(edit.name, source, target, **given)
+    def run(source: str, target: str, *, context: typer.Context, **given: Any) -> None:
+        edit_photograph(edit.name, source, target, typed=typed_options(context, given), **given)
 
     run.__name__, run.__doc__ = edit.name, edit.help
-    run.__signature__ = signature(edit)  # type: ignore[attr-defined]  # read by typer
+    found = signature(edit)
+    whole = [*found.parameters.values(), _argument("context", typer.Context, inspect.Parameter.empty)]
+    run.__signature__ = found.replace(parameters=whole)  # type: ignore[attr-defined]  # read by typer
     run.__annotations__ = {}
     return run
+
+
+def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
+    """Those of these options that are on the command line, even if with their default values."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    return [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
 
 
 def step_of(edit: Edit, given: dict[str, Any]) -> Step:
@@ -178,6 +186,8 @@ def step_of(edit: Edit, given: dict[str, Any]) -> Step:
             value = options.parse_sliders(value, f"--{parameter.name}")
         elif parameter.words or (parameter.kind == "number" and isinstance(value, str)):
             value = value if value is None else options.parse_number(value, parameter)
+        elif parameter.kind == "odd":
+            options.check_odd(value, parameter)
         values[parameter.name] = value
     return Step(edit.name, **values)
 
@@ -193,14 +203,19 @@ def edit_photograph(
     full: bool = False,
     workers: int | None = None,
     cluster: str | None = None,
+    typed: Iterable[str] = (),
     **given: Any,
 ) -> None:
-    """Apply an edit, given by name, to a file; ``given`` are options of its command, by default those of the edit."""
+    """Apply an edit, given by name, to a file.
+
+    ``given`` are options of its command, by default those of the edit, and ``typed`` are the names of those that the
+    user gave.
+    """
     edit = EDITS[name]
     step = step_of(edit, given)
     preset = given.get("preset")
     if preset is not None and (look := look_step(find_recipe(preset))) is not None:
-        if step.values or given.get("region") or given.get("mask"):
+        if {"region", "mask", *(parameter.name for parameter in edit)}.intersection(typed):
             raise ValueError(
                 f"--preset must not be combined with other options of detail if it is a look, got {preset}; drop them"
             )
@@ -289,13 +304,16 @@ def edit_photograph(
         if noise is not None:
             noise.tell()
 
+    selected = given.get("region") or given.get("mask")
+    if not (edit.requires_strokes or selected or step.changes()):
+        options.note(f"{name} changes nothing with these options: the photograph is written as it is")
     read = {what: given.get(what) for what in ("mask", "strokes", "preset")}
     editing.check_apart("OUT", target, **read)
     for which in ("show", "map"):
         editing.check_apart(f"--{which}", given.get(which), photograph=source, output=target, **read)
     if given.get("map") is not None:
         check_type(given["map"], MAP_DEPTH, alpha=False)
-    masked = name == "detail" and bool(given.get("region") or given.get("mask"))
+    masked = name == "detail" and bool(selected)
     editing.edit_file(
         source,
         target,

@@ -1,7 +1,7 @@
 """``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -140,10 +140,15 @@ def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
         raise ValueError(
             f"BEFORE and AFTER must be two photographs or two folders, got {before} and {after}; pass both"
         )
-    edited = {path.stem: path for path in sorted(second.iterdir()) if _is_picture(path)}
-    found = [(path, edited[path.stem]) for path in sorted(first.iterdir()) if _is_picture(path) and path.stem in edited]
+    edited = _pictures(second)
+    found = [(path, pair) for path in _pictures(first) if (pair := _counterpart(path, edited)) is not None]
     if not found:
         raise ValueError(f"{after} must hold photographs of the names of those in {before}, got none; rename them")
+    for (path, pair), (other, same) in pairwise(sorted(found, key=lambda each: each[1])):
+        if pair == same:
+            raise ValueError(
+                f"{before} must hold one photograph for {pair}, got {path.name} and {other.name}; remove one of them"
+            )
     _note_unpaired(first, {path.stem for _, path in found})
     _note_unpaired(second, {path.stem for path, _ in found})
     return found
@@ -151,7 +156,7 @@ def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
 
 def _note_unpaired(folder: Path, paired: set[str]) -> None:
     """Print a note if photographs of a folder have no counterpart of their name in the other."""
-    rest = [path.name for path in sorted(folder.iterdir()) if _is_picture(path) and path.stem not in paired]
+    rest = [path.name for path in _pictures(folder) if path.stem not in paired]
     if rest:
         others = f" and {len(rest) - 1} more" if len(rest) > 1 else ""
         options.note(f"{rest[0]}{others} in {folder} left out, without a photograph of that name in the other folder")
@@ -167,21 +172,37 @@ def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -
             )
             remedy = "put the masks in a folder under the names of the photographs" if folders else "name a file in it"
             raise ValueError(f"--mask must name {wanted}, got {mask}; {remedy}")
-        named = {path.stem: path for path in sorted(mask.iterdir()) if _is_picture(path)} if folders else {}
+        named = _pictures(mask) if folders else []
         for files, (photograph, _) in zip(found, paths, strict=True):
-            if folders and photograph.stem not in named:
+            own = _counterpart(photograph, named) if folders else mask
+            if own is None:
                 raise ValueError(
                     f"{mask} must hold a mask for every photograph, got none for {photograph.name}; add one, black all "
                     "over if the region is not in the photograph"
                 )
-            files.append(named[photograph.stem] if folders else mask)
+            files.append(own)
     return found
 
 
-def _is_picture(path: Path) -> bool:
-    from nlfilter_torch.io.photographs import SUFFIXES
+def _pictures(folder: Path) -> list[Path]:
+    from nlfilter_torch.cli.folders import is_picture
 
-    return path.suffix.lower() in SUFFIXES
+    return [path for path in sorted(folder.iterdir()) if is_picture(path)]
+
+
+def _counterpart(path: Path, others: Sequence[Path]) -> Path | None:
+    """The one of these files that has the name of a photograph, or if none has, the name but for its suffix.
+
+    Raises:
+        ValueError: if several differ from it in the suffix only.
+    """
+    found = [other for other in others if other.stem == path.stem]
+    if len(found) > 1 and path.name not in {other.name for other in found}:
+        names = " and ".join(other.name for other in found)
+        raise ValueError(
+            f"{found[0].parent} must hold one photograph of the name of {path.name}, got {names}; remove all but one"
+        )
+    return next((other for other in found if other.name == path.name), found[0] if found else None)
 
 
 def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":

@@ -16,9 +16,10 @@ from pathlib import Path
 
 from nlfilter_torch.cli.workers import DEATHS, Workers, is_death, worker_pool
 from nlfilter_torch.io.photographs import SUFFIXES
-from nlfilter_torch.io.writing import check_folder, open_beside, remove_stale
+from nlfilter_torch.io.writing import check_file, check_folder, open_beside, remove_stale
 
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
+FRAMES_RECORD = ".nlfilter-frames.json"  # in that of ``frames``: the names of the files that it wrote there
 
 DIED = "the process that worked on it died; use fewer --workers, so that each has more memory, or check the file"
 
@@ -43,17 +44,22 @@ class Tally:
 
 
 def pictures(folder: Path, what: str = "photographs") -> list[Path]:
-    """The image files of a folder, by name.
+    """The image files of a folder, by name, without hidden ones, such as those that macOS adds to every file.
 
     Raises:
         ValueError: if it is no folder, or has no image files; the message calls them ``what``.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; give the one that contains the {what}")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    paths = sorted(path for path in folder.iterdir() if is_picture(path))
     if not paths:
         raise ValueError(f"{folder} holds no PNG, JPEG, TIFF, WebP or AVIF file; put the {what} there")
     return paths
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a path is an image file by its suffix, and not hidden."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def left_out(folder: Path) -> str:
@@ -87,10 +93,42 @@ def prepare(paths: Sequence[Path], target: Path, settings: Mapping[str, object])
                 f"{target} contains results of other settings, listed in {record}; name a new folder, or empty this one"
             )
     elif present is not None:
-        raise ValueError(f"{target} already contains {present}, which this command did not write; name a new folder")
+        raise ValueError(_foreign(target, present))
     else:
         with open_beside(record) as stream:
             stream.write(text.encode())
+
+
+def _foreign(target: Path, name: str) -> str:
+    return f"{target} already contains {name}, which this command did not write; name a new folder"
+
+
+def check_replaced(paths: Sequence[Path], target: Path) -> set[str]:
+    """Check that ``frames`` may write files of these names; return the names of those that it wrote there before.
+
+    Raises:
+        ValueError: if ``target`` holds files of these names that other programs wrote, or links to ``paths``.
+    """
+    record, written = target / FRAMES_RECORD, set[str]()
+    if record.exists():
+        with contextlib.suppress(ValueError, TypeError):  # damaged
+            written.update(json.loads(record.read_text(encoding="utf-8")))
+    inputs = {path.resolve() for path in paths}
+    for path in paths:
+        place = target / path.name
+        if place.is_symlink() and place.resolve() in inputs:
+            raise ValueError(f"{place} is a link to {place.resolve()}, which is one of the frames; name a new folder")
+        if place.exists() or place.is_symlink():
+            if path.name not in written:
+                raise ValueError(_foreign(target, path.name))
+            check_file(place)
+    return written
+
+
+def record_written(target: Path, names: set[str]) -> None:
+    """Record, for :func:`check_replaced`, the names that ``frames`` writes to a folder."""
+    with open_beside(target / FRAMES_RECORD) as stream:
+        stream.write((json.dumps(sorted(names), indent=2) + "\n").encode())
 
 
 def edit_folder(

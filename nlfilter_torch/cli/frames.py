@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import DETAIL_OPTIONS, plain_step, preset_option, step_of, with_options
+from nlfilter_torch.cli.edits import DETAIL_OPTIONS, plain_step, preset_option, step_of, typed_options, with_options
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, find_recipe
 from nlfilter_torch.edits.recipe import Recipe
@@ -77,7 +77,7 @@ def frames(
     The filter is fitted once, to frames spread over the film, and applied to every frame. Since objects move, distance
     counts only if --spatial-bandwidth is given. Films keep their sound, frame rate, time stamps, rotation and colour
     properties (needs the extra `films`). Photographs in a folder keep their names, types, depths, transparency, colour
-    profiles and camera metadata.
+    profiles and camera metadata; files in OUT are replaced if this command wrote them.
 
     By sliders: `nlfilter-torch frames film.mp4 edited.mp4 --alpha 2,2,2,1`
 
@@ -110,8 +110,7 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: 
     Raises:
         ValueError: if an option does not belong to the edit.
     """
-    sources = {option: context.get_parameter_source(option) for option in (*given, "edit")}
-    typed = [option for option, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+    typed = typed_options(context, (*given, "edit"))
     if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
         if typed:
             raise ValueError(
@@ -151,7 +150,7 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     """Edit the photographs in a folder, and return their number."""
     import torch
 
-    from nlfilter_torch.cli.folders import pictures
+    from nlfilter_torch.cli.folders import check_replaced, pictures, record_written
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.io.films import is_film
     from nlfilter_torch.io.photographs import check_output, read_photograph, write_photograph
@@ -165,6 +164,7 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     if is_film(target) and not target.is_dir():
         raise ValueError(f"OUT must be a folder, as FRAMES is one, got {target}; choose the name of a folder")
     check_folder(target)
+    is_new, written = not target.exists(), check_replaced(paths, target)
     first: tuple[int, ...] = ()
 
     def read(path: Path) -> tuple[Any, Any]:
@@ -188,9 +188,15 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
         for number, path in enumerate(paths):
             begin(path.name)
             photograph, rows = read(path)
-            check_output(target.parent / path.name, photograph)
-            edited = torch.from_numpy(edit(rows)).permute(2, 0, 1)[None]
+            target.mkdir(exist_ok=True)
+            try:
+                check_output(target / path.name, photograph)
+            except ValueError:
+                if number == 0 and is_new:
+                    target.rmdir()
+                raise
             if number == 0:
-                target.mkdir(exist_ok=True)
+                record_written(target, written | {path.name for path in paths})
+            edited = torch.from_numpy(edit(rows)).permute(2, 0, 1)[None]
             write_photograph(photograph.with_pixels(edited), target / path.name)
     return len(paths)

@@ -54,7 +54,7 @@ def mask(
     from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
-    from nlfilter_torch.io.photographs import Photograph, check_memory, check_output, write_photograph
+    from nlfilter_torch.io.photographs import Photograph, check_depth, check_memory, check_output, write_photograph
     from nlfilter_torch.io.rows import TILED, check_place, open_picture, write_picture
     from nlfilter_torch.io.writing import check_file
     from nlfilter_torch.tiled.pictures import Picture
@@ -67,6 +67,10 @@ def mask(
     editing.check_apart("OUT", target, photograph=source, mask=mask)
     editing.check_apart("--show", show, photograph=source, output=target, mask=mask)
     place, floats = Path(target), Path(target).suffix.lower() == PFM
+    if floats and depth not in (None, "float"):
+        raise ValueError(
+            f"--depth must be float for a .pfm file, got {depth}; leave it out, or write a .tif or .png file"
+        )
     kind = options.DEPTHS[depth or ("16" if place.suffix.lower() in (".tif", ".tiff") else "8")]
     allowed = editing.allowed_memory(memory)
     editing.check_processes(source, target, workers, cluster)
@@ -109,6 +113,7 @@ def mask(
                 write_photograph(selected.with_pixels(found), place)
             return
     with open_picture(Path(source), allowed) as picture, stages() as report:
+        check_depth(source, picture.rows.dtype)
         plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
         if floats:
             check_file(place)

@@ -76,6 +76,13 @@ def parse_number(text: str, parameter: Parameter) -> float | str:
     return value
 
 
+def check_odd(value: int, parameter: Parameter) -> None:
+    """Raise ValueError unless the value of an option is odd and positive; its upper limit is checked by typer."""
+    if value < 1 or value % 2 == 0:
+        nearest = min(abs(value) // 2 * 2 + 1, int(parameter.high))
+        raise ValueError(f"--{parameter.name.replace('_', '-')} must be odd and at least 1, got {value}; try {nearest}")
+
+
 Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF, WebP or AVIF file.")]
 Seed = Annotated[
     int,

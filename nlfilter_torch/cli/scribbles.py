@@ -85,7 +85,7 @@ def _pixels(text: str, length: int) -> float:
     text = text.strip()
     if not text.endswith("%"):
         return int(text)
-    value = float(text[:-1]) / 100 * length
+    value = float(text[:-1]) * length / 100  # in this order, whole numbers of pixels are exact
     if not math.isfinite(value):
         raise ValueError(text)
     return value

@@ -1,5 +1,6 @@
 """Decoding of PNG, JPEG, WebP and AVIF files by Pillow, or by imagecodecs if they have more than 8 bits."""
 
+import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -9,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import AvifImagePlugin, Image, ImageFile, PngImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401
 
+from nlfilter_torch.io import colours, tiff
 from nlfilter_torch.io import exif as exif_tags
-from nlfilter_torch.io import tiff
 
 Pixels = NDArray[np.generic]
 
@@ -36,6 +37,8 @@ def read_by_pillow(
             if frames > 1 and image.format != "MPO":
                 raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
             check_size(image.size)
+            if "icc_profile" not in image.info:
+                _check_colours(path, image)
             orientation, exif = exif_tags.split(image.getexif)
             # Pillow would reduce 10, 12 or 16 bits to 8.
             if deep_png:
@@ -48,10 +51,28 @@ def read_by_pillow(
             return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
 
 
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(1 << 16)
+
+
+def _check_colours(path: Path, image: Image.Image) -> None:
+    """Check the colours of a PNG or AVIF file without a profile, see :mod:`nlfilter_torch.io.colours`."""
+    if image.format == "AVIF":
+        _, found, numbers = _head(path).partition(b"colrnclx")
+        if found and len(numbers) >= 4:
+            colours.check_numbers(path, *struct.unpack(">HH", numbers[:4]))
+    elif image.format == "PNG":
+        _, found, numbers = _head(path).partition(b"IDAT")[0].partition(b"cICP")
+        if found and len(numbers) >= 2:
+            colours.check_numbers(path, *numbers[:2])
+        elif "srgb" not in image.info:
+            colours.check_png(path, image.info.get("gamma"), image.info.get("chromaticity"))
+
+
 def _bits_of_avif(path: Path) -> int:
     """Read the bits per channel from the codec configuration, which is among the first boxes."""
-    with path.open("rb") as stream:
-        head = stream.read(1 << 16)
+    head = _head(path)
     place = head.find(b"av1C") + 6  # after the version, the profile and the level
     flags = head[place] if 6 <= place < len(head) else 0
     return (12 if flags & 0x20 else 10) if flags & 0x40 else 8

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from nlfilter_torch.io import colours, tiff
 from nlfilter_torch.io import exif as exif_tags
-from nlfilter_torch.io import tiff
 
 Found = tuple[NDArray[np.generic], int, bytes | None, bytes | None]  # channels, orientation, profile and EXIF
 CheckSize = Callable[[tuple[int, int]], None]  # of (width, height)
@@ -79,6 +79,9 @@ def read_heic(path: Path, check_size: CheckSize) -> Found:
         picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
         check_size(picture.size)
         info: dict[str, Any] = picture.info
+        numbers = info.get("nclx_profile")
+        if numbers and not info.get("icc_profile"):
+            colours.check_numbers(path, numbers["color_primaries"], numbers["transfer_characteristics"])
         channels = np.asarray(picture)
         if channels.dtype == np.uint16:  # the lower bits are empty
             channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)

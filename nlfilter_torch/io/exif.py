@@ -1,7 +1,7 @@
 """EXIF blocks, and rotation of pictures by their EXIF orientation."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from typing import Any
 
 from numpy.typing import NDArray
@@ -9,6 +9,25 @@ from PIL import ExifTags, Image, TiffImagePlugin
 
 PREFIX = b"Exif\0\0"
 FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point to a nested table
+INTEROP = int(ExifTags.IFD.Interop)  # a field of the first of these that points to another table
+
+
+class Latin1(str):
+    """Text of a field that is written as the bytes it was read from.
+
+    Pillow reads text as latin-1, which keeps the bytes of any encoding, but writes it as ASCII with question marks.
+    """
+
+    __slots__ = ()
+
+    def encode(self, encoding: str = "latin-1", errors: str = "replace") -> bytes:
+        """Encode as latin-1, whatever encoding is asked for."""
+        return super().encode("latin-1", "replace")
+
+
+def writable(value: Any) -> Any:
+    """The value of a field as it is to be given to Pillow."""
+    return Latin1(value) if isinstance(value, str) else value
 
 
 def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -47,10 +66,27 @@ def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
         details = folders.get(ExifTags.IFD.Exif, {})
         if orientation >= 5 and width in details and height in details:
             details[width], details[height] = details[height], details[width]
+        _keep_bytes(exif, *folders.values())
         try:
             return orientation, exif.tobytes()
         except Exception:  # Pillow does not say which field is invalid
             return orientation, _sound(fields, folders).tobytes()
+
+
+def _keep_bytes(*tables: MutableMapping[int, Any]) -> None:
+    """Make Pillow write the texts of tables as they were read."""
+    for table in tables:
+        for code, value in list(table.items()):
+            table[code] = writable(value)
+
+
+def without_orientation(block: bytes) -> bytes:
+    """Remove the orientation from an EXIF block; empty if nothing else is in it."""
+    exif = Image.Exif()
+    exif.load(block)
+    exif.pop(ExifTags.Base.Orientation, None)
+    _keep_bytes(exif, *(_folder(exif, code) for code in FOLDERS if code in exif))
+    return exif.tobytes() if exif else b""
 
 
 def orientation_of(value: Any) -> int:
@@ -69,15 +105,26 @@ def _folder(exif: Image.Exif, code: int) -> dict[int, Any]:
         return {}
 
 
+def tables(exif: Image.Exif) -> dict[int, dict[int, Any]]:
+    """The nested tables of a block, each with the tables inside it in place of pointers to them."""
+    found = {code: dict(folder) for code in FOLDERS if (folder := _folder(exif, code))}
+    for folder in found.values():
+        if folder.pop(INTEROP, None) is not None and (inner := _folder(exif, INTEROP)):
+            folder[INTEROP] = inner
+    return found
+
+
 def _sound(fields: dict[int, Any], folders: dict[int, dict[int, Any]]) -> Image.Exif:
     """Build an EXIF block from the fields that can be written."""
     block = Image.Exif()
     for code, value in fields.items():
         if code not in FOLDERS and is_writable(code, value):
-            block[code] = value
+            block[code] = writable(value)
     block[ExifTags.Base.Orientation] = 1
     for code, folder in folders.items():
-        block.get_ifd(code).update({key: value for key, value in folder.items() if is_writable(key, value)})
+        block.get_ifd(code).update(
+            {key: writable(value) for key, value in folder.items() if key != INTEROP and is_writable(key, value)}
+        )
     return block
 
 
@@ -85,7 +132,7 @@ def is_writable(code: int, value: Any) -> bool:
     """Whether Pillow can write a field with that value."""
     table = TiffImagePlugin.ImageFileDirectory_v2()
     try:
-        table[code] = value
+        table[code] = writable(value)
         table.tobytes()
     except Exception:
         return False

@@ -16,6 +16,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
+from nlfilter_torch.core.checks import warn
 from nlfilter_torch.io import exif as exif_tags
 from nlfilter_torch.io import tiff
 
@@ -43,7 +44,13 @@ class Extras:
         options: dict[str, Any] = {}
         if self.dpi is not None and kind not in ("WebP", "AVIF"):
             options["dpi"] = self.dpi
-        if self.xmp is None or (kind == "JPEG" and len(self.xmp) > JPEG_LIMIT):
+        if self.xmp is None:
+            return options
+        if kind == "JPEG" and len(self.xmp) > JPEG_LIMIT:
+            warn(
+                f"XMP metadata of {len(self.xmp)} bytes is left out, as JPEG holds at most {JPEG_LIMIT}; write a PNG, "
+                "TIFF, WebP or AVIF file to keep it"
+            )
             return options
         if kind != "PNG":
             return options | {"xmp": self.xmp}
@@ -89,8 +96,28 @@ def _read(path: Path) -> Extras:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow warns about sizes and damaged EXIF
         with Image.open(path) as image:
-            xmp = image.info.get("xmp", image.info.get(PNG_KEY))
+            if image.format == "PNG" and not _xmp(image) and _has_late_text(path):
+                image.load()  # also reads what follows the pixels
+            xmp = _xmp(image)
             return Extras(_upright(xmp.encode() if isinstance(xmp, str) else xmp), _sound(image.info.get("dpi")))
+
+
+def _xmp(image: Image.Image) -> Any:
+    return image.info.get("xmp", image.info.get(PNG_KEY))
+
+
+def _has_late_text(path: Path) -> bool:
+    """Whether a PNG file has text behind its pixels, where some programs write XMP."""
+    with path.open("rb") as stream:
+        stream.seek(8)  # signature
+        pixels = False
+        while len(head := stream.read(8)) == 8:
+            length, name = struct.unpack(">I4s", head)
+            if pixels and name == b"iTXt":
+                return True
+            pixels = pixels or name == b"IDAT"
+            stream.seek(length + 4, 1)  # content and checksum
+    return False
 
 
 def _ratio(value: Any) -> float:

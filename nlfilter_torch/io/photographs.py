@@ -204,6 +204,8 @@ def encode(
     elif channels.dtype == np.uint16:
         stream.write(encode_deep_png(channels, icc, exif, extras))
     else:
+        if exif is not None and kind == "AVIF":  # Pillow would remove it, and write the block anew
+            exif = exif_tags.without_orientation(exif)
         options: dict[str, object] = {"icc_profile": icc, "exif": exif or b""} | ENCODING.get(kind, {})
         options |= extras.options(kind)
         Image.fromarray(channels).save(stream, format=kind, **options)

@@ -214,7 +214,7 @@ def write(
     ]
     if xmp is not None:
         text.append((XMP, "B", len(xmp), xmp, True))
-    folders = {code: folder for code in exif_tags.FOLDERS if (folder := tags.get_ifd(code))}
+    folders = exif_tags.tables(tags)
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, "I", 1, 0, True) for code in folders]
     start = stream.tell()
@@ -247,7 +247,7 @@ def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder
     table = TiffImagePlugin.ImageFileDirectory_v2(ifh=(b"II*\0" if order == "<" else b"MM\0*") + bytes(4))
     for key, value in folder.items():
         if exif_tags.is_writable(key, value):
-            table[key] = value
+            table[key] = exif_tags.writable(value)
     end = stream.seek(0, 2)
     stream.write(bytes(end % 2))  # tables begin on even offsets
     offset = end + end % 2

@@ -29,6 +29,8 @@ def check_file(path: str | Path) -> None:
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is a pipe, a socket or a device, not a file; choose another name")
     _check_parent(path)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise ValueError(f"{path} is read-only; allow writing to it, or choose another name")
 
 
 def check_folder(folder: str | Path) -> None:

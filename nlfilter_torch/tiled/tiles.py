@@ -1,10 +1,11 @@
 """Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, gettempdir
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -212,9 +213,10 @@ def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iter
             try:
                 file.write(np.ascontiguousarray(values).tobytes())
             except OSError as error:
-                gigabytes = kind.itemsize * np.prod(shape) / 1e9
-                reason = f"{error.strerror}, for a temporary file of {gigabytes:.1f} GB between two steps of the edit"
-                raise OSError(error.errno, reason, str(folder)) from error
+                megabytes = max(1.0, kind.itemsize * math.prod(shape) / 1e6)
+                needed = f"{megabytes / 1000:.1f} GB" if megabytes >= 1000 else f"{megabytes:.0f} MB"
+                reason = f"{error.strerror}, for a temporary file of {needed}"
+                raise OSError(error.errno, reason, str(folder or gettempdir())) from error
         file.flush()
         yield np.memmap(file, kind, "r", shape=shape)
 
