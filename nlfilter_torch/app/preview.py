@@ -34,8 +34,13 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size, within_limits
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_features
-from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.kernel import GuideFeatures
+from nlfilter_torch.operator.features import (
+    GuideChannels,
+    GuideFeatures,
+    estimate_bandwidth,
+    reduce_channels,
+    unit_window,
+)
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 Key = tuple[object, ...]  # the settings on which a cached result depends

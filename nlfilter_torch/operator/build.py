@@ -30,12 +30,13 @@ from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_gra
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideChannels,
+    GuideFeatures,
     bandwidth_of_rows,
     estimate_bandwidth,
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
+from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator

@@ -9,43 +9,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from nlfilter_torch.operator.features import GuideChannels, extract_features, reduce_channels
+from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import Completion, nystrom_factor
-
-
-@dataclass(frozen=True, eq=False)
-class GuideFeatures:
-    """The function that computes features of guides. Paper: eq. (1), (18).
-
-    Attributes:
-        patch_weights: (p, p), of unit sum.
-        photometric_bandwidth: h_y, () or (B,) or a number.
-        spatial_bandwidth: h_x in pixels, () or (B,) or a number, or None.
-        guide_channels: ``"luminance"`` or ``"all"``.
-    """
-
-    patch_weights: Tensor
-    photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
-    guide_channels: GuideChannels
-
-    def __call__(
-        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0), stride: int = 1
-    ) -> Tensor:
-        """Compute features (B, D, N) of any guide (B, C, H, W), or of a tile; see :func:`extract_features`.
-
-        The guide must have the channels of the original guide, from which the landmarks come, and ``origin`` is in
-        coordinates of the original guide. A halo is half a patch, or less at the border of the whole guide.
-        """
-        return extract_features(
-            reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels),
-            patch_weights=self.patch_weights,
-            photometric_bandwidth=self.photometric_bandwidth,
-            spatial_bandwidth=self.spatial_bandwidth,
-            origin=origin,
-            halo=halo,
-            stride=stride,
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,14 @@ from nlfilter_torch.core.checks import check_choice, check_count, check_positive
 from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.features import (
     GuideChannels,
+    GuideFeatures,
     bandwidth_of_gradient,
     gradients,
     pad_border,
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
+from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
@@ -215,7 +216,7 @@ def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
 
 
 def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
-    """Features (1, D, n), as of :func:`extract_features`, from patches (1, C p^2, n) and indices of their pixels."""
+    """Features (1, D, n), as of :class:`GuideFeatures`, from patches (1, C p^2, n) and indices of their pixels."""
     window = recipe.patch_weights
     channels = patches.shape[1] // window.numel()
     scale = (window / channels).sqrt() / torch.as_tensor(recipe.photometric_bandwidth, dtype=window.dtype)
