@@ -36,9 +36,8 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
-from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 

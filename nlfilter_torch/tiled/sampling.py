@@ -24,9 +24,8 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
