@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
-from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.declaration import Edit
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
@@ -184,9 +183,7 @@ class Preview:
         """The spatial bandwidth of a step in pixels of a guide."""
         size = (guide.shape[-2], guide.shape[-1])
         scale = self._viewed(detail)[0] / size[0]
-        return nearby_or_far(
-            detail.arguments(size, scale)["spatial_bandwidth"], DETAIL["spatial_bandwidth"].share, size
-        )
+        return DETAIL["spatial_bandwidth"].distance(detail.arguments(size, scale)["spatial_bandwidth"], size)
 
     def mask(self, detail: Step) -> Tensor | None:
         """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""

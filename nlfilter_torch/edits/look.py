@@ -10,7 +10,6 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.pixels import corner
@@ -160,7 +159,7 @@ def fit_look_edit(
         if acts(sliders):
             filter_options = options | {
                 "photometric_bandwidth": photometric_bandwidth,
-                "spatial_bandwidth": nearby_or_far(spatial_bandwidth, LOOK["spatial_bandwidth"].share, viewed.size),
+                "spatial_bandwidth": LOOK["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size),
                 "num_landmarks": num_landmarks,
             }
             filtered = polynomial(viewed.operator(Guide(filter_options)), luminance, sliders.shape[-1] - 1, None)
