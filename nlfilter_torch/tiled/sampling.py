@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_choice, check_count, check_positive, warn
+from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.operator.build import Construction, check_bandwidths
 from nlfilter_torch.operator.features import (
     GuideChannels,
     GuideFeatures,
@@ -133,22 +134,10 @@ def take_pilot(
     Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
     """
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"))
-    check_choice(completion, "completion", ("diagonal", "none"))
-    check_count(num_landmarks, "num_landmarks")
+    method = Construction(num_landmarks, landmarks, completion, None, generator)
     window = unit_window(patch_size, None).to(picture.dtype)
-    if isinstance(photometric_bandwidth, str):
-        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
-    else:
-        check_positive(photometric_bandwidth, "photometric_bandwidth")
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth")
-    if num_landmarks > picture.pixels:
-        warn(
-            f"num_landmarks must be at most the number of pixels, {picture.pixels}, got {num_landmarks}; "
-            "using every pixel"
-        )
-        num_landmarks = picture.pixels
+    check_bandwidths(photometric_bandwidth, spatial_bandwidth)
+    num_landmarks = method.count(picture.pixels)
 
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     candidates = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
