@@ -16,9 +16,8 @@ from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
+from nlfilter_torch.filtering.histogram import LocalCurves, Stretch, ramps, tones
 from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
-from nlfilter_torch.filtering.stretch import Stretch, tones
 from nlfilter_torch.operator.features import reduce_channels
 
 Numbers = Tensor | Sequence[float]

@@ -18,7 +18,7 @@ from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.resizing import block_means, resized, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
-from nlfilter_torch.filtering.stretch import ends_of
+from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
