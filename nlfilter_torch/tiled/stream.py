@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from nlfilter_torch.edits.parameters import COLORIZE, DETAIL, RECOLOR
 from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.tiled.pictures import Picture, RowSource, RowTarget
-from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.sampling import Report, in_silence
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
 from nlfilter_torch.tiled.workers import single_threaded
@@ -230,11 +231,21 @@ def stream_colorize(
 
 
 def _stream(
-    source: RowSource, target: RowTarget, fit: Callable[[Tiled], Fitted], *tiling: Any, coloured: bool = False
+    source: RowSource,
+    target: RowTarget,
+    fit: Callable[[Tiled], Fitted],
+    statistics: Statistics,
+    sample: int,
+    tile_rows: int | None,
+    memory: int,
+    report: Report | None,
+    *,
+    coloured: bool = False,
 ) -> None:
-    """Fit an edit to a picture and write the result, with the ``tiling`` options of :meth:`Passes.of`."""
+    """Fit an edit to a picture and write the result; ``coloured`` edits turn grey into colour."""
     check_target(target, source, coloured=coloured)
-    tiled = Tiled(Picture(source), Passes.of(target, *tiling))
+    kind = np.dtype(target.dtype).name
+    tiled = Tiled(Picture(source), Passes(kind, statistics, sample, tile_rows, memory, report or in_silence))
     with single_threaded(tiled.passes.workers(1)):
         fitted = fit(tiled)
     fill(target, tiled.rows(fitted))
