@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.affinity import SMALLEST_EXPONENT
-from nlfilter_torch.operator.features import extract_features, patch_window
+from nlfilter_torch.operator.features import GuideFeatures, patch_window
 from nlfilter_torch.operator.landmarks import choose_landmarks
 from nlfilter_torch.operator.nystrom import JITTER
 
@@ -58,12 +58,7 @@ def plain_filter(
         steps: of the balancing, each of which reduces the error by a factor of three; 14 reach float32.
     """
     weights = patch_window(patch_size).to(guide) if patch_weights is None else patch_weights / patch_weights.sum()
-    features = extract_features(
-        guide,
-        patch_weights=weights,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-    )
+    features = GuideFeatures(weights, photometric_bandwidth, spatial_bandwidth, "all")(guide)
     size = (guide.shape[2], guide.shape[3])
     landmarks = choose_landmarks(features, size, num_landmarks, "kmeans", None)
     between = affinity(landmarks.double(), landmarks.double())  # (B, M, M), in float64 as it is badly conditioned

@@ -19,6 +19,8 @@ from nlfilter_torch.cli import folders, interrupts, main, workers
 from nlfilter_torch.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
 from nlfilter_torch.cli.workers import DEATHS
 from nlfilter_torch.edits.presets import PRESETS
+from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.writing import open_beside
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
@@ -327,6 +329,10 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert options[0].strip("-").replace("-", "_") in refused(capsys, source, target, *options).replace("-", "_")
     assert "--spatial-bandwidth must be a positive number of pixels" in refused(
         capsys, source, target, "--spatial-bandwidth", 0
+    )
+    (tmp_path / "tone.json").write_text(Recipe((Step("tone"),)).to_json())
+    assert "--seed must not be given with a --preset of edits other than detail" in refused(
+        capsys, source, target, "--preset", tmp_path / "tone.json", "--seed", 1
     )
     assert not target.exists()
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlfilter_torch import estimate_bandwidth
-from nlfilter_torch.operator.features import extract_features, pad_border, patch_window, reduce_channels
+from nlfilter_torch.operator.features import GuideFeatures, pad_border, patch_window, reduce_channels
 from tests import reference
 from tests.images import photograph
 
@@ -28,12 +28,7 @@ def test_window_is_the_reference_window(size: int) -> None:
 @pytest.mark.parametrize("h_x", [None, 2.5])
 def test_features_are_the_reference_features(size: tuple[int, int], patch_size: int, h_x: float | None) -> None:
     guides = np.stack([random_guide(2, *size, seed) for seed in (0, 1)])
-    found = extract_features(
-        torch.from_numpy(guides),
-        patch_weights=patch_window(patch_size),
-        photometric_bandwidth=0.1,
-        spatial_bandwidth=h_x,
-    )
+    found = GuideFeatures(patch_window(patch_size), 0.1, h_x, "all")(torch.from_numpy(guides))
     expected = [reference.features(guide, patch_size, 0.1, h_x).T for guide in guides]
     np.testing.assert_allclose(found, np.stack(expected), rtol=1e-12)
 
@@ -48,7 +43,7 @@ def test_borders_are_the_reference_borders(height: int, width: int, margin: int)
 def test_every_image_of_a_batch_has_its_own_bandwidths() -> None:
     guides = torch.from_numpy(random_guide(2, 6, 5)).unsqueeze(1)  # (2, 1, 6, 5)
     h_y, h_x = torch.tensor([0.1, 0.3]), torch.tensor([2.0, 5.0])
-    together = extract_features(guides, patch_weights=patch_window(3), photometric_bandwidth=h_y, spatial_bandwidth=h_x)
+    together = GuideFeatures(patch_window(3), h_y, h_x, "all")(guides)
     for i in range(2):
         alone = reference.features(guides[i].numpy(), 3, h_y[i].item(), h_x[i].item()).T
         np.testing.assert_allclose(together[i], alone, rtol=1e-6)
@@ -58,7 +53,7 @@ def test_every_image_of_a_batch_has_its_own_bandwidths() -> None:
 def test_a_bandwidth_is_a_difference_in_grey_whatever_the_patch(patch_size: int) -> None:
     guide = torch.zeros(1, 1, 20, 40, dtype=torch.float64)
     guide[..., 20:] = 0.2
-    x = extract_features(guide, patch_weights=patch_window(patch_size), photometric_bandwidth=0.2)
+    x = GuideFeatures(patch_window(patch_size), 0.2, None, "all")(guide)
     assert (x[0, :, 0] - x[0, :, 39]).square().sum().item() == pytest.approx(1)
 
 
@@ -76,13 +71,9 @@ def test_strides_do_not_matter() -> None:
     guide = torch.from_numpy(random_guide(2, 8, 9))[None]
     strided = guide.permute(0, 3, 2, 1).contiguous().permute(0, 3, 2, 1)
     assert not strided.is_contiguous()
+    features = GuideFeatures(patch_window(5), 0.1, None, "all")
     for g in (strided, guide.flip(-1).flip(-1), torch.stack([guide, guide], dim=-1)[..., 0]):
-        torch.testing.assert_close(
-            extract_features(g, patch_weights=patch_window(5), photometric_bandwidth=0.1),
-            extract_features(guide, patch_weights=patch_window(5), photometric_bandwidth=0.1),
-            atol=0,
-            rtol=0,
-        )
+        torch.testing.assert_close(features(g), features(guide), atol=0, rtol=0)
 
 
 # --- the automatic bandwidth, eq. 20

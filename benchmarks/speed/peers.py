@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from benchmarks.speed.cases import Case, colour
 from benchmarks.speed.timing import Call, discard
 from nlfilter_torch import estimate_bandwidth
-from nlfilter_torch.operator.features import extract_features, patch_window
+from nlfilter_torch.operator.features import GuideFeatures, patch_window
 
 PACKAGE = "nlfilter-torch"
 
@@ -92,9 +92,8 @@ def dense_attention(case: Case) -> Call:
     from torch.nn.attention import SDPBackend, sdpa_kernel
 
     image = case.image()
-    features = extract_features(
-        image, patch_weights=patch_window(case.patch_size), photometric_bandwidth=estimate_bandwidth(image)
-    ).mT  # (1, N, D)
+    window = patch_window(case.patch_size).to(image)
+    features = GuideFeatures(window, estimate_bandwidth(image), None, "all")(image).mT  # (1, N, D)
     features = features - features.mean(1, keepdim=True)
     queries = torch.cat([2 * features, torch.ones_like(features[..., :1])], dim=2).unsqueeze(1)
     keys = torch.cat([features, -features.square().sum(2, keepdim=True)], dim=2).unsqueeze(1)

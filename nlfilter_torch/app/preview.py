@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
-from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.declaration import Edit
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
@@ -34,8 +33,13 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size, within_limits
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_features
-from nlfilter_torch.operator.features import GuideChannels, estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.kernel import GuideFeatures
+from nlfilter_torch.operator.features import (
+    GuideChannels,
+    GuideFeatures,
+    estimate_bandwidth,
+    reduce_channels,
+    unit_window,
+)
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
@@ -179,9 +183,7 @@ class Preview:
         """The spatial bandwidth of a step in pixels of a guide."""
         size = (guide.shape[-2], guide.shape[-1])
         scale = self._viewed(detail)[0] / size[0]
-        return nearby_or_far(
-            detail.arguments(size, scale)["spatial_bandwidth"], DETAIL["spatial_bandwidth"].share, size
-        )
+        return DETAIL["spatial_bandwidth"].distance(detail.arguments(size, scale)["spatial_bandwidth"], size)
 
     def mask(self, detail: Step) -> Tensor | None:
         """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""

@@ -10,18 +10,10 @@ import typer
 
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.apply import apply
-from nlfilter_torch.cli.edits import (
-    DETAIL_OPTIONS,
-    edit_photograph,
-    plain_step,
-    preset_option,
-    step_of,
-    typed_options,
-    with_options,
-)
+from nlfilter_torch.cli.edits import DETAIL_OPTIONS, edit_photograph, other_recipe, preset_option, step_of, with_options
 from nlfilter_torch.cli.interrupts import INTERRUPTED
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import PRESETS, find_recipe
+from nlfilter_torch.edits.presets import PRESETS
 
 if TYPE_CHECKING:
     from nlfilter_torch.cli.folders import Tally
@@ -85,15 +77,12 @@ def batch(
     """
     step_of(EDITS["detail"], given)
 
-    from nlfilter_torch.cli.editing import allowed_memory
+    from nlfilter_torch.cli.editing import allowed_memory, check_workers
     from nlfilter_torch.cli.folders import Tally, edit_folder, left_out, pictures, prepare
     from nlfilter_torch.cli.progress import steps
     from nlfilter_torch.io.rows import WHOLE, free_memory
 
-    if cluster is not None and workers is not None:
-        raise ValueError(
-            f"--workers must not be combined with --cluster, got {workers} and {cluster}; omit one of them"
-        )
+    check_workers(workers, cluster)
     if cluster is not None:  # whose workers run in other folders
         folder, target = folder.absolute(), target.absolute()
         if preset is not None and preset not in PRESETS:
@@ -101,12 +90,7 @@ def batch(
     shared = free_memory() if memory is None else allowed_memory(memory)
     settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
-    if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
-        if beside := typed_options(context, settings):
-            raise ValueError(
-                f"--{beside[0].replace('_', '-')} is an option of detail, but {preset} holds another edit; "
-                "leave it out, or write it into the file"
-            )
+    if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[preset])
     paths = pictures(folder)
     prepare(paths, target, settings)

@@ -134,13 +134,18 @@ class Job:
         return found
 
 
-def check_processes(source: str, target: str, workers: int | None, cluster: str | None) -> None:
-    """Raise ValueError if worker processes are asked for and the files are not zarr arrays."""
-    option = "--workers" if cluster is None else "--cluster"
+def check_workers(workers: int | None, cluster: str | None) -> None:
+    """Raise ValueError if processes of this machine and of a cluster are asked for."""
     if workers is not None and cluster is not None:
         raise ValueError(
             f"--workers must not be combined with --cluster, got {workers} and {cluster}; omit one of them"
         )
+
+
+def check_processes(source: str, target: str, workers: int | None, cluster: str | None) -> None:
+    """Raise ValueError if worker processes are asked for and the files are not zarr arrays."""
+    check_workers(workers, cluster)
+    option = "--workers" if cluster is None else "--cluster"
     if (workers is not None or cluster is not None) and not (is_zarr(Path(source)) and is_zarr(Path(target))):
         raise ValueError(
             f"{option} takes zarr arrays, which several processes can write, as IN and OUT, got {source} and {target}; "

@@ -26,6 +26,25 @@ def plain_step(recipe: Recipe) -> Step | None:
     return step if step is not None and step.edit == "detail" and not step.strokes else None
 
 
+def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
+    """Those of these options that are on the command line, even if with their default values."""
+    sources = {name: context.get_parameter_source(name) for name in names}
+    return [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+
+
+def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> Recipe | None:
+    """The recipe of a preset, if options of ``detail`` cannot express it; ValueError if parameters are given too."""
+    recipe = find_recipe(preset)
+    if plain_step(recipe) is not None:
+        return None
+    if given := typed_options(context, names):
+        raise ValueError(
+            f"--{given[0].replace('_', '-')} must not be given with a --preset of edits other than detail, got "
+            f"{preset}; leave it out, or set it in that file"
+        )
+    return recipe
+
+
 def look_step(recipe: Recipe) -> Step | None:
     """The only step of a recipe, if it is a look."""
     return recipe.steps[0] if [step.edit for step in recipe.steps] == ["look"] else None
@@ -167,12 +186,6 @@ def command(edit: Edit) -> Callable[..., None]:
     run.__signature__ = found.replace(parameters=whole)  # type: ignore[attr-defined]  # read by typer
     run.__annotations__ = {}
     return run
-
-
-def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
-    """Those of these options that are on the command line, even if with their default values."""
-    sources = {name: context.get_parameter_source(name) for name in names}
-    return [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
 
 
 def step_of(edit: Edit, given: dict[str, Any]) -> Step:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.cli.edits import DETAIL_OPTIONS, plain_step, preset_option, step_of, typed_options, with_options
+from nlfilter_torch.cli.edits import DETAIL_OPTIONS, other_recipe, preset_option, step_of, typed_options, with_options
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import PRESETS, find_recipe
+from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.edits.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -110,27 +110,21 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: 
     Raises:
         ValueError: if an option does not belong to the edit.
     """
-    typed = typed_options(context, (*given, "edit"))
-    if preset is not None and plain_step(recipe := find_recipe(preset)) is None:
-        if typed:
-            raise ValueError(
-                f"--{typed[0].replace('_', '-')} must not be given with a --preset of edits other than detail, got "
-                f"{preset}; set it in that file instead"
-            )
+    if preset is not None and (recipe := other_recipe(context, preset, (*given, "edit"))) is not None:
         return recipe
     if name not in {edit.name for edit in EDITS_WITHOUT_STROKES}:
         names = ", ".join(edit.name for edit in EDITS_WITHOUT_STROKES)
         raise ValueError(f"--edit must be one of {names}, got {name!r}; choose one of these")
     if preset is not None and name != "detail":
         raise ValueError(f"--edit must not be given together with --preset, got {name} and {preset}; drop one of them")
-    declared = {parameter.name for parameter in EDITS[name]}
-    other = next((option for option in typed if option not in declared and option != "edit"), None)
+    own, declared = typed_options(context, given), {parameter.name for parameter in EDITS[name]}
+    other = next((option for option in own if option not in declared), None)
     if other is not None:
         edits = " or ".join(edit.name for edit in EDITS_WITHOUT_STROKES if other in {p.name for p in edit})
         raise ValueError(
             f"--{other.replace('_', '-')} must be used with --edit {edits}, got --edit {name}; drop it or change --edit"
         )
-    mine = given if name == "detail" else {option: given[option] for option in typed if option != "edit"}
+    mine = given if name == "detail" else {option: given[option] for option in own}
     return Recipe((step_of(EDITS[name], mine),))
 
 

@@ -58,7 +58,7 @@ def mask(
     from nlfilter_torch.io.rows import TILED, check_place, open_picture, write_picture
     from nlfilter_torch.io.writing import check_file
     from nlfilter_torch.tiled.pictures import Picture
-    from nlfilter_torch.tiled.scribbles import RegionRows
+    from nlfilter_torch.tiled.scribbles import region_rows
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.workers import single_threaded
 
@@ -114,7 +114,7 @@ def mask(
             return
     with open_picture(Path(source), allowed) as picture, stages() as report:
         check_depth(source, picture.rows.dtype)
-        plain = replace(picture, rows=RegionRows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
+        plain = replace(picture, rows=region_rows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
         if floats:
             check_file(place)
             height, width = picture.rows.shape[:2]

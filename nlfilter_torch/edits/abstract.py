@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_photograph, check_reach
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import merge_luminance, nearby, split_luminance
+from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.parameters import ABSTRACT
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source
@@ -145,7 +145,7 @@ def flattened(
     options = {"guide_channels": "all"} | options
     options |= {
         "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
-        "spatial_bandwidth": nearby(spatial_bandwidth, ABSTRACT["spatial_bandwidth"].share, source.size),
+        "spatial_bandwidth": ABSTRACT["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
     }
     operator = source.operator(Guide(options, spectral=True))
     # W preserves constants, but the span of the factor need not contain them: filter without the mean.

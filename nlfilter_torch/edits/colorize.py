@@ -26,7 +26,7 @@ from nlfilter_torch.core.checks import (
     check_tensor,
 )
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import group_colours, merge_luminance, nearby, split_luminance, with_green
+from nlfilter_torch.edits.colour import group_colours, merge_luminance, split_luminance, with_green
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.edits.mask import blocks_of
@@ -185,7 +185,7 @@ def fit_colorize(
         scribbles = blocks_of(scribbles, viewed, source.size, source.size[1] / small[1])
     pixels = small[0] * small[1]
     options["num_landmarks"] = min(num_landmarks, pixels)
-    nearness = nearby(spatial_bandwidth, COLORIZE["spatial_bandwidth"].share, small)
+    nearness = COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small)
 
     def operator_of(stage: Stage) -> Operator:
         scaled = {

@@ -1,12 +1,11 @@
-"""Functions shared by edits: change of luminance at constant chroma, chroma within gamut, spatial bandwidths."""
+"""Functions shared by edits: change of luminance at constant chroma, chroma within gamut."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.features import reduce_channels
 
 LIGHTNESS = 0.3  # weight of lightness relative to hue and saturation: a fold in a red cloth is still red
@@ -121,26 +120,6 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
         distance = (paint[:, left].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
         numbers[left] = distance.argmin(1)
     return torch.full_like(painted, -1, dtype=torch.long).masked_scatter(painted, numbers)
-
-
-def nearby_or_far(given: float | Tensor | str | None, share: float, size: Sequence[int]) -> float | Tensor | None:
-    """Return :func:`nearby`, or None, for no spatial bandwidth, if ``"none"`` is given.
-
-    Raises:
-        ValueError: if another word is given.
-    """
-    if isinstance(given, str):
-        check_choice(given, "spatial_bandwidth", ("none",))
-        return None
-    return nearby(given, share, size)
-
-
-def nearby(given: float | Tensor | None, share: float, size: Sequence[int]) -> float | Tensor:
-    """Return a spatial bandwidth in pixels: the one given, or for None a share of the short side of a picture (H, W).
-
-    It is relative so that a preview and the photograph agree.
-    """
-    return share * min(size) if given is None else given
 
 
 def colour_guide(image: Tensor) -> Tensor:

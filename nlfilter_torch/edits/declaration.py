@@ -5,7 +5,7 @@ Does not import torch, so that the command line prints help and lists without de
 
 import json
 import reprlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -191,6 +191,21 @@ class Parameter:
     def pixels(self, given: float | None, size: tuple[int, int]) -> float:
         """Return a length in pixels for an image of that size: the one given to the function, or the default."""
         return float(self.argument_of(self.default, size) if given is None else given)
+
+    def distance(self, given: Any, size: Sequence[int]) -> Any:
+        """Return a distance in pixels for a picture (H, W): the one given to the function, or :attr:`share` for None.
+
+        It is relative so that a preview and the photograph agree. The word ``"none"`` gives None, for no limit.
+
+        Raises:
+            ValueError: if another word is given.
+        """
+        if isinstance(given, str) and self.words:
+            from nlfilter_torch.core.checks import check_choice
+
+            check_choice(given, self.keyword, self.words)
+            return None
+        return self.share * min(size) if given is None else given
 
     def check_argument(self, value: Any, batch: int | None = None) -> None:
         """Check that a function can take ``value``; with ``batch``, also tensors of shape () or (batch,).

@@ -9,7 +9,6 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_photograph, check_reach
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
@@ -104,7 +103,7 @@ def fit_defocus(
     options = (
         {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | {"reach": REACH} | options
     )
-    spatial_bandwidth = nearby(spatial_bandwidth, DEFOCUS["spatial_bandwidth"].share, source.size)
+    spatial_bandwidth = DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size)
     found = fit_regions(source, [scribbles], [], spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:

@@ -13,7 +13,6 @@ from nlfilter_torch.core.checks import check_count, check_photograph
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import cached_constants
-from nlfilter_torch.edits.colour import nearby
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
@@ -147,7 +146,7 @@ def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Te
     options = {"guide_channels": "all"} | options
     options |= {
         "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
-        "spatial_bandwidth": nearby(options["spatial_bandwidth"], DENOISE["spatial_bandwidth"].share, source.size),
+        "spatial_bandwidth": DENOISE["spatial_bandwidth"].distance(options["spatial_bandwidth"], source.size),
         "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
     }
     operator = source.operator(Guide(options, blur=GUIDE_BLUR))

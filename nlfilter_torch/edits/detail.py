@@ -19,7 +19,6 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.mask import select_regions
@@ -172,7 +171,7 @@ def fit_detail(
             )
 
     def change(viewed: Source) -> Fitted:
-        nearness = nearby_or_far(spatial_bandwidth, DETAIL["spatial_bandwidth"].share, viewed.size)
+        nearness = DETAIL["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size)
         filter_options = options | {
             "photometric_bandwidth": photometric_bandwidth,
             "spatial_bandwidth": nearness,
@@ -287,5 +286,5 @@ def activity(image: Tensor) -> Tensor:
 def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
     """Return the options of :func:`nonlocal_operator` for a step on an image of size (H, W), the viewing size."""
     found = {name: value for name, value in step.arguments(size).items() if name in FILTER}
-    share = DETAIL["spatial_bandwidth"].share
-    return found | {"spatial_bandwidth": nearby_or_far(found["spatial_bandwidth"], share, size)}
+    distance = DETAIL["spatial_bandwidth"].distance(found["spatial_bandwidth"], size)
+    return found | {"spatial_bandwidth": distance}

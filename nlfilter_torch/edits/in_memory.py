@@ -16,8 +16,8 @@ from nlfilter_torch.edits.resizing import block_means, resize
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
 from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.filtering.stretch import ends_of
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum

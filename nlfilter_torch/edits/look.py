@@ -10,16 +10,14 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.filtering.local_tone import LocalCurves, ramps
+from nlfilter_torch.filtering.histogram import LocalCurves, Stretch, ramps, tones
 from nlfilter_torch.filtering.look import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
-from nlfilter_torch.filtering.stretch import Stretch, tones
 from nlfilter_torch.operator.features import reduce_channels
 
 Numbers = Tensor | Sequence[float]
@@ -160,7 +158,7 @@ def fit_look_edit(
         if acts(sliders):
             filter_options = options | {
                 "photometric_bandwidth": photometric_bandwidth,
-                "spatial_bandwidth": nearby_or_far(spatial_bandwidth, LOOK["spatial_bandwidth"].share, viewed.size),
+                "spatial_bandwidth": LOOK["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size),
                 "num_landmarks": num_landmarks,
             }
             filtered = polynomial(viewed.operator(Guide(filter_options)), luminance, sliders.shape[-1] - 1, None)

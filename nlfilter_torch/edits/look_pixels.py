@@ -15,7 +15,7 @@ from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
-from nlfilter_torch.filtering.local_tone import LocalCurves
+from nlfilter_torch.filtering.histogram import LocalCurves
 from nlfilter_torch.filtering.look import bands_of, local_curves, range_of, textures_of
 from nlfilter_torch.filtering.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
 from nlfilter_torch.operator.build import nonlocal_operator, sampled_operator

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import LIGHTNESS, hundredths_of_lab, nearby
+from nlfilter_torch.edits.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
@@ -240,7 +240,7 @@ def fit_regions(
         if spatial_bandwidth is not None:
             check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
             spatial_bandwidth = spatial_bandwidth / step
-        options["spatial_bandwidth"] = nearby(spatial_bandwidth, MASK["spatial_bandwidth"].share, small.size)
+        options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
     operator = small.operator(Guide(options, region_guide, MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
     frame, colours = operator.at(places), small.colours(places)

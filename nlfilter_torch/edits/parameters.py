@@ -17,6 +17,7 @@ from nlfilter_torch.edits.shared_parameters import (
     choice,
     filter_parameters,
     gain,
+    number,
     reach_of_time,
     sliders,
 )
@@ -75,14 +76,12 @@ DETAIL = Edit(
         ),
         replace(REACH, former_names=(("time", reach_of_time), ("spread", reach_of_time)), slider=REACH_SLIDER),
         replace(TOLERANCE, argument="mask_bandwidth"),
-        Parameter(
+        number(
             "threshold",
-            "number",
             5.0,
             "Detail with less contrast than this is strengthened less, since it may be noise: a standard deviation in "
             "grey levels of 255. 0 strengthens all detail equally.",
-            0,
-            255,
+            (0, 255),
             "levels",
             domain="not negative",
             zero_meaning="pass 0 to strengthen all detail equally",
@@ -109,13 +108,11 @@ SHARPEN = Edit(
             idle=1.0,
             slider=Slider("Amount", 0, 10, 0.5),
         ),
-        Parameter(
+        number(
             "guide_blur",
-            "number",
             1.2,
             "Blur that hides noise and the finest grain from the filter, so that they are not sharpened. 0: no blur.",
-            0,
-            1e4,
+            (0, 1e4),
             "px",
             domain="not negative",
             zero_meaning="pass 0 to leave the guide unblurred",
@@ -167,25 +164,21 @@ DENOISE = Edit(
     Gently: `nlfilter-torch denoise in.jpg out.jpg --strength 0.6`
     """,
     (
-        Parameter(
+        number(
             "strength",
-            "number",
             1.0,
             "How much noise is removed: 1 removes the estimated or given noise, less leaves some, more smooths detail.",
-            0,
-            4,
+            (0, 4),
             domain="not negative",
             zero_meaning="0 changes nothing",
             idle=0.0,
             slider=Slider("Strength", 0, 2, 0.05, knots=(0, 0.5, 1, 2)),
         ),
-        Parameter(
+        number(
             "noise_level",
-            "number",
             None,
             "Standard deviation of the noise in grey levels of 255. Default: estimated from the photograph.",
-            0,
-            255,
+            (0, 255),
             "levels",
             domain="not negative",
             zero_meaning="0 changes nothing",
@@ -213,13 +206,11 @@ RECOLOR = Edit(
     Keep the wood unchanged: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
     """,
     (
-        Parameter(
+        number(
             "reach",
-            "number",
             0.6,
             "How far the colour spreads to less similar areas. 0 stays close, 0.95 goes far.",
-            0,
-            0.999,
+            (0, 0.999),
             domain="below 1",
             metavar="0...1",
             slider=Slider("Reach", 0, 0.95, 0.05),
@@ -246,13 +237,11 @@ COLORIZE = Edit(
     Without painting: `nlfilter-torch colorize grey.jpg out.jpg --region 10,10,30,30:skyblue --region 10,300,9,9:green`
     """,
     (
-        Parameter(
+        number(
             "strength",
-            "number",
             1.0,
             "How much colour is given to areas that resemble no stroke: 1 colours everything, 0 leaves them grey.",
-            0,
-            1,
+            (0, 1),
             domain="share",
             metavar="0...1",
             slider=Slider("Fill", 0, 1, 0.05),
@@ -280,13 +269,11 @@ DEFOCUS = Edit(
     Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
     """,
     (
-        Parameter(
+        number(
             "radius",
-            "number",
             2.5,
             "Radius of the strongest blur, in hundredths of the short side.",
-            0.1,
-            20,
+            (0.1, 20),
             "%",
             domain="positive",
             slider=Slider("Blur", 0.5, 10, 0.1),
@@ -332,38 +319,32 @@ ABSTRACT = Edit(
     Like a comic: `nlfilter-torch abstract in.jpg out.jpg --edges 1 --tones 8 --bandwidth 50`
     """,
     (
-        Parameter(
+        number(
             "power",
-            "number",
             0.1,
             "How much detail is removed. 0: none, 0.1: all but outlines, 1: much more.",
-            0,
-            10,
+            (0, 10),
             domain="not negative",
             zero_meaning="pass 0 to leave the image unchanged",
             idle=0.0,
             metavar="K",
             slider=Slider("Flatten", 0, 1, 0.01),
         ),
-        Parameter(
+        number(
             "edges",
-            "number",
             0.0,
             "Darkness of lines along edges: 0 draws none.",
-            0,
-            1,
+            (0, 1),
             domain="share",
             idle=0.0,
             metavar="0...1",
             slider=Slider("Lines", 0, 1, 0.05),
         ),
-        Parameter(
+        number(
             "edge_width",
-            "number",
             0.2,
             "Width of the lines along edges, in hundredths of the short side.",
-            0.01,
-            2,
+            (0.01, 2),
             "%",
             domain="positive",
             min_pixels=0.3,  # thinnest line that pixels can show

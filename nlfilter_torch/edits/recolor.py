@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph, check_tensor
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, nearby, region_means, split_luminance
+from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
@@ -103,7 +103,7 @@ def fit_recolor(
     old = region_means(split_luminance(scribbles.image.unsqueeze(2))[1], regions.unsqueeze(2))
     inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
     options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
-    options["spatial_bandwidth"] = nearby(spatial_bandwidth, RECOLOR["spatial_bandwidth"].share, source.size)
+    options["spatial_bandwidth"] = RECOLOR["spatial_bandwidth"].distance(spatial_bandwidth, source.size)
     found = fit_regions(source, inside, [] if kept is None else [kept], reach=reach, **options)
     change = Recoloring(colours, old, valid)
     reduced = split_luminance(found.reduced)[1]

@@ -20,9 +20,14 @@ ALIKE = "How much two places may differ and still count as similar"
 FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 
 
+def number(name: str, default: Any, help: str, ends: tuple[float, float], unit: Unit = "", **more: Any) -> Parameter:
+    """Declare a number within a range."""
+    return Parameter(name, "number", default, help, *ends, unit, **more)
+
+
 def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
     """Declare a factor."""
-    return Parameter(name, "number", default, help, *GAINS, "gain", domain="finite", **more)
+    return number(name, default, help, GAINS, "gain", domain="finite", **more)
 
 
 def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
@@ -46,12 +51,11 @@ def filter_parameters(
 ) -> tuple[Parameter, ...]:
     """Declare the filter parameters of an edit, with its defaults; ``far`` allows ``"none"`` as spatial bandwidth."""
     levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) affect fine texture only, large ones (40) treat "
-    photometric = Parameter(
+    photometric = number(
         "bandwidth",
-        "number",
         bandwidth,
         levels + ("much as detail. `auto` estimates it from the picture." if auto else "wide areas as one."),
-        *BANDWIDTHS,
+        BANDWIDTHS,
         "levels",
         words=("auto",) if auto else (),
         optional=bandwidth is None,
@@ -63,12 +67,11 @@ def filter_parameters(
         reach += ". `none`: distance is ignored, and large areas of light and dark count as detail too"
     return (
         photometric,
-        Parameter(
+        number(
             "spatial_bandwidth",
-            "number",
             None,
             f"How far apart two places may be and still count as similar. Default: {reach}.",
-            *DISTANCES,
+            DISTANCES,
             "px",
             words=("none",) if far else (),
             optional=True,
@@ -118,39 +121,33 @@ LIMITS = choice(
     "Limits of brightening and darkening: `soft` keeps detail in highlights and shadows, `none` lets them clip.",
 )
 #: For all edits of brightness.
-VIEWING_SIZE = Parameter(
+VIEWING_SIZE = number(
     "viewing_size",
-    "number",
     1.5,
     "Size at which the picture is viewed, in megapixels, so that the sliders have the same effect at any resolution. "
     "In larger photographs, patches and lengths are measured in pixels at that size. 0: the size of the file.",
-    0,
-    1e6,
+    (0, 1e6),
     domain="not negative",
     zero_meaning="pass 0 for the size of the image",
     metavar="MEGAPIXELS",
     panel=FILTER_PANEL,
 )
 #: For all edits that select objects.
-TOLERANCE = Parameter(
+TOLERANCE = number(
     "tolerance",
-    "number",
     8.0,
     "How much two colours may differ and still count as similar, in units of CIE Lab.",
-    1,
-    100,
+    (1, 100),
     "lab",
     argument="photometric_bandwidth",
     panel=FILTER_PANEL,
 )
 #: For all edits that select regions.
-REACH = Parameter(
+REACH = number(
     "reach",
-    "number",
     0.6,
     "How far a region spreads to less similar areas. 0 stays close, 0.95 goes far.",
-    0,
-    0.999,
+    (0, 0.999),
     domain="below 1",
     metavar="0...1",
     panel=FILTER_PANEL,

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_order, check_photograph
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.colour import nearby_or_far
 from nlfilter_torch.edits.in_memory import edited
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import TONE
@@ -110,7 +109,7 @@ def fit_tone(
     def change(viewed: Source) -> Fitted:
         filter_options = options | {
             "photometric_bandwidth": photometric_bandwidth,
-            "spatial_bandwidth": nearby_or_far(spatial_bandwidth, TONE["spatial_bandwidth"].share, viewed.size),
+            "spatial_bandwidth": TONE["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size),
             "num_landmarks": num_landmarks,
         }
         operator, mean = viewed.operator(Guide(filter_options)), viewed.mean(luminance)

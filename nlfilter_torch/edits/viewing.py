@@ -16,7 +16,6 @@ reduced, is nearly the small result, which the editor shows while a slider moves
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +25,7 @@ from nlfilter_torch.core.values import cached_constants
 from nlfilter_torch.edits.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
 from nlfilter_torch.edits.pixels import Fitted, Pixels, Planes, corner
 from nlfilter_torch.edits.resizing import interpolation, resized
+from nlfilter_torch.edits.source import Source
 from nlfilter_torch.operator.features import pad_border
 
 MEGAPIXEL = 1_000_000
@@ -46,29 +46,9 @@ def viewed_size(size: tuple[int, int], megapixels: float) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-class Reducible(Protocol):
-    """The part of :class:`~nlfilter_torch.edits.source.Source` that is used here."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W)."""
-
-    def resized(self, size: tuple[int, int]) -> Any:
-        """Reduce the picture to a smaller size."""
-
-    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
-        """Reduce planes (B, C, h, w) of all its pixels to a smaller size."""
-
-    def cached(self, fitted: Fitted) -> Fitted:
-        """Compute the result of an edit and keep it in memory, if there is room for it."""
-
-    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means (B, S, 1, 1) of a function of the image and of the result of an edit."""
-
-
 def fit_change(
-    source: Reducible,
-    change: Callable[[Any], Fitted],
+    source: Source,
+    change: Callable[[Source], Fitted],
     planes: Planes,
     size: float,
     limits: Limits,
@@ -99,7 +79,7 @@ def fit_change(
 
 
 def within_limits(
-    source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None = 0.0
+    source: Source, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None = 0.0
 ) -> Fitted:
     """The edit that applies a change of brightness to a picture; arguments as those of :func:`fit_change`."""
     fitted, balance = _limited(source, change, limits, brighter)
@@ -110,13 +90,13 @@ def within_limits(
     return fitted.then(changed)
 
 
-def balance(source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor) -> Balance | None:
+def balance(source: Source, change: Fitted, limits: Limits, brighter: float | Tensor) -> Balance | None:
     """The balance of a picture under a change of its brightness; arguments as those of :func:`fit_change`."""
     return _limited(source, change, limits, brighter)[1]
 
 
 def _limited(
-    source: Reducible, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None
+    source: Source, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None
 ) -> tuple[Fitted, Balance | None]:
     """The change, limited, and the balance of the picture."""
     if limits == "none":
@@ -149,7 +129,7 @@ class Coarse:
         parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
-    def changes(self, source: Reducible, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
+    def changes(self, source: Source, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
         """Function from pixels to the changes of their ``planes`` and of their saturation."""
         finer = self._of_larger(source, planes)
         return lambda pixels: finer._moved(planes(pixels), finer._at(pixels, source.size))
@@ -159,7 +139,7 @@ class Coarse:
         changed = moved, saturation if saturation.shape[1] else None
         return move_luminance(image, *(clamped(image, *changed) if self.limits == "soft" else changed))
 
-    def _of_larger(self, source: Reducible, planes: Planes) -> "Coarse":
+    def _of_larger(self, source: Source, planes: Planes) -> "Coarse":
         """Correct the change so that its mean over blocks of a larger picture is the change of the small one.
 
         The change of detail that the small picture lacks has a nonzero mean, which is subtracted here.

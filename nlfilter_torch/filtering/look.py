@@ -13,15 +13,22 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_dtype, check_finite, check_tensor
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.filtering.local_tone import STRENGTHS, LocalCurves, mean_ramps
-from nlfilter_torch.filtering.stretch import KINDS, Stretch, ends_of, tones
+from nlfilter_torch.filtering.histogram import (
+    DARKEST,
+    KINDS,
+    STRENGTHS,
+    LocalCurves,
+    Stretch,
+    ends_of,
+    mean_ramps,
+    tones,
+)
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
-DARKEST = 1 / 255  # smallest value of the largest channel for which saturation is defined
 #: Parts of a look, with their shapes for one image; a letter is any length from 2 on.
 SHAPES: dict[str, tuple[int | str, ...]] = {
     "alpha": ("k+1",),

@@ -15,9 +15,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from nlfilter_torch.filtering.local_tone import STRENGTHS
+from nlfilter_torch.filtering.histogram import KINDS, STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, below_largest, saturation_hats
-from nlfilter_torch.filtering.stretch import KINDS
 
 Parts = tuple[str, ...]
 

@@ -9,10 +9,9 @@ from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_count, check_image
 from nlfilter_torch.core.precision import as_given, working_dtype
-from nlfilter_torch.filtering.local_tone import STRENGTHS
+from nlfilter_torch.filtering.histogram import KINDS, STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
 from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
-from nlfilter_torch.filtering.stretch import KINDS
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels

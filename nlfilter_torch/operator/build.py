@@ -30,14 +30,14 @@ from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_gra
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideChannels,
+    GuideFeatures,
     bandwidth_of_rows,
     estimate_bandwidth,
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
-from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 
@@ -63,6 +63,25 @@ class Construction:
             check_positive(self.tolerance, "tolerance")
         if self.generator is not None:
             check_instance(self.generator, torch.Generator, "generator", "create one with torch.Generator()")
+
+    def count(self, points: int) -> int:
+        """Number of landmarks, reduced with a warning where there are fewer points."""
+        if self.num_landmarks > points:
+            got = described(self.num_landmarks)
+            warn(f"num_landmarks must be at most the number of pixels, {points}, got {got}; using every pixel")
+        return min(self.num_landmarks, points)
+
+
+def check_bandwidths(
+    photometric: float | Tensor | str, spatial: float | Tensor | None, batch: int | None = None
+) -> None:
+    """Raise unless these are bandwidths, for all images or for each of a batch."""
+    if isinstance(photometric, str):
+        check_choice(photometric, "photometric_bandwidth", ("auto",), "pass it or a number")
+    else:
+        check_positive(photometric, "photometric_bandwidth", batch)
+    if spatial is not None:
+        check_positive(spatial, "spatial_bandwidth", batch)
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:
@@ -145,12 +164,7 @@ def nonlocal_operator(
     check_image(guide, "guide", empty=True)
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
-    if isinstance(photometric_bandwidth, str):
-        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",), "pass it or a number")
-    else:
-        check_positive(photometric_bandwidth, "photometric_bandwidth", guide.shape[0])
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth", guide.shape[0])
+    check_bandwidths(photometric_bandwidth, spatial_bandwidth, guide.shape[0])
     if not is_hidden(guide) and _is_small(photometric_bandwidth) and not called_by_edit():
         warn_of_scale(guide, "guide")
     guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
@@ -278,10 +292,8 @@ def _assemble(
     Landmarks (B, D, M) are chosen by the method unless they are already ``chosen``.
     """
     whole = among.whole(size)
-    points, count, tolerance = whole[0] * whole[1], method.num_landmarks, method.tolerance
-    if count > points:
-        warn(f"num_landmarks must be at most the number of pixels, {points}, got {described(count)}; using every pixel")
-        count = points
+    points, tolerance = whole[0] * whole[1], method.tolerance
+    count = method.count(points)
     if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
     in_graph = torch.compiler.is_compiling()  # never with a generator, weights or a group

@@ -4,6 +4,7 @@ Also the estimate of the photometric bandwidth. Paper: Appendix A, eq. (20).
 """
 
 import math
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, Literal
 
@@ -28,7 +29,6 @@ from nlfilter_torch.core.values import is_hidden
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 GuideChannels = Literal["luminance", "all"]
-Bandwidth = float | Tensor | None
 
 
 def patch_window(patch_size: int) -> Tensor:
@@ -77,54 +77,61 @@ def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
     return guide
 
 
-def extract_features(
-    guide: Tensor,
-    *,
-    patch_weights: Tensor,
-    photometric_bandwidth: float | Tensor,
-    spatial_bandwidth: Bandwidth = None,
-    origin: tuple[int, int] = (0, 0),
-    halo: tuple[int, int] = (0, 0),
-    stride: int = 1,
-) -> Tensor:
-    """Compute features that define the kernel by their squared distances: ``K_ij = exp(-||x_i - x_j||^2)``.
+@dataclass(frozen=True, eq=False)
+class GuideFeatures:
+    """Features that define the kernel by their squared distances: ``K_ij = exp(-||x_i - x_j||^2)``.
 
     Paper: eq. (1), with the mean over channels if the guide has several, and eq. (18).
 
-    Args:
-        guide: (B, C, H, W), already reduced to the channels to be compared.
+    Attributes:
         patch_weights: (p, p), non-negative, of unit sum; differentiable.
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
         spatial_bandwidth: h_x in pixels, a number or a tensor of shape () or (B,); None leaves out the coordinates.
-        origin: coordinates (row, column) of the first pixel.
-        halo: numbers of rows at the top and at the bottom that are read by patches but get no features themselves.
-        stride: n, to use only the pixel in the middle of each complete square of n x n pixels.
-
-    Returns:
-        (B, D, N) with D = C p^2, plus 2 with coordinates; N counts the pixels outside the halo. Pixels come last: each
-        feature is a plane.
+        guide_channels: ``"luminance"`` or ``"all"``.
     """
-    batch, channels, height, width = guide.shape
-    size = patch_weights.shape[0]
-    weights = patch_weights.to(guide).div(channels)
-    # The derivative of the root is infinite at 0, but that of squared distances is not.
-    scale = (weights + FAINT_WEIGHT * (weights == 0)).sqrt() / per_image(photometric_bandwidth, guide, 3)
-    padded = pad_border(guide, size // 2)
-    # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
-    padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
-    features: Tensor = (
-        _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
-        if stride == 1
-        else _strided_patches(padded, scale, stride)
-    )
-    if spatial_bandwidth is None:
-        return features
-    height, width = (height - halo[0] - halo[1]) // stride, width // stride
-    rows = origin[0] + halo[0] + stride * torch.arange(height, dtype=guide.dtype, device=guide.device)
-    columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
-    grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
-    coordinates = grid / per_image(spatial_bandwidth, guide, 3)
-    return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
+
+    patch_weights: Tensor
+    photometric_bandwidth: float | Tensor
+    spatial_bandwidth: float | Tensor | None
+    guide_channels: GuideChannels
+
+    def __call__(
+        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0), stride: int = 1
+    ) -> Tensor:
+        """Compute the features of a guide, or of a tile of it.
+
+        Args:
+            guide: (B, C, H, W), with the channels of the guide from which the landmarks come.
+            origin: coordinates (row, column) of the first pixel in that guide.
+            halo: numbers of rows at the top and at the bottom that are read by patches but get no features themselves:
+                half a patch, or less at the border of the whole guide.
+            stride: n, to use only the pixel in the middle of each complete square of n x n pixels.
+
+        Returns:
+            (B, D, N) with D = C p^2, plus 2 with coordinates; N counts the pixels outside the halo. Pixels come last:
+            each feature is a plane.
+        """
+        guide = reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels)
+        batch, channels, height, width = guide.shape
+        weights = self.patch_weights.to(guide).div(channels)
+        # The derivative of the root is infinite at 0, but that of squared distances is not.
+        scale = (weights + FAINT_WEIGHT * (weights == 0)).sqrt() / per_image(self.photometric_bandwidth, guide, 3)
+        padded = pad_border(guide, weights.shape[0] // 2)
+        # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
+        padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
+        features: Tensor = (
+            _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
+            if stride == 1
+            else _strided_patches(padded, scale, stride)
+        )
+        if self.spatial_bandwidth is None:
+            return features
+        height, width = (height - halo[0] - halo[1]) // stride, width // stride
+        rows = origin[0] + halo[0] + stride * torch.arange(height, dtype=guide.dtype, device=guide.device)
+        columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
+        grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
+        coordinates = grid / per_image(self.spatial_bandwidth, guide, 3)
+        return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
 
 
 def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:

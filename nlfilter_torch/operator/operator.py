@@ -18,7 +18,8 @@ from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
-from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
+from nlfilter_torch.operator.features import GuideFeatures
+from nlfilter_torch.operator.nystrom import Kernel
 from nlfilter_torch.operator.products import apply_powers
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum

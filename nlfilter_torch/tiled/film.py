@@ -20,8 +20,7 @@ from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.build import operator_from_features
-from nlfilter_torch.operator.features import estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.kernel import GuideFeatures
+from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs

@@ -6,24 +6,22 @@ rectangle's own pixels are needed. This is how the editor shows a part of a larg
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.applying import fit_step
+from nlfilter_torch.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.pictures import GuidePicture, Picture, RowSource
+from nlfilter_torch.tiled.pictures import GuidePicture, LazyRows, Picture, RowSource
 from nlfilter_torch.tiled.sampling import ColumnCache, Report, in_silence
+from nlfilter_torch.tiled.scribbles import colour_rows, mask_rows
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.strokes import strokes_by_rows
 from nlfilter_torch.tiled.tiles import Passes, Statistics, intermediate
 from nlfilter_torch.tiled.workers import in_order
 
@@ -69,33 +67,17 @@ def _grown(places: range, margin: int, length: int) -> range:
     return range(max(0, places.start - margin), min(length, places.stop + margin))
 
 
-@dataclass(frozen=True)
-class SomeColumns:
-    """Some columns of a source of rows."""
-
-    whole: RowSource
-    columns: range
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(H, w) or (H, w, S)."""
-        return (self.whole.shape[0], len(self.columns), *self.whole.shape[2:])
-
-    @property
-    def dtype(self) -> Any:
-        """Dtype of the source."""
-        return self.whole.dtype
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """The rows from ``rows.start`` to ``rows.stop``."""
-        return np.asarray(self.whole[rows])[:, self.columns.start : self.columns.stop]
+def some_columns(whole: RowSource, columns: range) -> LazyRows:
+    """Some columns of rows (H, W) or (H, W, S)."""
+    shape = (whole.shape[0], len(columns), *whole.shape[2:])
+    return LazyRows(shape, lambda rows: np.asarray(whole[rows])[:, columns.start : columns.stop], whole.dtype)
 
 
 def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
     """Read the pixels of a rectangle."""
     margin = tiled.margin
     around = part.grown(margin, tiled.size)
-    picture = Picture(SomeColumns(tiled.picture.source, around.columns), tiled.picture.name)
+    picture = Picture(some_columns(tiled.picture.source, around.columns), tiled.picture.name)
     tile = picture.tile(part.rows.start, part.rows.stop, margin)
     columns = part.inside(around)[1]
 
@@ -145,7 +127,7 @@ class Stage:
         if self._fitted is None or self._fitted[0] != step:
             self._fitted = None
             tiled = Tiled(self.picture, passes)
-            fitted = fit_step(step, tiled, *strokes_by_rows(step, tiled.size))
+            fitted = fit_step(step, tiled, *scribbles_of(step, tiled.size, colour_rows, mask_rows))
             for operator in tiled.operators:
                 operator.prepare()
             self._fitted = step, tiled, fitted
@@ -232,7 +214,7 @@ class Parts:
     def original(self, part: Rectangle) -> Tensor:
         """A rectangle (1, C, h, w) of the picture, in [0, 1]."""
         picture = self._stages[0].picture
-        columns = Picture(SomeColumns(picture.source, part.columns), picture.name)
+        columns = Picture(some_columns(picture.source, part.columns), picture.name)
         return columns.tile(part.rows.start, part.rows.stop, 0).inner.clamp(0, 1)
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from nlfilter_torch.tiled.workers import in_order
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
+CHUNK_ROWS = 64  # of rows that are only searched
 STATISTICS_PIXELS = 1 << 15  # in a block of a pass; independent of the tile size, so that sums agree bit by bit
 
 
@@ -32,6 +33,30 @@ class RowSource(Protocol):
 
     def __getitem__(self, rows: slice, /) -> Any:
         """The rows from ``rows.start`` to ``rows.stop``."""
+
+
+@dataclass(frozen=True)
+class LazyRows:
+    """Rows that are computed when they are read.
+
+    Attributes:
+        shape: (H, W) or (H, W, S).
+        read: computes the rows from ``rows.start`` to ``rows.stop``.
+        dtype: a numpy dtype.
+    """
+
+    shape: tuple[int, ...]
+    read: Callable[[slice], NDArray[Any]]
+    dtype: Any = np.float32
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        return self.read(rows)
+
+    def any(self) -> bool:
+        """Whether a value is not 0; reads a few rows at a time."""
+        height = self.shape[0]
+        return any(self[start : min(start + CHUNK_ROWS, height)].any() for start in range(0, height, CHUNK_ROWS))
 
 
 class RowTarget(Protocol):

@@ -7,14 +7,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from nlfilter_torch.edits.applying import fit_step
+from nlfilter_torch.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.edits.detail import blend_edited
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
+from nlfilter_torch.tiled.scribbles import colour_rows, mask_rows
 from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.strokes import strokes_by_rows
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
 from nlfilter_torch.tiled.workers import single_threaded
 
@@ -76,7 +76,7 @@ def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Ite
     """Yield the rows of a picture after a step, not yet computed."""
     tiled = Tiled(Picture(source, name), passes)
     with single_threaded(passes.workers(1)):
-        fitted = fit_step(step, tiled, *strokes_by_rows(step, tiled.size))
+        fitted = fit_step(step, tiled, *scribbles_of(step, tiled.size, colour_rows, mask_rows))
     with tiled.tiling(fitted) as tiling:
         yield tiling
 

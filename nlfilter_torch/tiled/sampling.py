@@ -13,19 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_choice, check_count, check_positive, warn
+from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.operator.build import Construction, check_bandwidths
 from nlfilter_torch.operator.features import (
     GuideChannels,
+    GuideFeatures,
     bandwidth_of_gradient,
     gradients,
     pad_border,
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.kernel import GuideFeatures, Kernel
 from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
 from nlfilter_torch.operator.operator import Columns
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
@@ -133,22 +134,10 @@ def take_pilot(
     Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
     """
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"))
-    check_choice(completion, "completion", ("diagonal", "none"))
-    check_count(num_landmarks, "num_landmarks")
+    method = Construction(num_landmarks, landmarks, completion, None, generator)
     window = unit_window(patch_size, None).to(picture.dtype)
-    if isinstance(photometric_bandwidth, str):
-        check_choice(photometric_bandwidth, "photometric_bandwidth", ("auto",))
-    else:
-        check_positive(photometric_bandwidth, "photometric_bandwidth")
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth")
-    if num_landmarks > picture.pixels:
-        warn(
-            f"num_landmarks must be at most the number of pixels, {picture.pixels}, got {num_landmarks}; "
-            "using every pixel"
-        )
-        num_landmarks = picture.pixels
+    check_bandwidths(photometric_bandwidth, spatial_bandwidth)
+    num_landmarks = method.count(picture.pixels)
 
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     candidates = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
@@ -215,7 +204,7 @@ def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
 
 
 def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
-    """Features (1, D, n), as of :func:`extract_features`, from patches (1, C p^2, n) and indices of their pixels."""
+    """Features (1, D, n), as of :class:`GuideFeatures`, from patches (1, C p^2, n) and indices of their pixels."""
     window = recipe.patch_weights
     channels = patches.shape[1] // window.numel()
     scale = (window / channels).sqrt() / torch.as_tensor(recipe.photometric_bandwidth, dtype=window.dtype)

@@ -1,39 +1,31 @@
 """The scribbled pixels of a picture that is read by rows."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
-from nlfilter_torch.tiled.pictures import Picture, RowSource, transparency
+from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
+from nlfilter_torch.tiled.pictures import LazyRows, Picture, RowSource, stored_as, transparency
 
 ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
-@dataclass(frozen=True)
-class RegionRows:
-    """The mask of region ``region``: rows (h, W), one channel of rows (h, W, K)."""
+def mask_rows(strokes: Sequence[Stroke], size: tuple[int, int]) -> LazyRows:
+    """The mask of strokes over a picture (H, W), rasterised as it is read: rows (H, W, 1) of zeros and ones."""
+    return LazyRows((*size, 1), lambda rows: stored_as(mask_of(strokes, size, rows), "float32"))
 
-    masks: RowSource
-    region: int
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(H, W)."""
-        return tuple(self.masks.shape[:2])
+def colour_rows(strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[LazyRows, None]:
+    """Strokes over a picture (H, W), rasterised as they are read: rows (H, W, 4) in RGB with their mask, and None."""
+    return LazyRows((*size, 4), lambda rows: stored_as(torch.cat(paint(strokes, size, rows), dim=1), "float32")), None
 
-    @property
-    def dtype(self) -> Any:
-        """Dtype of the masks."""
-        return self.masks.dtype
 
-    def __getitem__(self, rows: slice) -> Any:
-        """The rows from ``rows.start`` to ``rows.stop``."""
-        return np.asarray(self.masks[rows])[..., self.region]
+def region_rows(masks: RowSource, region: int) -> LazyRows:
+    """The mask (H, W) of a region, one channel of rows (H, W, K)."""
+    return LazyRows(tuple(masks.shape[:2]), lambda rows: np.asarray(masks[rows])[..., region], masks.dtype)
 
 
 def read_scribbles(

@@ -18,12 +18,17 @@ from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.resizing import block_means, resized, resized_parts
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
-from nlfilter_torch.filtering.stretch import ends_of
+from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.sampling import ColumnCache, take_pilot, visit
-from nlfilter_torch.tiled.scribbles import RegionRows, check_scribble_memory, floats_per_scribbled_pixel, read_scribbles
+from nlfilter_torch.tiled.scribbles import (
+    check_scribble_memory,
+    floats_per_scribbled_pixel,
+    read_scribbles,
+    region_rows,
+)
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
 from nlfilter_torch.tiled.workers import Result, in_order, single_threaded
 
@@ -144,7 +149,7 @@ class Tiled:
         """
         if len(masks.shape) == 2:
             return [self.scribbles(masks, None, name)]
-        return [self.scribbles(RegionRows(masks, k), None, name) for k in range(masks.shape[2])]
+        return [self.scribbles(region_rows(masks, k), None, name) for k in range(masks.shape[2])]
 
     def colours(self, places: Tensor) -> Tensor:
         """Read the colours (1, C, n) of single pixels."""

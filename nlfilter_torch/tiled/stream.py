@@ -1,7 +1,10 @@
 """Edits of pictures whose factor exceeds memory: statistics from passes or a sample, then output in tiles."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -10,8 +13,9 @@ from nlfilter_torch.edits.colorize import fit_colorize
 from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.edits.parameters import COLORIZE, DETAIL, RECOLOR
 from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.tiled.pictures import Picture, RowSource, RowTarget
-from nlfilter_torch.tiled.sampling import Report
+from nlfilter_torch.tiled.sampling import Report, in_silence
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
 from nlfilter_torch.tiled.workers import single_threaded
@@ -77,21 +81,10 @@ def stream_detail(
         >>> np.array_equal(edited, picture)
         True
     """
-    check_target(target, source)
-    tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
-    with single_threaded(tiled.passes.workers(1)):
-        fitted = fit_detail(
-            tiled,
-            alpha,
-            regions,
-            negative=negative,
-            residual=residual,
-            reach=reach,
-            channels=channels,
-            **options,
-        )
-    fill(target, tiled.rows(fitted))
+    options |= {"negative": negative, "residual": residual, "reach": reach, "channels": channels}
+    fit = partial(fit_detail, alpha=alpha, regions=regions, **options)
+    _stream(source, target, fit, statistics, sample, tile_rows, memory, report)
 
 
 def stream_recolor(
@@ -152,16 +145,14 @@ def stream_recolor(
         >>> np.array_equal(recoloured[:, :18], picture[:, :18])
         True
     """
-    check_target(target, source)
-    tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
-    if tiled.channels != 3:
+    picture = Picture(source)
+    if picture.colours != 3:
         raise ValueError(
-            f"source must have 3 or 4 channels to be recoloured, got {tiled.picture.samples}; use colorize instead"
+            f"source must have 3 or 4 channels to be recoloured, got {picture.samples}; use colorize instead"
         )
-    options |= {"photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
-    with single_threaded(tiled.passes.workers(1)):
-        fitted = fit_recolor(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)
-    fill(target, tiled.rows(fitted))
+    options |= {"keep": keep, "reach": reach, "photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
+    fit = partial(fit_recolor, strokes=strokes, stroke_mask=stroke_mask, **options)
+    _stream(source, target, fit, statistics, sample, tile_rows, memory, report)
 
 
 def stream_colorize(
@@ -224,19 +215,37 @@ def stream_colorize(
         >>> bool((blue > red)[:, :17].all()), bool((red > blue)[:, 23:].all())
         (True, True)
     """
-    check_target(target, source, coloured=True)
-    tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
+    fit = partial(
+        fit_colorize,
+        strokes=strokes,
+        stroke_mask=stroke_mask,
+        method=method,
+        strength=strength,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        generator=generator,
+    )
+    _stream(source, target, fit, statistics, sample, tile_rows, memory, report, coloured=True)
+
+
+def _stream(
+    source: RowSource,
+    target: RowTarget,
+    fit: Callable[[Tiled], Fitted],
+    statistics: Statistics,
+    sample: int,
+    tile_rows: int | None,
+    memory: int,
+    report: Report | None,
+    *,
+    coloured: bool = False,
+) -> None:
+    """Fit an edit to a picture and write the result; ``coloured`` edits turn grey into colour."""
+    check_target(target, source, coloured=coloured)
+    kind = np.dtype(target.dtype).name
+    tiled = Tiled(Picture(source), Passes(kind, statistics, sample, tile_rows, memory, report or in_silence))
     with single_threaded(tiled.passes.workers(1)):
-        fitted = fit_colorize(
-            tiled,
-            strokes,
-            stroke_mask,
-            method=method,
-            strength=strength,
-            photometric_bandwidth=photometric_bandwidth,
-            spatial_bandwidth=spatial_bandwidth,
-            patch_size=patch_size,
-            num_landmarks=num_landmarks,
-            generator=generator,
-        )
+        fitted = fit(tiled)
     fill(target, tiled.rows(fitted))

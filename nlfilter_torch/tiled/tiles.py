@@ -53,18 +53,6 @@ class Passes:
     threads: int = field(default_factory=torch.get_num_threads)
     processes: "Processes | None" = None
 
-    @staticmethod
-    def of(
-        target: RowTarget,
-        statistics: Statistics,
-        sample: int,
-        tile_rows: int | None,
-        memory: int,
-        report: Report | None,
-    ) -> "Passes":
-        """The options of an edit that writes to a target."""
-        return Passes(np.dtype(target.dtype).name, statistics, sample, tile_rows, memory, report or in_silence)
-
     def __post_init__(self) -> None:
         """Raise unless all options are valid."""
         check_choice(self.statistics, "statistics", ("sample", "full"))

@@ -1,9 +1,14 @@
-"""Tone curves of every part of a picture, which equalise the histogram around it as far as limits of contrast allow.
+"""Changes by the histogram of a picture: automatic levels of the whole, and tone curves of its parts.
 
-After Zuiderveld, "Contrast Limited Adaptive Histogram Equalization" (1994): clipped histograms of 8 x 8 tiles give
-curves, and a pixel takes its value from the curves of the four nearest tiles. Here histograms are of hat functions, so
-that curves are continuous in the picture. What curves of luminance change is added to every channel; curves of the
-largest channel (value in HSV), which is stretched to the whole range first, scale colours.
+Automatic levels stretch brightness to the whole range, from the darkest to the lightest pixel. There are three kinds:
+of luminance, which changes all channels alike; of the largest channel (value in HSV), which scales colours; and of each
+channel for itself. As in other programs, single outliers set the range.
+
+Tone curves equalise the histogram around a pixel as far as limits of contrast allow. After Zuiderveld, "Contrast
+Limited Adaptive Histogram Equalization" (1994): clipped histograms of 8 x 8 tiles give curves, and a pixel takes its
+value from the curves of the four nearest tiles. Here histograms are of hat functions, so that curves are continuous in
+the picture. What curves of luminance change is added to every channel; curves of the largest channel, which is
+stretched to the whole range first, scale colours.
 """
 
 from collections.abc import Callable
@@ -14,13 +19,66 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.filtering.stretch import DARKEST, Stretch, brightness
+from nlfilter_torch.operator.features import reduce_channels
 
+DARKEST = 1 / 255  # colours are divided by their largest channel, or by this if it is smaller
+KINDS = 3  # of automatic levels
+FLAT = 1 / 255  # range of a picture that is not stretched
 LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
-STRENGTHS = 2 * len(LIMITS)  # of luminance, and of the largest channel
+STRENGTHS = 2 * len(LIMITS)  # of tone curves of luminance, and of the largest channel
 SHADES = 33
 TILES = 8  # along both sides
 FINE = 16  # blocks along the short side of a tile that histograms are first taken of
+
+
+def brightness(image: Tensor) -> Tensor:
+    """Luminance and largest channel (B, 2, H, W) of an image (B, C, H, W)."""
+    return torch.cat([reduce_channels(image, "luminance").mean(1, keepdim=True), image.amax(1, keepdim=True)], dim=1)
+
+
+def tones(image: Tensor) -> Tensor:
+    """What is stretched: both kinds of :func:`brightness` and the channels, (B, 2 + C, H, W)."""
+    return torch.cat([brightness(image), image], dim=1)
+
+
+def ends_of(planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest values (B, C, 1, 1) of planes (B, C, H, W)."""
+    return planes.amin((2, 3), keepdim=True), planes.amax((2, 3), keepdim=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """The range of a picture's :func:`tones`.
+
+    Attributes:
+        darkest: (B, 2 + C, 1, 1).
+        width: distance to the lightest; 1 where it is so small that nothing is stretched, and ``darkest`` is 0 there.
+    """
+
+    darkest: Tensor
+    width: Tensor
+
+    @staticmethod
+    def of(ends: tuple[Tensor, Tensor]) -> "Stretch":
+        """The range between the least and the largest :func:`tones` of a picture, (B, 2 + C, 1, 1) each."""
+        width = ends[1] - ends[0]
+        flat = width < FLAT
+        return Stretch(ends[0].masked_fill(flat, 0.0), width.masked_fill(flat, 1.0))
+
+    def largest(self, values: Tensor) -> Tensor:
+        """Stretch the largest channels (B, 1, H, W) of pixels."""
+        return (values - self.darkest[:, 1:2]) / self.width[:, 1:2]
+
+    def changes(self, image: Tensor) -> Tensor:
+        """What each kind changes of an image (B, C, H, W): (B, KINDS, C, H, W)."""
+        found = tones(image)
+        moved = (found - self.darkest) / self.width - found
+        scaled = moved[:, 1:2] * image / found[:, 1:2].clamp(min=DARKEST)
+        return torch.stack([moved[:, :1].expand_as(image), scaled, moved[:, 2:]], dim=1)
+
+    def change(self, image: Tensor, strengths: Tensor) -> Tensor:
+        """The sum (B, C, H, W) of all kinds, weighted by strengths (KINDS,) or (B, KINDS)."""
+        return (strengths.to(image).reshape(-1, KINDS, 1, 1, 1) * self.changes(image)).sum(1)
 
 
 def ramps(image: Tensor, stretch: Stretch) -> Tensor:
