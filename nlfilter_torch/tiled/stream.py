@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha
-from nlfilter_torch.edits.colorize import fit_colorize
-from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.colorize import colorize
+from nlfilter_torch.edits.detail import enhance
 from nlfilter_torch.edits.parameters import COLORIZE, DETAIL, RECOLOR
-from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.edits.recolor import recolor
 from nlfilter_torch.tiled.pictures import Picture, RowSource, RowTarget
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.source import Tiled
@@ -81,7 +81,7 @@ def stream_detail(
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
     with single_threaded(tiled.passes.workers(1)):
-        fitted = fit_detail(
+        fitted = enhance.fit(
             tiled,
             alpha,
             regions,
@@ -160,7 +160,7 @@ def stream_recolor(
         )
     options |= {"photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
     with single_threaded(tiled.passes.workers(1)):
-        fitted = fit_recolor(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)
+        fitted = recolor.fit(tiled, strokes, stroke_mask, keep=keep, reach=reach, **options)
     fill(target, tiled.rows(fitted))
 
 
@@ -227,7 +227,7 @@ def stream_colorize(
     check_target(target, source, coloured=True)
     tiled = Tiled(Picture(source), Passes.of(target, statistics, sample, tile_rows, memory, report))
     with single_threaded(tiled.passes.workers(1)):
-        fitted = fit_colorize(
+        fitted = colorize.fit(
             tiled,
             strokes,
             stroke_mask,
