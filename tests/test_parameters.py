@@ -3,6 +3,7 @@
 import ast
 import inspect
 import re
+from typing import get_args
 
 import pytest
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 import nlfilter_torch
 from benchmarks import parameters
 from nlfilter_torch.edits.declaration import Edit, Parameter
-from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.parameters import EDITS, MASK
 from nlfilter_torch.edits.shared_parameters import FILTER
 from nlfilter_torch.edits.source import Source
 from tests.pages import ROOT
@@ -69,6 +70,15 @@ def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
         function()
     with pytest.raises(TypeError, match=rf"{name}\(\) got multiple values for argument '{picture}'"):
         function(None, **{picture: None})
+
+
+@pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
+def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> None:
+    function = inspect.signature(getattr(nlfilter_torch, PUBLIC.get(edit.name, edit.name))).parameters
+    for parameter in edit:
+        if parameter.kind == "number" and parameter.domain is not None:
+            annotation = function[parameter.keyword].annotation
+            assert parameter.per_image == (Tensor in get_args(annotation)), parameter.name
 
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)

@@ -78,13 +78,10 @@ def abstract(
         True
     """
     check_count(num_landmarks, "num_landmarks")
-    ABSTRACT["power"].check_argument(power, source.batch)
-    ABSTRACT["edges"].check_argument(edges)
-    ABSTRACT["edge_width"].check_argument(edge_width)
-    ABSTRACT["viewing_size"].check_argument(viewing_size)
+    ABSTRACT.check(source.batch, power=power, edges=edges, edge_width=edge_width, viewing_size=viewing_size)
     width = ABSTRACT["edge_width"].pixels(edge_width, source.size)
     check_reach(width, "edge_width", source.size)
-    ABSTRACT["tones"].check_argument(tones)
+    ABSTRACT.check(tones=tones)
     if (edges > 0 or tones is not None) and source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3")
 

@@ -125,20 +125,20 @@ def colorize(
     """
     if source.whole:  # otherwise they are checked when they are read
         check_tensor(strokes, "strokes")
-    COLORIZE["method"].check_argument(method)
+    COLORIZE.check(method=method)
     if method == "kmeans" and not source.whole:
         raise ValueError(
             "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in memory; "
             "choose regression, or allow more memory"
         )
-    COLORIZE["strength"].check_argument(strength, source.batch)
+    COLORIZE.check(source.batch, strength=strength)
     check_positive(time, "time", source.batch)
     check_positive(photometric_bandwidth, "photometric_bandwidth", source.batch)
     if spatial_bandwidth is not None:
         check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
     check_patch_size(patch_size)
     check_count(num_landmarks, "num_landmarks")
-    COLORIZE["viewing_size"].check_argument(viewing_size)
+    COLORIZE.check(viewing_size=viewing_size)
     scribbles, viewed = source.scribbles(stroke_mask, strokes, "stroke_mask"), source
     small = viewed_size(source.size, viewing_size)
     if small != source.size:

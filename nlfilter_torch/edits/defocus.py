@@ -72,8 +72,7 @@ def defocus(
     """
     if source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
-    DEFOCUS["aperture"].check_argument(aperture)
-    DEFOCUS["radius"].check_argument(radius)
+    DEFOCUS.check(aperture=aperture, radius=radius)
     blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
     check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")

@@ -76,15 +76,14 @@ def denoise(
         >>> bool((denoise(noisy) - clean).std() < 0.03), bool((denoise(noisy, method="rule") - clean).std() < 0.06)
         (True, True)
     """
-    DENOISE["strength"].check_argument(strength, source.batch)
-    DENOISE["method"].check_argument(method)
+    DENOISE.check(source.batch, strength=strength, method=method)
     check_count(num_landmarks, "num_landmarks")
     unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
     if unknown:
         raise TypeError(f"denoise has no argument {unknown[0]}; see its documentation for the valid ones")
     is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
     if not isinstance(noise_level, Noise) and not is_map:  # commands pass the noise that they have estimated
-        DENOISE["noise_level"].check_argument(noise_level, source.batch)
+        DENOISE.check(source.batch, noise_level=noise_level)
     noise: float | Tensor | Noise = noise_of(source) if noise_level is None else noise_level
     if method == "network":
         return _by_network(source, noise, strength)

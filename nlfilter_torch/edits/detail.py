@@ -13,7 +13,6 @@ from nlfilter_torch.core.checks import (
     check_image,
     check_positive,
     check_shape,
-    check_weight,
 )
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.edits.colour import nearby_or_far
@@ -98,12 +97,8 @@ def enhance(
     check_alpha(alpha)
     if regions is not None and source.whole:  # otherwise they are checked when they are read
         check_image(regions, "regions", batch=source.batch)
-    DETAIL["channels"].check_argument(channels)
-    DETAIL["limits"].check_argument(limits)
-    DETAIL["viewing_size"].check_argument(viewing_size)
-    DETAIL["threshold"].check_argument(threshold, source.batch)
-    if residual is not None:
-        check_weight(residual, "residual", source.batch)
+    DETAIL.check(source.batch, channels=channels, limits=limits, viewing_size=viewing_size, threshold=threshold)
+    DETAIL.check(source.batch, residual=residual)
     if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")

@@ -88,8 +88,7 @@ def apply_look(
     """
     if source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
-    LOOK["amount"].check_argument(amount, source.batch)
-    LOOK["viewing_size"].check_argument(viewing_size)
+    LOOK.check(source.batch, amount=amount, viewing_size=viewing_size)
     given = {"alpha": alpha, "bands": bands, "texture": texture, "saturation": saturation}
     given |= {"stretch": stretch, "local": local, "red": red, "green": green, "blue": blue}
     sliders, gains, textured, factors, levels, strengths, *channels = (

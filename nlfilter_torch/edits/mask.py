@@ -212,7 +212,7 @@ def fit_regions(
 
     Further arguments are those of :func:`region_mask`.
     """
-    MASK["reach"].check_argument(reach, source.batch)
+    MASK.check(source.batch, reach=reach)
     if "guide_channels" in options:
         raise TypeError("guide_channels must not be given: masks compare colours and texture; leave it out")
     count, several = len(inside), len(background) > 1

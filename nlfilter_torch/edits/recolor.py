@@ -70,7 +70,7 @@ def recolor(
     """
     if source.whole:  # otherwise they are checked when they are read
         check_tensor(strokes, "strokes")
-    RECOLOR["reach"].check_argument(reach, source.batch)
+    RECOLOR.check(source.batch, reach=reach)
     scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
     kept = None if keep is None else source.scribbles(keep, None, "keep", needed=False)
 

@@ -22,7 +22,7 @@ FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landm
 
 def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
     """Declare a factor."""
-    return Parameter(name, "number", default, help, *GAINS, "gain", domain="finite", **more)
+    return Parameter(name, "number", default, help, *GAINS, "gain", domain="finite", per_image=True, **more)
 
 
 def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
@@ -154,6 +154,7 @@ REACH = Parameter(
     domain="below 1",
     metavar="0...1",
     panel=FILTER_PANEL,
+    per_image=True,
 )
 REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 

@@ -58,10 +58,7 @@ def sharpen(
         >>> sharp.shape, bool(sharp.std() > image.std())
         (torch.Size([1, 3, 32, 32]), True)
     """
-    SHARPEN["amount"].check_argument(amount, source.batch)
-    SHARPEN["guide_blur"].check_argument(guide_blur)
-    SHARPEN["limits"].check_argument(limits)
-    SHARPEN["viewing_size"].check_argument(viewing_size)
+    SHARPEN.check(source.batch, amount=amount, guide_blur=guide_blur, limits=limits, viewing_size=viewing_size)
     middle = torch.as_tensor(amount, dtype=source.dtype).reshape(-1).expand(source.batch)
     still = torch.zeros_like(middle)
     sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, so that the filter gives the change

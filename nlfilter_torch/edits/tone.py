@@ -65,10 +65,7 @@ def adjust_tone(
         (True, True)
     """
     check_order(order)
-    TONE["contrast"].check_argument(contrast, source.batch)
-    TONE["limits"].check_argument(limits)
-    TONE["viewing_size"].check_argument(viewing_size)
-    TONE["clarity"].check_argument(clarity, source.batch)
+    TONE.check(source.batch, contrast=contrast, limits=limits, viewing_size=viewing_size, clarity=clarity)
 
     def slider(value: float | Tensor) -> Tensor:
         return torch.as_tensor(value).to(source.dtype).reshape(-1).expand(source.batch)
