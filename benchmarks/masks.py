@@ -20,7 +20,6 @@ from benchmarks.photographs import photograph
 from nlfilter_torch import region_mask
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.mask import fit_mask
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)
@@ -91,12 +90,12 @@ def speed(side: int) -> None:
     inside[..., side // 2 : side // 2 + side // 20, side // 2 :][..., : side // 10] = 1
     outside[..., : side // 20, : side // 10] = 1
     source = InMemory(image.to(working_dtype(image)), {})
-    source.all(fit_mask(source, inside, outside))  # caches the operator
+    source.all(region_mask.fit(source, inside, outside))  # caches the operator
 
     def add_scribble() -> Tensor:
         free = (outside[0, 0] == 0).nonzero()[0]
         outside[0, 0, free[0] :, free[1] :][:10, :10] = 1  # otherwise the last mask would be returned
-        return source.all(fit_mask(source, inside, outside))
+        return source.all(region_mask.fit(source, inside, outside))
 
     first, further = timed(lambda: region_mask(image, inside, outside)), timed(add_scribble)
     print(f"{side}x{side} on {torch.get_num_threads()} threads: {first:.2f} s, a further scribble {further:.2f} s")

@@ -24,9 +24,8 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.memory import MIB, forget_peak, resident
-from nlfilter_torch import nonlocal_operator, polynomial_filter
+from nlfilter_torch import enhance, nonlocal_operator, polynomial_filter
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.detail import fit_detail
 from nlfilter_torch.edits.steps import working_bytes
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_detail
@@ -102,7 +101,7 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
 
     with open_picture(source, memory) as picture:
         tiled = Tiled(Picture(picture.rows), Passes("uint8", statistics, memory=memory, report=report))
-        rows = tiled.rows(fit_detail(tiled, ALPHA, **(PLAIN | {"num_landmarks": landmarks})))
+        rows = tiled.rows(enhance.fit(tiled, ALPHA, **(PLAIN | {"num_landmarks": landmarks})))
         write_picture(target, rows, "uint8", picture)
         pixels = picture.shape[0] * picture.shape[1]
     report("", 0, 0)

@@ -21,16 +21,14 @@ from numpy.typing import NDArray
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
-from nlfilter_torch.edits.colorize import fit_colorize
 from nlfilter_torch.edits.colour import colour_guide, split_luminance
-from nlfilter_torch.edits.recolor import fit_recolor
 from nlfilter_torch.io.rows import open_picture, write_picture
 from nlfilter_torch.tiled import stream_colorize, stream_recolor
 from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import Passes
 
-VERBS: dict[str, Any] = {"recolor": fit_recolor, "colorize": fit_colorize}
+VERBS: dict[str, Any] = {"recolor": recolor, "colorize": colorize}
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB
     ((0.25, 0.25, 0.02, 0.03), (0, 0, 255)),
     ((0.70, 0.60, 0.02, 0.02), (255, 0, 0)),
@@ -66,7 +64,7 @@ def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
     with open_picture(source, memory) as picture:
         height, width, _ = picture.shape
         tiled = Tiled(Picture(picture.rows), Passes("uint8", memory=memory))
-        write_picture(target, tiled.rows(VERBS[verb](tiled, Boxes((height, width, 4)), None)), "uint8", picture)
+        write_picture(target, tiled.rows(VERBS[verb].fit(tiled, Boxes((height, width, 4)), None)), "uint8", picture)
     return {
         "verb": verb,
         "megapixels": height * width / 1e6,

@@ -2,15 +2,18 @@
 
 import ast
 import inspect
+import re
+from typing import get_args
 
 import pytest
+from torch import Tensor
 
 import nlfilter_torch
 from benchmarks import parameters
-from nlfilter_torch.edits.applying import FITS
 from nlfilter_torch.edits.declaration import Edit, Parameter
-from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.parameters import EDITS, MASK
 from nlfilter_torch.edits.shared_parameters import FILTER
+from nlfilter_torch.edits.source import Source
 from tests.pages import ROOT
 
 EVERY = [(edit, parameter) for edit in EDITS.values() for parameter in edit]
@@ -42,10 +45,45 @@ def test_defaults_are_valid(edit: Edit, parameter: Parameter) -> None:
         parameter.check_argument(parameter.argument_of(value, (400, 600)))
 
 
+PUBLIC = {"detail": "enhance", "tone": "adjust_tone", "look": "apply_look", "mask": "region_mask"}
+NAMES = [PUBLIC.get(name, name) for name in (*EDITS, "mask")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str) -> None:
+    function = getattr(nlfilter_torch, name)
+    described = re.findall(r"^    (\**)(\w+): ", inspect.getdoc(function).split("Args:")[1], flags=re.MULTILINE)
+    assert [argument for _, argument in described] == list(inspect.signature(function).parameters)
+    assert list(function.__annotations__) == [argument for _, argument in described] + ["return"]
+    of_image, *others = inspect.signature(function).parameters.values()
+    of_source, *same = inspect.signature(function.fit).parameters.values()
+    assert (of_image.annotation, of_source.annotation) == (Tensor, Source)
+    assert others == same
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
+    function, picture = getattr(nlfilter_torch, name), "grey" if name == "colorize" else "image"
+    with pytest.raises(TypeError, match=rf"{picture} must be a torch.Tensor, got str"):
+        function(**{picture: "photo.png"})
+    with pytest.raises(TypeError, match=rf"{name}\(\) missing 1 required positional argument: '{picture}'"):
+        function()
+    with pytest.raises(TypeError, match=rf"{name}\(\) got multiple values for argument '{picture}'"):
+        function(None, **{picture: None})
+
+
+@pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
+def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> None:
+    function = inspect.signature(getattr(nlfilter_torch, PUBLIC.get(edit.name, edit.name))).parameters
+    for parameter in edit:
+        if parameter.kind == "number" and parameter.domain is not None:
+            annotation = function[parameter.keyword].annotation
+            assert parameter.per_image == (Tensor in get_args(annotation)), parameter.name
+
+
 @pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
 def test_functions_have_the_declared_defaults(edit: Edit) -> None:
-    public = {"detail": "enhance", "tone": "adjust_tone", "look": "apply_look"}.get(edit.name, edit.name)
-    function = inspect.signature(getattr(nlfilter_torch, public)).parameters
+    function = inspect.signature(getattr(nlfilter_torch, PUBLIC.get(edit.name, edit.name))).parameters
     for parameter in edit:
         name = parameter.keyword
         if name in function and parameter.kind != "sliders" and name != "photometric_bandwidth":
@@ -53,7 +91,3 @@ def test_functions_have_the_declared_defaults(edit: Edit) -> None:
             wanted = parameter.idle if is_idle else edit.defaults[name]
             assert function[name].default == wanted
         assert name in function or name in FILTER or parameter.name == "inside"
-    fit = inspect.signature(FITS[edit.name]).parameters
-    for name, argument in fit.items():
-        if argument.default is not argument.empty:
-            assert function[name].default == argument.default

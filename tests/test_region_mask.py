@@ -172,7 +172,7 @@ def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch)
     wanted = region_mask(image, front, back, num_landmarks=40)
     rows: list[Any] = [t[0].permute(1, 2, 0).numpy() for t in (image, front, back)]
     tiled = Tiled(Picture(rows[0]), Passes("float32", "full", tile_rows=tile_rows))
-    fitted = masks.fit_mask(tiled, rows[1], rows[2], num_landmarks=40)
+    fitted = region_mask.fit(tiled, rows[1], rows[2], num_landmarks=40)
     found = np.concatenate([values for _, values in tiled.rows(fitted)])
     np.testing.assert_allclose(found[..., 0], wanted[0, 0].numpy(), atol=1e-5)
 

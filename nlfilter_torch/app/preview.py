@@ -23,7 +23,7 @@ from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, see
 from nlfilter_torch.edits.declaration import Edit
 from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.mask import fit_mask
+from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.pixels import Fitted, Pixels, part_of
 from nlfilter_torch.edits.recipe import Recipe
@@ -197,7 +197,7 @@ class Preview:
             (inner,), others = scribbles_of(detail, self.size)
             names = ("mask_bandwidth", "reach")
             bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
-            fitted = fit_mask(
+            fitted = region_mask.fit(
                 self._source,
                 inner,
                 others.get("negative"),

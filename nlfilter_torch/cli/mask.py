@@ -50,7 +50,7 @@ def mask(
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.progress import stages, steps
     from nlfilter_torch.edits.applying import seeded
-    from nlfilter_torch.edits.mask import fit_mask, region_mask
+    from nlfilter_torch.edits.mask import region_mask
     from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
@@ -129,7 +129,7 @@ def mask(
             drawn = selected_by(job.size, job.open)
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
             with single_threaded(tiled.passes.workers(1)):
-                fitted = fit_mask(tiled, *drawn, **arguments(job.size))
+                fitted = region_mask.fit(tiled, *drawn, **arguments(job.size))
             if floats:
                 write_pfm(place, tiled.all(fitted)[0, 0].float().numpy())
                 return

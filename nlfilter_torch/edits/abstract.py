@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_photograph, check_reach
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.checks import check_count, check_reach
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.parameters import ABSTRACT
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source
 from nlfilter_torch.edits.synthesis import synthesize
@@ -29,9 +28,10 @@ MIN_SQUARED_GRADIENT = 1e-12  # lower limit of squared gradients; keeps the deri
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel of the viewing size, from which on steps are CRISP
 
 
-@full_precision
+@edit_of("image")
 def abstract(
-    image: Tensor,
+    source: Source,
+    /,
     *,
     power: float | Tensor = ABSTRACT.defaults["power"],
     edges: float = ABSTRACT.defaults["edges"],
@@ -43,7 +43,7 @@ def abstract(
     patch_size: int = ABSTRACT.defaults["patch_size"],
     num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Remove small detail from a photograph and keep its outlines: ``W^k y`` with a fractional k.
 
     Paper: Sec. V-D. The kernel compares colours and has a spatial term, so that the filter is local. Lines along edges
@@ -77,49 +77,24 @@ def abstract(
         >>> bool((abstract(image, power=0.0, num_landmarks=50) - image).abs().max() < 1e-5)
         True
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_abstract,
-        power=power,
-        edges=edges,
-        edge_width=edge_width,
-        tones=tones,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        **options,
-    )
-
-
-def fit_abstract(
-    source: Source,
-    *,
-    power: float | Tensor = ABSTRACT.defaults["power"],
-    edges: float = ABSTRACT.defaults["edges"],
-    edge_width: float | None = None,
-    tones: int | None = ABSTRACT.defaults["tones"],
-    viewing_size: float = ABSTRACT.defaults["viewing_size"],
-    spatial_bandwidth: float | Tensor | None = None,
-    num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
-    """:func:`abstract` for any source."""
     check_count(num_landmarks, "num_landmarks")
-    ABSTRACT["power"].check_argument(power, source.batch)
-    ABSTRACT["edges"].check_argument(edges)
-    ABSTRACT["edge_width"].check_argument(edge_width)
-    ABSTRACT["viewing_size"].check_argument(viewing_size)
+    ABSTRACT.check(source.batch, power=power, edges=edges, edge_width=edge_width, viewing_size=viewing_size)
     width = ABSTRACT["edge_width"].pixels(edge_width, source.size)
     check_reach(width, "edge_width", source.size)
-    ABSTRACT["tones"].check_argument(tones)
+    ABSTRACT.check(tones=tones)
     if (edges > 0 or tones is not None) and source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3")
 
     def change(viewed: Source) -> Fitted:
-        flat = flattened(viewed, power, num_landmarks=num_landmarks, spatial_bandwidth=spatial_bandwidth, **options)
+        flat = flattened(
+            viewed,
+            power,
+            num_landmarks=num_landmarks,
+            spatial_bandwidth=spatial_bandwidth,
+            photometric_bandwidth=photometric_bandwidth,
+            patch_size=patch_size,
+            **options,
+        )
         return Fitted(lambda pixels: flat(pixels) - pixels.image)
 
     fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")

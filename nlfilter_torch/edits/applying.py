@@ -9,33 +9,33 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.abstract import fit_abstract
-from nlfilter_torch.edits.colorize import fit_colorize
-from nlfilter_torch.edits.defocus import fit_defocus
-from nlfilter_torch.edits.denoise import fit_denoise
-from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.abstract import abstract
+from nlfilter_torch.edits.colorize import colorize
+from nlfilter_torch.edits.defocus import defocus
+from nlfilter_torch.edits.denoise import denoise
+from nlfilter_torch.edits.detail import enhance
 from nlfilter_torch.edits.in_memory import InMemory, edited
-from nlfilter_torch.edits.look import fit_look_edit
-from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.edits.look import apply_look
+from nlfilter_torch.edits.recolor import recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.shared_parameters import FILTER
-from nlfilter_torch.edits.sharpen import fit_sharpen
+from nlfilter_torch.edits.sharpen import sharpen
 from nlfilter_torch.edits.source import Fitted, Source
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.tone import fit_tone
+from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.edits.viewing import viewed_size
 
 #: For each edit, the function that fits it to a source, given the scribbles and the parameters.
 FITS: dict[str, Callable[..., Fitted]] = {
-    "denoise": fit_denoise,
-    "detail": fit_detail,
-    "tone": fit_tone,
-    "sharpen": fit_sharpen,
-    "colorize": fit_colorize,
-    "recolor": fit_recolor,
-    "defocus": fit_defocus,
-    "abstract": fit_abstract,
-    "look": fit_look_edit,
+    "denoise": denoise.fit,
+    "detail": enhance.fit,
+    "tone": adjust_tone.fit,
+    "sharpen": sharpen.fit,
+    "colorize": colorize.fit,
+    "recolor": recolor.fit,
+    "defocus": defocus.fit,
+    "abstract": abstract.fit,
+    "look": apply_look.fit,
 }
 
 

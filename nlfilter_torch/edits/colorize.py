@@ -18,16 +18,9 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import (
-    check_count,
-    check_patch_size,
-    check_photograph,
-    check_positive,
-    check_tensor,
-)
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_tensor
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, split_luminance, with_green
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
@@ -71,9 +64,10 @@ FAINT, GREY = 0.05, 0.02  # chroma below which estimates differ little in weight
 OTHER_HUE = 0.1  # weight of an estimate of the opposite hue
 
 
-@full_precision
+@edit_of("grey", channels=1)
 def colorize(
-    grey: Tensor,
+    source: Source,
+    /,
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
@@ -86,7 +80,7 @@ def colorize(
     num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     viewing_size: float = COLORIZE.defaults["viewing_size"],
     generator: torch.Generator | None = None,
-) -> Tensor:
+) -> Fitted:
     """Colour a grey image from strokes; its luminance is kept.
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
@@ -129,62 +123,29 @@ def colorize(
         >>> bool((colour[:, 2] > colour[:, 0])[..., :10].all()), bool((colour[:, 0] > colour[:, 2])[..., 14:].all())
         (True, True)
     """
-    check_photograph(grey, "grey", channels=1)
-    check_tensor(strokes, "strokes")
-    return edited(
-        grey,
-        fit_colorize,
-        strokes,
-        stroke_mask,
-        method=method,
-        strength=strength,
-        time=time,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        viewing_size=viewing_size,
-        generator=generator,
-    )
-
-
-def fit_colorize(
-    source: Source,
-    strokes: Any,
-    stroke_mask: Any,
-    *,
-    method: Method = COLORIZE.defaults["method"],
-    strength: float | Tensor = COLORIZE.defaults["strength"],
-    time: float | Tensor = 1.0,
-    photometric_bandwidth: float | Tensor = COLORIZE.defaults["photometric_bandwidth"],
-    spatial_bandwidth: float | Tensor | None = None,
-    patch_size: int = COLORIZE.defaults["patch_size"],
-    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
-    viewing_size: float = COLORIZE.defaults["viewing_size"],
-    **options: Any,
-) -> Fitted:
-    """:func:`colorize` for any source; a colour picture is reduced to its luminance."""
-    COLORIZE["method"].check_argument(method)
+    if source.whole:  # otherwise they are checked when they are read
+        check_tensor(strokes, "strokes")
+    COLORIZE.check(method=method)
     if method == "kmeans" and not source.whole:
         raise ValueError(
             "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in memory; "
             "choose regression, or allow more memory"
         )
-    COLORIZE["strength"].check_argument(strength, source.batch)
+    COLORIZE.check(source.batch, strength=strength)
     check_positive(time, "time", source.batch)
     check_positive(photometric_bandwidth, "photometric_bandwidth", source.batch)
     if spatial_bandwidth is not None:
         check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
     check_patch_size(patch_size)
     check_count(num_landmarks, "num_landmarks")
-    COLORIZE["viewing_size"].check_argument(viewing_size)
+    COLORIZE.check(viewing_size=viewing_size)
     scribbles, viewed = source.scribbles(stroke_mask, strokes, "stroke_mask"), source
     small = viewed_size(source.size, viewing_size)
     if small != source.size:
         viewed = source.resized(small)
         scribbles = blocks_of(scribbles, viewed, source.size, source.size[1] / small[1])
     pixels = small[0] * small[1]
-    options["num_landmarks"] = min(num_landmarks, pixels)
+    options = {"num_landmarks": min(num_landmarks, pixels), "generator": generator}
     nearness = COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small)
 
     def operator_of(stage: Stage) -> Operator:
@@ -289,7 +250,10 @@ def weighted_mean(alike: Tensor, connected: Tensor, around: Tensor, influence: T
 
 
 def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
-    """A picture in the chroma (B, 2, h, w), red and blue, of its reduction; edges follow those of its luminance."""
+    """A picture in the chroma (B, 2, h, w), red and blue, of its reduction; edges follow those of its luminance.
+
+    A source may be in colour: only its luminance counts.
+    """
     if source is viewed:
         return Fitted(lambda some: merge_luminance(luminance(some), with_green(chroma(some))))
 

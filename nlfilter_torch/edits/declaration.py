@@ -91,6 +91,7 @@ class Parameter:
         is_option: whether the command has an option for it.
         length: length of a list; 0 is any.
         panel: title of its section in the help of the command; without one it is among the edit's main options.
+        per_image: whether the function also takes a tensor with one value for each image.
     """
 
     name: str
@@ -115,6 +116,7 @@ class Parameter:
     is_option: bool = True
     length: int = 0
     panel: str | None = None
+    per_image: bool = False
 
     @property
     def keyword(self) -> str:
@@ -208,7 +210,7 @@ class Parameter:
         return self.share * min(size) if given is None else given
 
     def check_argument(self, value: Any, batch: int | None = None) -> None:
-        """Check that a function can take ``value``; with ``batch``, also tensors of shape () or (batch,).
+        """Check that a function can take ``value``; with ``batch``, if :attr:`per_image`, also shape () or (batch,).
 
         Raises:
             TypeError, ValueError: if it cannot; the message names the argument.
@@ -223,6 +225,7 @@ class Parameter:
         elif self.domain == "count":
             checks.check_count(value, name, least=int(self.low), most=int(self.high))
         else:
+            batch = batch if self.per_image else None
             if batch is None:
                 checks.check_number(value, name, "pass a float or None" if self.unit == "%" else "pass a float")
             if self.domain is not None:
@@ -263,6 +266,11 @@ class Edit:
     def defaults(self) -> dict[str, Any]:
         """Defaults of the function's arguments, in its units; None for lengths that depend on the image."""
         return {p.keyword: None if p.unit == "%" else p.argument_of(p.default, (0, 0)) for p in self}
+
+    def check(self, batch: int | None = None, **arguments: Any) -> None:
+        """Check arguments of the function, in the order given; see :meth:`Parameter.check_argument`."""
+        for name, value in arguments.items():
+            self[name].check_argument(value, batch)
 
     @property
     def words(self) -> tuple[str, ...]:

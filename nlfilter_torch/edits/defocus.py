@@ -6,10 +6,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph, check_reach
+from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
 from nlfilter_torch.edits.source import Fitted, Source
@@ -23,9 +22,10 @@ SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
 ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multiples of this, which makes it fast
 
 
-@full_precision
+@edit_of("image")
 def defocus(
-    image: Tensor,
+    source: Source,
+    /,
     focus_region: Tensor,
     *,
     radius: float | None = None,
@@ -34,7 +34,7 @@ def defocus(
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = DEFOCUS.defaults["patch_size"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Blur the background of a subject that stays in focus.
 
     Paper: Sec. V-C, Fig. 17, with :func:`region_mask` in place of its mask. Only the background is blurred, so the
@@ -69,42 +69,22 @@ def defocus(
         >>> bool(blurred[..., :18].std() < image[..., :18].std() / 2)
         True
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_defocus,
-        focus_region,
-        radius=radius,
-        aperture=aperture,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        **options,
-    )
-
-
-def fit_defocus(
-    source: Source,
-    focus_region: Any,
-    *,
-    radius: float | None = None,
-    aperture: Aperture = DEFOCUS.defaults["aperture"],
-    spatial_bandwidth: float | Tensor | None = None,
-    **options: Any,
-) -> Fitted:
-    """:func:`defocus` for any source."""
     if source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
-    DEFOCUS["aperture"].check_argument(aperture)
-    DEFOCUS["radius"].check_argument(radius)
+    DEFOCUS.check(aperture=aperture, radius=radius)
     blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
     check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
-    options = (
-        {name: DEFOCUS.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | {"reach": REACH} | options
+    options = {"reach": REACH} | options
+    found = fit_regions(
+        source,
+        [scribbles],
+        [],
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
+        patch_size=patch_size,
+        **options,
     )
-    spatial_bandwidth = DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size)
-    found = fit_regions(source, [scribbles], [], spatial_bandwidth=spatial_bandwidth, **options)
 
     def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:
         return blur_behind(image, focus_of(masks), blur_radius, aperture)

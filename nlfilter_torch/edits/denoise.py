@@ -9,11 +9,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_photograph
+from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import cached_constants
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.noise import Noise, noise_of
 from nlfilter_torch.edits.parameters import DENOISE
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source
@@ -28,9 +27,10 @@ ORDER = 2
 NEGLIGIBLE_NOISE = 0.1 / 255  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
-@full_precision
+@edit_of("image")
 def denoise(
-    image: Tensor,
+    source: Source,
+    /,
     *,
     noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
     strength: float | Tensor = DENOISE.defaults["strength"],
@@ -40,7 +40,7 @@ def denoise(
     patch_size: int = DENOISE.defaults["patch_size"],
     num_landmarks: int = DENOISE.defaults["num_landmarks"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Remove noise of known or estimated level.
 
     The network is :meth:`NonlocalDenoiser.trained`. With ``method="rule"`` nothing is learned: the sliders of eq. (12)
@@ -74,49 +74,32 @@ def denoise(
         >>> bool((denoise(noisy) - clean).std() < 0.03), bool((denoise(noisy, method="rule") - clean).std() < 0.06)
         (True, True)
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_denoise,
-        noise_level=noise_level,
-        strength=strength,
-        method=method,
+    DENOISE.check(source.batch, strength=strength, method=method)
+    check_count(num_landmarks, "num_landmarks")
+    unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
+    if unknown:
+        raise TypeError(f"denoise has no argument {unknown[0]}; see its documentation for the valid ones")
+    is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
+    if not isinstance(noise_level, Noise) and not is_map:  # commands pass the noise that they have estimated
+        DENOISE.check(source.batch, noise_level=noise_level)
+    noise: float | Tensor | Noise = noise_of(source) if noise_level is None else noise_level
+    if method == "network":
+        return _by_network(source, noise, strength)
+    if is_map:
+        raise ValueError(
+            "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
+        )
+    level = noise.level if isinstance(noise, Noise) else torch.as_tensor(noise, dtype=source.dtype)
+    level = level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1)
+    return _by_rule(
+        source,
+        level,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         num_landmarks=num_landmarks,
         **options,
     )
-
-
-def fit_denoise(
-    source: Source,
-    *,
-    noise_level: float | Tensor | Noise | None,
-    strength: float | Tensor,
-    method: Method,
-    **options: Any,
-) -> Fitted:
-    """:func:`denoise` for any source; ``noise_level`` may be the result of :func:`noise_of`."""
-    DENOISE["strength"].check_argument(strength, source.batch)
-    DENOISE["method"].check_argument(method)
-    check_count(options["num_landmarks"], "num_landmarks")
-    unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
-    if unknown:
-        raise TypeError(f"denoise has no argument {unknown[0]}; see its documentation for the valid ones")
-    is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
-    if not isinstance(noise_level, Noise) and not is_map:
-        DENOISE["noise_level"].check_argument(noise_level, source.batch)
-    if noise_level is None:
-        noise_level = noise_of(source)
-    if method == "network":
-        return _by_network(source, noise_level, strength)
-    if is_map:
-        raise ValueError(
-            "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
-        )
-    level = noise_level.level if isinstance(noise_level, Noise) else torch.as_tensor(noise_level, dtype=source.dtype)
-    return _by_rule(source, level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1), **options)
 
 
 @cached_constants

@@ -11,15 +11,11 @@ from nlfilter_torch.core.checks import (
     check_dtype,
     check_finite,
     check_image,
-    check_photograph,
     check_positive,
     check_shape,
-    check_tensor,
-    check_weight,
 )
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, MASK
@@ -34,9 +30,10 @@ VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for 
 EPSILON = 1e-12
 
 
-@full_precision
+@edit_of("image")
 def enhance(
-    image: Tensor,
+    source: Source,
+    /,
     alpha: Tensor,
     regions: Tensor | None = None,
     *,
@@ -53,7 +50,7 @@ def enhance(
     spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
     num_landmarks: int = DETAIL.defaults["num_landmarks"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Apply detail sliders to a photograph, or separate sliders to everything similar to each of several regions.
 
     Paper: eq. (12), (13). The filter compares luminance; the masks are those of :func:`region_mask`.
@@ -96,58 +93,11 @@ def enhance(
         >>> enhance(image, torch.tensor([3.0, 3.0, 4.0, 1.05]), region, num_landmarks=50).shape
         torch.Size([1, 3, 24, 24])
     """
-    check_photograph(image, "image")
-    check_tensor(alpha, "alpha")
-    if regions is not None:
-        check_image(regions, "regions", batch=image.shape[0])
-    return edited(
-        image,
-        fit_detail,
-        alpha,
-        regions,
-        negative=negative,
-        outside=outside,
-        residual=residual,
-        channels=channels,
-        reach=reach,
-        mask_bandwidth=mask_bandwidth,
-        threshold=threshold,
-        limits=limits,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        num_landmarks=num_landmarks,
-        **options,
-    )
-
-
-def fit_detail(
-    source: Source,
-    alpha: Tensor,
-    regions: Any = None,
-    *,
-    negative: Any = None,
-    outside: Tensor | None = None,
-    residual: float | Tensor | None = DETAIL.defaults["residual"],
-    channels: str = DETAIL.defaults["channels"],
-    reach: float | Tensor = DETAIL.defaults["reach"],
-    mask_bandwidth: float | Tensor = DETAIL.defaults["mask_bandwidth"],
-    threshold: float | Tensor = DETAIL.defaults["threshold"],
-    limits: Limits = DETAIL.defaults["limits"],
-    viewing_size: float = DETAIL.defaults["viewing_size"],
-    photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
-    spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
-    num_landmarks: int = DETAIL.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
-    """:func:`enhance` for any source."""
     check_alpha(alpha)
-    DETAIL["channels"].check_argument(channels)
-    DETAIL["limits"].check_argument(limits)
-    DETAIL["viewing_size"].check_argument(viewing_size)
-    DETAIL["threshold"].check_argument(threshold, source.batch)
-    if residual is not None:
-        check_weight(residual, "residual", source.batch)
+    if regions is not None and source.whole:  # otherwise they are checked when they are read
+        check_image(regions, "regions", batch=source.batch)
+    DETAIL.check(source.batch, channels=channels, limits=limits, viewing_size=viewing_size, threshold=threshold)
+    DETAIL.check(source.batch, residual=residual)
     if regions is None and (negative is not None or outside is not None):
         name = "outside" if negative is None else "negative"
         raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")

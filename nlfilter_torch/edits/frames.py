@@ -59,7 +59,7 @@ def filter_frames(
         [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
     """
     check_alpha(alpha, dimensions=(1,))
-    DETAIL["channels"].check_argument(channels)
+    DETAIL.check(channels=channels)
     if not isinstance(references, Sequence):
         raise TypeError(f"references must be a list of frames, got {type(references).__name__}; wrap it in a list")
     if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
@@ -78,9 +78,7 @@ def filter_frames(
     for frame in references:
         check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first one")
-    DETAIL["limits"].check_argument(limits)
-    DETAIL["threshold"].check_argument(threshold)
-    DETAIL["viewing_size"].check_argument(viewing_size)
+    DETAIL.check(limits=limits, threshold=threshold, viewing_size=viewing_size)
     # References are stacked vertically to one image, at the cost of a few patches across the seams.
     viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
     stacked = torch.cat([InMemory(f.to(working_dtype(f))).resized(viewed).image for f in references], dim=2)

@@ -1,16 +1,17 @@
-"""An image or a batch in memory as the source of an edit, with gradients."""
+"""An image or a batch in memory as the source of an edit, with gradients, and edits as functions of an image."""
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, cast
+from functools import cached_property, wraps
+from typing import Any, Concatenate, Literal, ParamSpec, Protocol, cast, overload
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_unit_range
 from nlfilter_torch.core.inner import EVERYWHERE
-from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.pixels import Fitted, Planes, part_of, strips_of
 from nlfilter_torch.edits.resizing import block_means, resize
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
@@ -21,6 +22,8 @@ from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.operator import Columns, NonlocalOperator
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
+
+P = ParamSpec("P")
 
 
 class InMemory:
@@ -198,7 +201,74 @@ class InMemoryOperator:
         return lambda: [columns]
 
 
-def edited(image: Tensor, fit: Callable[..., Fitted], *arguments: Any, **options: Any) -> Tensor:
+def edited(image: Tensor, fit: Callable[..., Fitted], /, *arguments: Any, **options: Any) -> Tensor:
     """Fit an edit to an image in memory and apply it; the result has the image's dtype."""
     source = InMemory(image.to(working_dtype(image)))
     return source.all(fit(source, *arguments, **options)).to(image.dtype)
+
+
+class EditOfImage(Protocol[P]):
+    """An edit of an image; ``fit`` fits it to a source, given scribbles in the form that the source takes."""
+
+    fit: Callable[..., Fitted]
+
+    def __call__(self, image: Tensor, *args: P.args, **kwargs: P.kwargs) -> Tensor:
+        """Edit the image."""
+
+
+class EditOfGrey(Protocol[P]):
+    """An edit like :class:`EditOfImage`, of an image that is the argument ``grey``."""
+
+    fit: Callable[..., Fitted]
+
+    def __call__(self, grey: Tensor, *args: P.args, **kwargs: P.kwargs) -> Tensor:
+        """Edit the image."""
+
+
+@overload
+def edit_of(
+    picture: Literal["image"], *, channels: int | None = None
+) -> Callable[[Callable[Concatenate[Source, P], Fitted]], EditOfImage[P]]: ...
+
+
+@overload
+def edit_of(
+    picture: Literal["grey"], *, channels: int | None = None
+) -> Callable[[Callable[Concatenate[Source, P], Fitted]], EditOfGrey[P]]: ...
+
+
+def edit_of(picture: str, *, channels: int | None = None) -> Any:
+    """Turn a function that fits an edit to a source into a function that edits an image.
+
+    The decorated function takes a :class:`Source` and returns :class:`Fitted`. Callers pass an image in place of the
+    source and receive the edited image, in its dtype; the docstring and the annotations are written for them. The
+    function of a source remains available as the attribute ``fit``.
+
+    Args:
+        picture: name of the image, for callers and in errors.
+        channels: number of channels that it must have; None is any.
+    """
+
+    def decorate(fit: Callable[..., Fitted]) -> Any:
+        @full_precision
+        @wraps(fit)
+        def edit(*args: Any, **kwargs: Any) -> Tensor:
+            if picture in kwargs and not args:
+                args = (kwargs.pop(picture),)
+            if picture in kwargs or not args:
+                problem = "got multiple values for argument" if args else "missing 1 required positional argument:"
+                raise TypeError(f"{fit.__name__}() {problem} {picture!r}")
+            image, *others = args
+            check_photograph(image, picture, channels=channels)
+            return edited(image, fit, *others, **kwargs)
+
+        signature = inspect.signature(fit)
+        image = inspect.Parameter(picture, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Tensor)
+        parameters = [image, *list(signature.parameters.values())[1:]]
+        function: Any = edit
+        function.fit = fit
+        function.__signature__ = signature.replace(parameters=parameters, return_annotation=Tensor)
+        function.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": Tensor}
+        return function
+
+    return decorate

@@ -7,10 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, luminance
@@ -23,9 +21,10 @@ from nlfilter_torch.operator.features import reduce_channels
 Numbers = Tensor | Sequence[float]
 
 
-@full_precision
+@edit_of("image")
 def apply_look(
-    image: Tensor,
+    source: Source,
+    /,
     *,
     alpha: Numbers = LOOK.defaults["alpha"],
     bands: Numbers = LOOK.defaults["bands"],
@@ -43,7 +42,7 @@ def apply_look(
     spatial_bandwidth: float | Tensor | str | None = LOOK.defaults["spatial_bandwidth"],
     num_landmarks: int = LOOK.defaults["num_landmarks"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Put a photograph under a look: the image plus what each part changes.
 
     Args:
@@ -85,54 +84,9 @@ def apply_look(
         >>> apply_look(image, matrix=sepia).shape
         torch.Size([1, 3, 24, 24])
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_look_edit,
-        alpha=alpha,
-        bands=bands,
-        texture=texture,
-        red=red,
-        green=green,
-        blue=blue,
-        matrix=matrix,
-        saturation=saturation,
-        stretch=stretch,
-        local=local,
-        amount=amount,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        num_landmarks=num_landmarks,
-        **options,
-    )
-
-
-def fit_look_edit(
-    source: Source,
-    *,
-    alpha: Numbers,
-    bands: Numbers,
-    texture: Numbers,
-    red: Numbers,
-    green: Numbers,
-    blue: Numbers,
-    matrix: Numbers,
-    saturation: Numbers,
-    stretch: Numbers,
-    local: Numbers,
-    amount: float | Tensor,
-    viewing_size: float,
-    photometric_bandwidth: float | Tensor | str,
-    spatial_bandwidth: float | Tensor | str | None,
-    num_landmarks: int,
-    **options: Any,
-) -> Fitted:
-    """:func:`apply_look` for any source."""
     if source.channels not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
-    LOOK["amount"].check_argument(amount, source.batch)
-    LOOK["viewing_size"].check_argument(viewing_size)
+    LOOK.check(source.batch, amount=amount, viewing_size=viewing_size)
     given = {"alpha": alpha, "bands": bands, "texture": texture, "saturation": saturation}
     given |= {"stretch": stretch, "local": local, "red": red, "green": green, "blue": blue}
     sliders, gains, textured, factors, levels, strengths, *channels = (

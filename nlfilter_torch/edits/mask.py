@@ -16,10 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_photograph, check_positive
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.checks import check_count, check_positive
 from nlfilter_torch.edits.colour import LIGHTNESS, hundredths_of_lab
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
@@ -66,9 +65,10 @@ def region_guide(image: Tensor) -> Tensor:
     return torch.cat([colours, blur(colours, SURROUND_SIGMA), TEXTURE_WEIGHT * strength], dim=1)
 
 
-@full_precision
+@edit_of("image")
 def region_mask(
-    image: Tensor,
+    source: Source,
+    /,
     scribbles: Tensor,
     background: Tensor | None = None,
     *,
@@ -77,7 +77,7 @@ def region_mask(
     spatial_bandwidth: float | Tensor | None = None,
     num_landmarks: int = MASK.defaults["num_landmarks"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Soft object masks from foreground and background scribbles.
 
     A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
@@ -115,10 +115,8 @@ def region_mask(
         >>> bool(mask[..., 10:22, 10:22].min() > 0.8), bool(mask[..., :6, :].max() < 0.1)
         (True, True)
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_mask,
+    found = select_regions(
+        source,
         scribbles,
         background,
         reach=reach,
@@ -127,11 +125,7 @@ def region_mask(
         num_landmarks=num_landmarks,
         **options,
     )
-
-
-def fit_mask(source: Source, scribbles: Any, background: Any = None, **options: Any) -> Fitted:
-    """:func:`region_mask` for any source."""
-    return Fitted(select_regions(source, scribbles, background, **options).masks)
+    return Fitted(found.masks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +212,7 @@ def fit_regions(
 
     Further arguments are those of :func:`region_mask`.
     """
-    MASK["reach"].check_argument(reach, source.batch)
+    MASK.check(source.batch, reach=reach)
     if "guide_channels" in options:
         raise TypeError("guide_channels must not be given: masks compare colours and texture; leave it out")
     count, several = len(inside), len(background) > 1

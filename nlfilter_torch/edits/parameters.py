@@ -85,6 +85,7 @@ DETAIL = Edit(
             "levels",
             domain="not negative",
             zero_meaning="pass 0 to strengthen all detail equally",
+            per_image=True,
         ),
         LIMITS,
         VIEWING_SIZE,
@@ -173,6 +174,7 @@ DENOISE = Edit(
             zero_meaning="0 changes nothing",
             idle=0.0,
             slider=Slider("Strength", 0, 2, 0.05, knots=(0, 0.5, 1, 2)),
+            per_image=True,
         ),
         number(
             "noise_level",
@@ -183,6 +185,7 @@ DENOISE = Edit(
             domain="not negative",
             zero_meaning="0 changes nothing",
             optional=True,
+            per_image=True,
         ),
         choice(
             "method",
@@ -215,6 +218,7 @@ RECOLOR = Edit(
             metavar="0...1",
             slider=Slider("Reach", 0, 0.95, 0.05),
             panel=FILTER_PANEL,
+            per_image=True,
         ),
         replace(TOLERANCE, former_names=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
         *filter_parameters(share=1.2, patch_size=1)[1:],
@@ -245,6 +249,7 @@ COLORIZE = Edit(
             domain="share",
             metavar="0...1",
             slider=Slider("Fill", 0, 1, 0.05),
+            per_image=True,
         ),
         choice(
             "method",
@@ -329,6 +334,7 @@ ABSTRACT = Edit(
             idle=0.0,
             metavar="K",
             slider=Slider("Flatten", 0, 1, 0.01),
+            per_image=True,
         ),
         number(
             "edges",

@@ -6,10 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph, check_tensor
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.checks import check_tensor
 from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, region_means, split_luminance
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
 from nlfilter_torch.edits.parameters import RECOLOR
@@ -21,9 +20,10 @@ END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far a
 GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to keep
 
 
-@full_precision
+@edit_of("image", channels=3)
 def recolor(
-    image: Tensor,
+    source: Source,
+    /,
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
@@ -33,7 +33,7 @@ def recolor(
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = RECOLOR.defaults["patch_size"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Recolour the objects that strokes are painted on, and similar pixels around them.
 
     Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours.
@@ -68,43 +68,25 @@ def recolor(
         >>> torch.equal(blue[..., :8], image[..., :8]), bool((blue[:, 2] > blue[:, 0])[..., 14:].all())
         (True, True)
     """
-    check_photograph(image, "image", channels=3)
-    check_tensor(strokes, "strokes")
-    return edited(
-        image,
-        fit_recolor,
-        strokes,
-        stroke_mask,
-        keep=keep,
-        reach=reach,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        **options,
-    )
-
-
-def fit_recolor(
-    source: Source,
-    strokes: Any,
-    stroke_mask: Any,
-    *,
-    keep: Any = None,
-    reach: float | Tensor = RECOLOR.defaults["reach"],
-    spatial_bandwidth: float | Tensor | None = None,
-    **options: Any,
-) -> Fitted:
-    """:func:`recolor` for any source."""
-    RECOLOR["reach"].check_argument(reach, source.batch)
+    if source.whole:  # otherwise they are checked when they are read
+        check_tensor(strokes, "strokes")
+    RECOLOR.check(source.batch, reach=reach)
     scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
     kept = None if keep is None else source.scribbles(keep, None, "keep", needed=False)
 
     colours, regions, valid = _grouped(scribbles)
     old = region_means(split_luminance(scribbles.image.unsqueeze(2))[1], regions.unsqueeze(2))
     inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
-    options = {name: RECOLOR.defaults[name] for name in ("photometric_bandwidth", "patch_size")} | options
-    options["spatial_bandwidth"] = RECOLOR["spatial_bandwidth"].distance(spatial_bandwidth, source.size)
-    found = fit_regions(source, inside, [] if kept is None else [kept], reach=reach, **options)
+    found = fit_regions(
+        source,
+        inside,
+        [] if kept is None else [kept],
+        reach=reach,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=RECOLOR["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
+        patch_size=patch_size,
+        **options,
+    )
     change = Recoloring(colours, old, valid)
     reduced = split_luminance(found.reduced)[1]
     beside = []

@@ -27,7 +27,7 @@ def number(name: str, default: Any, help: str, ends: tuple[float, float], unit: 
 
 def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
     """Declare a factor."""
-    return number(name, default, help, GAINS, "gain", domain="finite", **more)
+    return number(name, default, help, GAINS, "gain", domain="finite", per_image=True, **more)
 
 
 def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
@@ -151,6 +151,7 @@ REACH = number(
     domain="below 1",
     metavar="0...1",
     panel=FILTER_PANEL,
+    per_image=True,
 )
 REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 

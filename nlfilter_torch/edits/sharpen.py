@@ -5,9 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph, check_reach
-from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.core.checks import check_reach
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import SHARPEN
 from nlfilter_torch.edits.source import Fitted, Guide, Source, luminance
@@ -16,9 +15,10 @@ from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import reduce_channels
 
 
-@full_precision
+@edit_of("image")
 def sharpen(
-    image: Tensor,
+    source: Source,
+    /,
     *,
     amount: float | Tensor = SHARPEN.defaults["amount"],
     guide_blur: float = SHARPEN.defaults["guide_blur"],
@@ -26,7 +26,7 @@ def sharpen(
     viewing_size: float = SHARPEN.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = SHARPEN.defaults["photometric_bandwidth"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Sharpen a photograph, noisy or not.
 
     The finest layer, which contains the noise, and the smooth one stay unchanged; the two between are amplified. With
@@ -58,40 +58,15 @@ def sharpen(
         >>> sharp.shape, bool(sharp.std() > image.std())
         (torch.Size([1, 3, 32, 32]), True)
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_sharpen,
-        amount=amount,
-        guide_blur=guide_blur,
-        limits=limits,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        **options,
-    )
-
-
-def fit_sharpen(
-    source: Source,
-    *,
-    amount: float | Tensor = SHARPEN.defaults["amount"],
-    guide_blur: float = SHARPEN.defaults["guide_blur"],
-    limits: Limits = SHARPEN.defaults["limits"],
-    viewing_size: float = SHARPEN.defaults["viewing_size"],
-    **options: Any,
-) -> Fitted:
-    """:func:`sharpen` for any source."""
-    SHARPEN["amount"].check_argument(amount, source.batch)
-    SHARPEN["guide_blur"].check_argument(guide_blur)
-    SHARPEN["limits"].check_argument(limits)
-    SHARPEN["viewing_size"].check_argument(viewing_size)
+    SHARPEN.check(source.batch, amount=amount, guide_blur=guide_blur, limits=limits, viewing_size=viewing_size)
     middle = torch.as_tensor(amount, dtype=source.dtype).reshape(-1).expand(source.batch)
     still = torch.zeros_like(middle)
     sliders = torch.stack([still, middle - 1, middle - 1, still], dim=1)  # less 1, so that the filter gives the change
 
     def change(viewed: Source) -> Fitted:
         check_reach(guide_blur, "guide_blur", viewed.size)
-        operator = viewed.operator(Guide(options, transform=_grey, blur=guide_blur))
+        filter_options = options | {"photometric_bandwidth": photometric_bandwidth}
+        operator = viewed.operator(Guide(filter_options, transform=_grey, blur=guide_blur))
         changed = polynomial(operator, luminance, 3, None)
         return Fitted(lambda pixels: changed(pixels, sliders))
 

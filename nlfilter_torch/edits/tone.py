@@ -5,9 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_order, check_photograph
-from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.in_memory import edited
+from nlfilter_torch.core.checks import check_order
+from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import TONE
 from nlfilter_torch.edits.source import Fitted, Guide, Source, luminance
@@ -15,9 +14,10 @@ from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 
 
-@full_precision
+@edit_of("image")
 def adjust_tone(
-    image: Tensor,
+    source: Source,
+    /,
     *,
     contrast: float | Tensor = TONE["contrast"].idle,
     clarity: float | Tensor = TONE["clarity"].idle,
@@ -28,7 +28,7 @@ def adjust_tone(
     spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
     num_landmarks: int = TONE.defaults["num_landmarks"],
     **options: Any,
-) -> Tensor:
+) -> Fitted:
     """Change the contrast of large shapes, and of the coarsest detail on them, without changing the mean.
 
     Paper: eq. (12) with alpha_{k+1} = contrast and alpha_k = clarity, applied to the image less its mean: since W
@@ -63,41 +63,8 @@ def adjust_tone(
         >>> bool((strong.mean((2, 3)) - image.mean((2, 3))).abs().max() < 1e-5), bool(strong.std() > image.std())
         (True, True)
     """
-    check_photograph(image, "image")
-    return edited(
-        image,
-        fit_tone,
-        contrast=contrast,
-        clarity=clarity,
-        order=order,
-        limits=limits,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        num_landmarks=num_landmarks,
-        **options,
-    )
-
-
-def fit_tone(
-    source: Source,
-    *,
-    contrast: float | Tensor = TONE["contrast"].idle,
-    clarity: float | Tensor = TONE["clarity"].idle,
-    order: int = 3,
-    limits: Limits = TONE.defaults["limits"],
-    viewing_size: float = TONE.defaults["viewing_size"],
-    photometric_bandwidth: float | Tensor | str = TONE.defaults["photometric_bandwidth"],
-    spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
-    num_landmarks: int = TONE.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
-    """:func:`adjust_tone` for any source."""
     check_order(order)
-    TONE["contrast"].check_argument(contrast, source.batch)
-    TONE["limits"].check_argument(limits)
-    TONE["viewing_size"].check_argument(viewing_size)
-    TONE["clarity"].check_argument(clarity, source.batch)
+    TONE.check(source.batch, contrast=contrast, limits=limits, viewing_size=viewing_size, clarity=clarity)
 
     def slider(value: float | Tensor) -> Tensor:
         return torch.as_tensor(value).to(source.dtype).reshape(-1).expand(source.batch)

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha
-from nlfilter_torch.edits.colorize import fit_colorize
-from nlfilter_torch.edits.detail import fit_detail
+from nlfilter_torch.edits.colorize import colorize
+from nlfilter_torch.edits.detail import enhance
 from nlfilter_torch.edits.parameters import COLORIZE, DETAIL, RECOLOR
-from nlfilter_torch.edits.recolor import fit_recolor
+from nlfilter_torch.edits.recolor import recolor
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.tiled.pictures import Picture, RowSource, RowTarget
 from nlfilter_torch.tiled.sampling import Report, in_silence
@@ -83,7 +83,7 @@ def stream_detail(
     """
     check_alpha(alpha, dimensions=(1,) if regions is None else (1, 2))
     options |= {"negative": negative, "residual": residual, "reach": reach, "channels": channels}
-    fit = partial(fit_detail, alpha=alpha, regions=regions, **options)
+    fit = partial(enhance.fit, alpha=alpha, regions=regions, **options)
     _stream(source, target, fit, statistics, sample, tile_rows, memory, report)
 
 
@@ -151,7 +151,7 @@ def stream_recolor(
             f"source must have 3 or 4 channels to be recoloured, got {picture.samples}; use colorize instead"
         )
     options |= {"keep": keep, "reach": reach, "photometric_bandwidth": photometric_bandwidth, "patch_size": patch_size}
-    fit = partial(fit_recolor, strokes=strokes, stroke_mask=stroke_mask, **options)
+    fit = partial(recolor.fit, strokes=strokes, stroke_mask=stroke_mask, **options)
     _stream(source, target, fit, statistics, sample, tile_rows, memory, report)
 
 
@@ -216,7 +216,7 @@ def stream_colorize(
         (True, True)
     """
     fit = partial(
-        fit_colorize,
+        colorize.fit,
         strokes=strokes,
         stroke_mask=stroke_mask,
         method=method,
