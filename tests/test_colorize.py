@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from nlfilter_torch import colorize
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
@@ -69,3 +70,16 @@ def test_a_colour_too_strong_for_its_luminance_is_weakened() -> None:
     assert found.min() >= 0
     assert found.max() <= 1
     torch.testing.assert_close(luminance(found), grey)
+
+
+def test_segments_of_an_image_do_not_depend_on_the_colours_of_others() -> None:
+    generator = torch.Generator().manual_seed(3)
+    grey = F.interpolate(torch.rand(2, 1, 6, 6, generator=generator), (28, 28), mode="bilinear") * 0.8 + 0.1
+    strokes, mask = torch.zeros(2, 3, 28, 28), torch.zeros(2, 1, 28, 28)
+    for image, top, left, channel in ((0, 2, 2, 0), (0, 20, 20, 2), (1, 2, 2, 0), (1, 20, 20, 2), (1, 2, 20, 1)):
+        strokes[image, channel, top : top + 3, left : left + 3] = 1
+        mask[image, :, top : top + 3, left : left + 3] = 1
+    both = colorize(grey, strokes, mask, method="kmeans", num_landmarks=40)
+    for i in (slice(0, 1), slice(1, 2)):
+        single = colorize(grey[i], strokes[i], mask[i], method="kmeans", num_landmarks=40)
+        torch.testing.assert_close(both[i], single, atol=1e-5, rtol=0)

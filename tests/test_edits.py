@@ -183,3 +183,20 @@ def test_the_amount_of_sharpening_is_not_rounded_to_float32() -> None:
     close, far = (sharpen(RGB.double(), amount=amount, **options) for amount in (3.3, exact.float().double()))
     assert torch.equal(sharpen(RGB.double(), amount=exact, **options), close)
     assert not torch.equal(close, far)
+
+
+def test_a_threshold_of_zero_in_a_tensor_is_no_threshold() -> None:
+    image = torch.full((2, 1, 40, 40), 0.5)
+    image[..., 20:] = 0.7
+    image[..., 20:, :] += 0.1
+    options = {"photometric_bandwidth": 0.2, "num_landmarks": 50, "limits": "none"}
+    alpha = torch.tensor([3.0, 3.0, 4.0, 1.0])
+    expected = enhance(image, alpha, threshold=0.0, **options)
+    torch.testing.assert_close(enhance(image, alpha, threshold=torch.tensor(0.0), **options), expected)
+    each = enhance(image, alpha, threshold=torch.tensor([0.0, 5 / 255]), **options)
+    torch.testing.assert_close(each[:1], expected[:1])
+
+
+def test_sliders_for_more_images_than_there_are_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"alpha must have shape \(k\+1,\), or \(1, k\+1\)"):
+        enhance(torch.rand(1, 3, 24, 24), torch.ones(3, 4) * 2)

@@ -28,7 +28,7 @@ from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
-from nlfilter_torch.filtering.masks import segment_mask
+from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.spectrum import Spectrum
@@ -159,9 +159,9 @@ def colorize(
     assert scribbles.colours is not None  # for mypy
     wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
     if method == "kmeans":
-        regions, colours, _ = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
+        regions, colours, valid = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
         planes = scribbles.weighted(regions.squeeze(2)).planes(viewed)
-        pieces = segment_mask(cast(Spectrum, operator_of(FAR).pairs), planes, time=time)
+        pieces = segment(cast(Spectrum, operator_of(FAR).pairs), planes, time, valid)
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
         return _coloured(source, viewed, part_of(chroma[:, ::2]))
     wanted = wanted[:, ::2]  # green follows from red and blue

@@ -120,6 +120,12 @@ def enhance(
                 f"{tuple(alpha.shape)}; reshape it"
             )
 
+    elif alpha.ndim == 2 and len(alpha) not in (1, source.batch):
+        raise ValueError(
+            f"alpha must have shape (k+1,), or ({source.batch}, k+1) for a row per image, got {tuple(alpha.shape)}; "
+            "select the rows"
+        )
+
     def change(viewed: Source) -> Fitted:
         nearness = DETAIL["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size)
         filter_options = options | {
@@ -223,7 +229,8 @@ def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tens
         return sum_of(changes)
     added, rest = changes.chunk(2, dim=1)
     least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
-    return added * (activity / (activity + least).clamp(min=EPSILON)) + rest
+    shares = torch.where(least == 0, 1.0, activity / (activity + least).clamp(min=EPSILON))
+    return added * shares + rest
 
 
 def activity(image: Tensor) -> Tensor:

@@ -185,19 +185,24 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_positive(time, "time", spectrum.factor.shape[0])
+    return segment(spectrum, regions, time)
+
+
+def segment(spectrum: Spectrum, regions: Tensor, time: float | Tensor, valid: Tensor | None = None) -> Tensor:
+    """:func:`segment_mask`; regions that are not ``valid`` (B, K) get no pixels."""
     exponent = per_image(time, spectrum.root, 2)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions").expand(len(spectrum.factor), -1, -1)  # (B, K, N)
         basis = spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent))  # to coordinates, (B, M, M)
         centres = _sums(spectrum, basis, weights)
-        assignment = _nearest(spectrum, basis, centres)
+        assignment = _nearest(spectrum, basis, centres, valid)
         for _ in range(ITERATIONS):
             members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
             counts = weighted(members, spectrum.weights).sum(2, dtype=torch.float64)
             sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
             empty = sizes == 0
             centres = torch.where(empty, centres, _sums(spectrum, basis, members) / torch.where(empty, 1.0, sizes))
-            previous, assignment = assignment, _nearest(spectrum, basis, centres)
+            previous, assignment = assignment, _nearest(spectrum, basis, centres, valid)
             if is_hidden(members):  # a comparison would wait for the device
                 continue
             if not spectrum.among.max((previous != assignment).any().to(members)):
@@ -211,7 +216,10 @@ def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     return basis @ spectrum.among.sum(moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights))
 
 
-def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:
-    """Index (B, N) of the nearest of the centres (B, M, K) for every pixel, in the coordinates ``basis @ F``."""
+def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor, valid: Tensor | None) -> Tensor:
+    """Index (B, N) of the nearest valid centre (B, M, K) for every pixel, in the coordinates ``basis @ F``."""
     inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor, spectrum.scaling)
-    return (inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)).max(1).indices  # ten times as fast as argmax
+    score = inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)
+    if valid is not None:
+        score = score.masked_fill(~valid.unsqueeze(2), -torch.inf)
+    return score.max(1).indices  # ten times as fast as argmax
