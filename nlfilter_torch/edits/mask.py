@@ -87,8 +87,9 @@ def region_mask(
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        scribbles: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions; a rough mask is fine. Scribbles
-            of other regions are background, except where they overlap.
+        scribbles: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions; a rough mask is fine. Exactly 0
+            elsewhere: pixels with faint scribbles count as parts of the region too. Scribbles of other regions are
+            background, except where they overlap.
         background: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions or of each;
             ``scribbles`` take precedence. None means no background scribbles.
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values

@@ -28,7 +28,7 @@ DETAIL = Edit(
     "detail",
     """Strengthen or weaken the details of a photograph, with one slider for each size of detail.
 
-    Colours stay unchanged where nothing clips, and so do the file's depth, transparency, colour profile and camera
+    Where nothing clips, only brightness changes. The file keeps its depth, transparency, colour profile and camera
     metadata (EXIF). Photographs that do not fit in memory are processed in tiles, preferably from TIFF files or zarr
     arrays, which are read in parts.
 
@@ -201,8 +201,9 @@ RECOLOR = Edit(
     "recolor",
     """Recolour an object: paint some colour on it, and the rest of it and similar objects nearby take that colour.
 
-    Brightness stays exactly the same, and so does everything outside the object. Photographs that do not fit in memory
-    are processed in tiles, preferably from TIFF files or zarr arrays, which are read in parts.
+    Brightness stays exactly the same, and so does everything unlike the object; mark what is alike but must keep its
+    colour with --keep. Photographs that do not fit in memory are processed in tiles, preferably from TIFF files or zarr
+    arrays, which are read in parts.
 
     Turn a red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
 
@@ -321,7 +322,7 @@ ABSTRACT = Edit(
 
     Like a watercolour: `nlfilter-torch abstract in.jpg out.jpg`
 
-    Like a comic: `nlfilter-torch abstract in.jpg out.jpg --edges 1 --tones 8 --bandwidth 50`
+    Like a comic: `nlfilter-torch abstract in.jpg out.jpg --edges 1 --tones 8 --bandwidth 25`
     """,
     (
         number(
