@@ -49,7 +49,12 @@ def test_sharpening_raises_edges_and_spares_noise() -> None:
     assert slope(sharp) > 1.2 * slope(noisy)
     assert (sharp[0] - sharp[1])[wall[1:]].std() < 1.2 * (noisy[0] - noisy[1])[wall[1:]].std()
     assert torch.equal(sharpen(clean, amount=1.0), clean)
-    assert not torch.equal(sharpen(clean), sharpen(clean, guide_blur=0.0))
+    assert not torch.equal(sharpen(noisy), sharpen(noisy, guide_blur=0.0))
+    gains = [slope(sharpen(clean, amount=amount)) / slope(clean) for amount in (2.0, 4.0, 8.0)]
+    assert gains == sorted(gains)
+    assert 1.2 < gains[1] < 1.6
+    shading = torch.linspace(0.2, 0.8, 96).expand(1, 1, 96, 96)
+    torch.testing.assert_close(sharpen(shading, amount=8.0), shading, atol=0.5 / 255, rtol=0)
 
 
 def test_detail_reaches_the_likes_of_a_region_only() -> None:

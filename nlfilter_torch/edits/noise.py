@@ -1,6 +1,7 @@
 """Estimation of the noise of a photograph from its flattest windows."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +11,7 @@ from nlfilter_torch.core.checks import check_image
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.source import Source
+from nlfilter_torch.operator.features import GuideChannels, reduce_channels
 
 WINDOW_SIZE = 9  # side of a window in pixels
 NUM_WINDOWS = 6144
@@ -81,16 +83,16 @@ def estimate_noise(image: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def noise_of(source: Source) -> Noise:
-    """Estimate the noise of any source."""
-    return Noise(*source.measured(_measured))
+def noise_of(source: Source, channels: GuideChannels = "all") -> Noise:
+    """Estimate the noise of any source, or of its luminance."""
+    return Noise(*source.measured(partial(_measured, channels=channels)))
 
 
-def _measured(source: Source) -> Tensor:
+def _measured(source: Source, channels: GuideChannels) -> Tensor:
     """Estimate floor, gain and light, (3, B)."""
     if min(source.size) < 3:
         return torch.zeros(3, source.batch, dtype=source.dtype)
-    windows = _windows(source)
+    windows = _windows(source, channels)
     light = windows.mean((2, 3))
     response = _response(windows)
     # Windows with clipped pixels come last, as clipping truncates their noise.
@@ -110,7 +112,7 @@ def _measured(source: Source) -> Tensor:
     return torch.stack([torch.where(even, level.square(), floor), gain, light.mean(1)])
 
 
-def _windows(source: Source) -> Tensor:
+def _windows(source: Source, channels: GuideChannels) -> Tensor:
     """Return windows (B, C * n, WINDOW_SIZE, WINDOW_SIZE) at random positions, the same in memory and in tiles."""
     height, width = source.size
     rows, columns = max(1, height - WINDOW_SIZE + 1), max(1, width - WINDOW_SIZE + 1)
@@ -123,7 +125,7 @@ def _windows(source: Source) -> Tensor:
     down = _mirrored(corners // columns, inside, height)
     across = _mirrored(corners % columns, inside, width)
     places, order = (down[:, :, None] * width + across[:, None, :]).flatten().sort()
-    colours = source.colours(places)
+    colours = reduce_channels(source.colours(places).unsqueeze(3), channels).squeeze(3)
     return colours[:, :, order.argsort().to(colours.device)].unflatten(2, (-1, WINDOW_SIZE, WINDOW_SIZE)).flatten(1, 2)
 
 

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from nlfilter_torch.edits.declaration import FILTER_PANEL, Edit, Parameter, Slider
+from nlfilter_torch.edits.declaration import FILTER_PANEL, GAINS, Edit, Parameter, Slider
 from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.shared_parameters import (
     LIMITS,
@@ -102,10 +102,13 @@ SHARPEN = Edit(
     Example: `nlfilter-torch sharpen in.jpg out.jpg --amount 5`
     """,
     (
-        gain(
+        Parameter(
             "amount",
+            "number",
             4.0,
             "Strength: 1 leaves the photograph unchanged, 4 is visible, 8 is strong.",
+            *GAINS,
+            domain="finite",
             idle=1.0,
             slider=Slider("Amount", 0, 10, 0.5),
         ),
