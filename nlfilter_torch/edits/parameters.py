@@ -102,15 +102,15 @@ SHARPEN = Edit(
     Example: `nlfilter-torch sharpen in.jpg out.jpg --amount 5`
     """,
     (
-        Parameter(
+        number(
             "amount",
-            "number",
             4.0,
             "Strength: 1 leaves the photograph unchanged, 4 is visible, 8 is strong.",
-            *GAINS,
+            GAINS,
             domain="finite",
             idle=1.0,
             slider=Slider("Amount", 0, 10, 0.5),
+            per_image=True,
         ),
         number(
             "guide_blur",
