@@ -213,6 +213,7 @@ def wait_for_ever(source: str, target: str) -> None:
 
 
 def run_for_ever(folder: str, target: str) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell inherit that it is ignored
     with interrupts.handled():  # as the command does; an interrupt during a callback would be lost
         tally_of(pictures(Path(folder)), Path(target), wait_for_ever)
 
