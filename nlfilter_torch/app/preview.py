@@ -19,9 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.edits.activity import activity, limit_by_activity
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
 from nlfilter_torch.edits.declaration import Edit
-from nlfilter_torch.edits.detail import activity, change_of_mean, limit_by_activity, split_sliders
+from nlfilter_torch.edits.detail import change_of_mean, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK

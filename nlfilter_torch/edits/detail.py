@@ -15,6 +15,7 @@ from nlfilter_torch.core.checks import (
     check_shape,
 )
 from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.edits.activity import VARIANCE_SIGMA, activity, limit_by_activity, sum_of
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.mask import select_regions
@@ -24,10 +25,7 @@ from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, luminance
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
-from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
-
-VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
-EPSILON = 1e-12
+from nlfilter_torch.operator.features import blur_margin
 
 
 @edit_of("image")
@@ -196,12 +194,6 @@ def change_of_mean(sliders: Tensor) -> Tensor | None:
     return last[0] if bool((sliders != 0).any(1).all() & (last == last[0]).all()) else None
 
 
-def sum_of(changes: Tensor) -> Tensor:
-    """Sum of added detail and the rest of the change, given as (B, 2 C, H, W)."""
-    added, rest = changes.chunk(2, dim=1)
-    return added + rest
-
-
 def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
     """Blend the changes of K regions and of the background, (B, (K + 1) S, H, W), by masks (B, K, H, W).
 
@@ -218,26 +210,6 @@ def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tens
     before = image.expand(-1, max(one.shape[1] for one in edited), -1, -1)
     changes = [one - before for one in edited]
     return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)
-
-
-def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
-    """Sum added detail and the rest of the change, (B, 2 C, H, W), with less added detail where the image is flat.
-
-    Added detail is multiplied by ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
-    """
-    if not isinstance(threshold, Tensor) and threshold == 0:
-        return sum_of(changes)
-    added, rest = changes.chunk(2, dim=1)
-    least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
-    shares = torch.where(least == 0, 1.0, activity / (activity + least).clamp(min=EPSILON))
-    return added * shares + rest
-
-
-def activity(image: Tensor) -> Tensor:
-    """Local variance (B, 1, H, W) of the luminance of an image."""
-    grey = reduce_channels(image, "luminance").mean(1, keepdim=True)
-    mean, square = blur(torch.cat([grey, grey.square()], dim=1), VARIANCE_SIGMA).chunk(2, dim=1)
-    return (square - mean.square()).clamp(min=0)
 
 
 def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
