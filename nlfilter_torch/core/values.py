@@ -41,15 +41,19 @@ def cached_constants(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         with torch.inference_mode(False), torch.device("cpu"):
-            fake = torch._C._get_dispatch_mode(_FAKE) is not None
-            return function(*args, **kwargs) if fake else cached(*args, **kwargs)
+            return (function if _fakes() else cached)(*args, **kwargs)
 
     return wrapper
 
 
 def is_fake(tensor: Tensor) -> bool:
     """Whether a tensor is fake (has a shape but no data), or fake tensor mode is active."""
-    return isinstance(tensor, FakeTensor) or torch._C._get_dispatch_mode(_FAKE) is not None
+    return isinstance(tensor, FakeTensor) or _fakes()
+
+
+def _fakes() -> bool:
+    """Whether fake tensor mode is active."""
+    return torch._C._get_dispatch_mode(_FAKE) is not None
 
 
 def are_derived(arguments: Sequence[Any]) -> bool:

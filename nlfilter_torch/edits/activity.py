@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.operator.features import blur, reduce_channels
 
 VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
@@ -17,7 +18,7 @@ def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tens
     if not isinstance(threshold, Tensor) and threshold == 0:
         return sum_of(changes)
     added, rest = changes.chunk(2, dim=1)
-    least = torch.as_tensor(threshold).to(activity).reshape(-1, 1, 1, 1).square()
+    least = per_image(threshold, activity, 4).square()
     shares = torch.where(least == 0, 1.0, activity / (activity + least).clamp(min=EPSILON))
     return added * shares + rest
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_tensor
+from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.edits.colour import group_colours, merge_luminance, split_luminance, with_green
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
@@ -200,7 +201,7 @@ def colorize(
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
         del operator  # frees its factor before the next one is computed
     far, near = parts
-    everywhere = torch.as_tensor(strength).to(wanted).reshape(-1, 1, 1, 1)
+    everywhere = per_image(strength, wanted, 4)
 
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.values import cached_constants
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.noise import Noise, noise_of
@@ -117,7 +118,7 @@ def _by_network(source: Source, noise: float | Tensor | Noise, strength: float |
 
     def finish(image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
-        level = level * torch.as_tensor(strength, dtype=level.dtype, device=level.device).reshape(-1, 1, 1, 1)
+        level = level * per_image(strength, level, 4)
         level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
         return image - _network(image.device, image.dtype).estimate_in_tiles(image, level, turns=1, inner=inner)
 

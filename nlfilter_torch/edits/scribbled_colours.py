@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import pixel_blocks
+from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.edits.colour import hundredths_of_lab
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 
@@ -46,7 +47,7 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
         bandwidth: photometric bandwidth of the regression.
     """
     some, counted = every_nth(scribbled, (weights.detach() > 0).to(others), NUM_COMPARED)
-    scale = torch.as_tensor(bandwidth).to(others).reshape(-1, 1, 1)
+    scale = per_image(bandwidth, others, 3)
     return (density(colours_in_lab(others), colours_in_lab(some), counted, scale) / SIMILAR_SHARE).clamp(max=1.0)
 
 
@@ -68,7 +69,7 @@ def colour_likelihood(
     places = hundredths_of_lab(image).flatten(2)
     scribbled = (every_nth(marked.image, weights, NUM_COLOURS) for weights in marked.weights.unbind(1))
     chosen = [*scribbled, (frame, unlike.squeeze(1))]
-    scale = BANDWIDTH_SHARE * torch.as_tensor(bandwidth).to(image).reshape(-1, 1, 1)
+    scale = BANDWIDTH_SHARE * per_image(bandwidth, image, 3)
     inside, outside, around = (density(places, colours_in_lab(some), counted, scale) for some, counted in chosen)
     opposed = (marked.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
     outside = torch.where(opposed, (outside + around) / 2, around)

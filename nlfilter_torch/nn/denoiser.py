@@ -18,7 +18,7 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.core.precision import as_given, full_precision, working_dtype
+from nlfilter_torch.core.precision import as_given, full_precision, per_image, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
@@ -236,7 +236,7 @@ def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tens
         check_values(noise.flatten(), name, "not negative", noise.numel())
         return noise.to(image).expand(image.shape[0], -1, -1, -1)
     check_values(noise, name, "not negative", image.shape[0])
-    levels = torch.as_tensor(noise, dtype=image.dtype, device=image.device).reshape(-1, 1, 1, 1)
+    levels = per_image(noise, image, 4)
     return levels.expand(image.shape[0], 1, *image.shape[-2:])
 
 
