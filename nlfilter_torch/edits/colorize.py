@@ -4,7 +4,7 @@ Three estimates of the chroma are averaged: the regression on the strokes relate
 :class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
 errors are in different places, so that the mean is better than each. An estimate counts less the farther it is from the
 other two, the more saturated it is, and the more its hue differs from that of the estimate by relative differences,
-whose worst errors are smaller than those of the others. The regression extends chroma relative to :func:`usual_chroma`,
+whose worst errors are smaller than those of the others and which therefore counts a little more. The regression extends chroma relative to :func:`usual_chroma`,
 since shadows and highlights of an object have less than its midtones; propagation between neighbours, relative to its
 square root.
 """
@@ -63,6 +63,8 @@ LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 FAINT, GREY = 0.05, 0.02  # chroma below which estimates differ little in weight, and in hue
 OTHER_HUE = 0.1  # weight of an estimate of the opposite hue
+OUTLIER_POWER = 3  # of the distance from the other estimates, by which a weight is divided
+AROUND_FACTOR = 1.25  # of the weight of the estimate by relative differences
 
 
 @edit_of("grey", channels=1)
@@ -240,12 +242,13 @@ def weighted_mean(alike: Tensor, connected: Tensor, around: Tensor, influence: T
     )
     distances = (first + third, first + second, second + third)  # squared, from both others
     own = around.square().sum(1, keepdim=True) + GREY**2
-    factors: tuple[float | Tensor, ...] = (1.0, influence, 1.0)
+    factors: tuple[float | Tensor, ...] = (1.0, influence, AROUND_FACTOR)
     total, weights = around.new_zeros(()), around.new_zeros(())
     for estimate, factor, distance in zip((alike, connected, around), factors, distances, strict=True):
         squared = estimate.square().sum(1, keepdim=True)
         cosine = ((estimate * around).sum(1, keepdim=True) + GREY**2) * ((squared + GREY**2) * own).rsqrt()
-        share = factor * ((1 + cosine) / 2 + OTHER_HUE) * (squared + FAINT**2).rsqrt() / (distance + SAME_CHROMA**2)
+        hue = (1 + cosine) / 2 + OTHER_HUE
+        share = factor * hue * (squared + FAINT**2).rsqrt() * (distance + SAME_CHROMA**2).rsqrt() ** OUTLIER_POWER
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 
