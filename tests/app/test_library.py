@@ -149,3 +149,13 @@ def test_addresses_open_what_was_edited_here_and_nothing_else(shots: Path, addre
 def test_an_address_after_a_new_start(shots: Path) -> None:
     recipe = edit(Library(shots).open(shots / "cat.png"))
     assert Library(shots).reopen("cat.png").recipe == recipe
+
+
+def test_the_photograph_is_not_replaced_by_its_edited_version(shots: Path) -> None:
+    """The edit that is kept for it would be applied to that again."""
+    session = Library(shots).open(shots / "cat.png")
+    edit(session)
+    with pytest.raises(ValueError, match=r"the name must not be that of the photograph, got 'cat\.png': .*; choose"):
+        session.save("cat.png")
+    assert difference(read_photograph(shots / "cat.png").pixels, cat()) < 1
+    session.save("other.png")
