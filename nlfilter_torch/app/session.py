@@ -303,8 +303,8 @@ class Session:
             raise ValueError("open a photograph first; there is nothing to save")
         if target.resolve() == self.opened.path:
             raise ValueError(
-                f"the name must not be that of the photograph, got {name!r}: the edit kept for it would be applied twice; "
-                "choose another name"
+                f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
+                "applied again; choose another name"
             )
         check_output(target, self.opened.photograph)
         return target
