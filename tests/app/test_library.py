@@ -128,6 +128,20 @@ def test_a_file_that_is_damaged_is_set_aside(shots: Path) -> None:
     assert (shots / "cat.png.edit.json.unreadable").read_text() == "{"
 
 
+def test_a_damaged_file_in_a_read_only_folder_stays(shots: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (shots / "cat.png.edit.json").write_text("{")
+
+    def refuse(path: Path, target: Path) -> Path:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "replace", refuse)  # as root, a test cannot make a folder read-only
+    session = Library(shots).open(shots / "cat.png")
+    assert session.recipe == Recipe()
+    assert session.trouble is not None
+    assert session.trouble.endswith("the photograph is shown unedited")
+    assert (shots / "cat.png.edit.json").read_text() == "{"
+
+
 def test_a_file_that_someone_else_changed_counts(shots: Path) -> None:
     library = Library(shots)
     session = library.open(shots / "cat.png")
