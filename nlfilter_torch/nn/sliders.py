@@ -83,8 +83,7 @@ class PolynomialSliders(nn.Module):
         """Filter given the layers (B, k+1, C, H, W) of :func:`detail_layers`; without a ``residual``."""
         if self.residual is not None:
             raise ValueError(
-                "residual must be None to combine layers, which do not contain it, got a weight; call the layer with an "
-                "operator"
+                "residual must be None to combine layers, which lack it, got a weight; call the layer with an operator"
             )
         check_tensor(layers, "layers")
         if layers.ndim != 5:
