@@ -147,6 +147,7 @@ def test_other_arguments_of_a_wrong_type() -> None:
     sentence(lambda: enhance(IMAGE, ONES, IMAGE[0]), "regions")
     sentence(lambda: NonlocalFilter().forward(None), "image")
     sentence(lambda: NonlocalFilter().sliders.combine(IMAGE), "layers")
+    sentence(lambda: NonlocalFilter(residual=0.5).sliders.combine(IMAGE), "residual")
     sentence(lambda: SPECTRUM.synthesize(torch.sqrt, torch.ones(2, 3, 19)), "coefficients")
     sentence(lambda: OPERATOR.powers(IMAGE, 10**12), "order")
 

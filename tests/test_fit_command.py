@@ -101,6 +101,7 @@ def test_preset_keeps_every_entry() -> None:
         ('{"bandwidth": 3}', "look.json is not a preset: it must hold a list of steps"),
         ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step without"),
         ('{"alpha": [1]}', "alpha in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got [1]"),
+        ('{"alpha": []}', "alpha in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got []"),
         ('{"alpha": [1, NaN]}', "alpha in look.json must be a list of 2 to 100 numbers"),
         ('{"alpha": [1, 1], "bandwidth": 0}', "bandwidth in look.json must be a positive number of grey levels"),
         ('{"alpha": [1, 1], "spatial_bandwidth": "far"}', "spatial_bandwidth in look.json must be a positive number"),

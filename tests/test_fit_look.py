@@ -305,3 +305,9 @@ def test_shifts_and_sizes_are_found() -> None:
     assert "enlarged to 100x80" in done
     with pytest.raises(ValueError, match="after must have the size of before"):
         align(CAT, CUP[..., :30, :70], "before", "after")
+
+
+def test_a_pair_of_which_a_single_pixel_is_not_clipped() -> None:
+    before, after = torch.ones(2, 1, 3, 20, 20).unbind()
+    before[..., 1, 2], after[..., 1, 2] = 0.5, 0.6
+    assert fit_look([(before, after)]).apply(before).isfinite().all()

@@ -257,6 +257,10 @@ def test_presets_are_edits(tmp_path: Path) -> None:
             "points of a stroke in defocus in edit.json must be pairs of numbers",
         ),
         (
+            '{"defocus": {"strokes": [{"points": [[0, 3]], "radius": 0.1, "paint": "in"}]}}',
+            r"must be pairs of numbers, shares of width and height from -2 to 2, got \[\[0, 3\]\]",
+        ),
+        (
             '{"defocus": {"strokes": [{"points": [[0, NaN]], "radius": 0.1, "paint": "in"}]}}',
             "points of a stroke in defocus in edit.json must be pairs of numbers",
         ),

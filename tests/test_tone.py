@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from nlfilter_torch import adjust_tone, enhance, nonlocal_operator, polynomial_filter, sharpen
+from nlfilter_torch import abstract, adjust_tone, enhance, nonlocal_operator, polynomial_filter, sharpen
 from nlfilter_torch.edits.colour import split_luminance
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance
 
@@ -83,3 +83,16 @@ def test_detail_reaches_the_likes_of_a_region_only() -> None:
         enhance(image, sliders, negative=box(1, 1))
     with pytest.raises(ValueError, match=r"alpha must have shape \(1, k\+1\)"):
         enhance(image, torch.ones(2, 4), box(1, 1))
+
+
+def test_numbers_do_not_take_the_default_dtype() -> None:
+    image = colour("coffee", 30, 40)
+    edits = (lambda: adjust_tone(image, contrast=1.4, num_landmarks=40), lambda: abstract(image, num_landmarks=40))
+    expected = [edit() for edit in edits]
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        found = [edit() for edit in edits]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for a, b in zip(found, expected, strict=True):
+        assert torch.equal(a, b)

@@ -188,6 +188,14 @@ def test_soft_limits_do_not_clip_and_none_is_the_plain_sum(name: str) -> None:
         EDITS[name](image, limits="hard")
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_values_above_white_change_as_little_as_asked(channels: int) -> None:
+    """As in float files; the tone curve that keeps the mean brightness has no meaning there."""
+    image, change = drawn()
+    image, change = 4 * image[:, :channels], 1e-4 * change.clamp(-2, 2)
+    assert (changed(image, change, brighter=0.0) - image).abs().max() < 0.01
+
+
 @pytest.mark.parametrize("residual", [None, 1.0])
 def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
     image, region = colour("coffee", 40, 60), torch.zeros(1, 1, 40, 60)

@@ -147,6 +147,9 @@ class Editor:
 
     def _change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
         """Change entries of a step; ``complete`` when the pointer is released."""
+        if self.session.opened is None:  # it would be lost when one is opened
+            self._panel.follow()
+            return
         self.session.set(step, **entries)
         if complete:
             self.session.commit()

@@ -181,13 +181,13 @@ class Panel:
             return
         self._started = name
         inside = self.session.recipe.last("detail")["inside"]
-        entries = _entries_of(name)
+        entries = entries_of(name)
         entries["inside"] = inside if inside is not None and len(inside) == len(entries["alpha"]) else None
         self._change("detail", entries, True)
 
     def _name_preset(self, detail: Step) -> None:
         """Show the preset that the sliders are; or the one that they began with, which can then be chosen again."""
-        same = [name for name in PRESETS if all(detail[k] == v for k, v in _entries_of(name).items())]
+        same = [name for name in PRESETS if all(detail[k] == v for k, v in entries_of(name).items())]
         if same and self._started not in same:
             self._started = same[0]
         if detail["alpha"] == NONE:
@@ -201,6 +201,6 @@ class Panel:
             self._change("detail", {"bandwidth": value}, True)
 
 
-def _entries_of(name: str) -> dict[str, Any]:
+def entries_of(name: str) -> dict[str, Any]:
     """What a preset sets."""
-    return {entry: getattr(PRESETS[name], entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
+    return {entry: getattr(PRESETS[name], entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}

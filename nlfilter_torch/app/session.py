@@ -43,8 +43,18 @@ OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the
 
 @dataclass(frozen=True)
 class Opened:
-    """An open photograph, the name of its file, its preview, parts of it at full size, and the pages of the file."""
+    """An open photograph.
 
+    Attributes:
+        path: its file, which may be a copy.
+        name: the name of the file for the user.
+        photograph: its pixels.
+        preview: its preview.
+        parts: parts of it at full size.
+        pages: number of pages of the file.
+    """
+
+    path: Path
     name: str
     photograph: Photograph
     preview: Preview
@@ -97,7 +107,8 @@ class Session:
             self.opened.parts.close()
         parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name or path.name)
         pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
-        self.opened = Opened(name or path.name, photograph, Preview(photograph.pixels, self._pixels), parts, pages)
+        preview = Preview(photograph.pixels, self._pixels)
+        self.opened = Opened(path.resolve(), name or path.name, photograph, preview, parts, pages)
         self.recipe = self._shown = self.saved = Recipe()
         self._at_rest = None
         self._past, self._future = [], []
@@ -290,6 +301,11 @@ class Session:
         target = self.target(name)
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to save")
+        if target.resolve() == self.opened.path:
+            raise ValueError(
+                f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
+                "applied again; choose another name"
+            )
         check_output(target, self.opened.photograph)
         return target
 
@@ -352,5 +368,7 @@ class Session:
         return target
 
     def load_preset(self, content: bytes, name: str) -> None:
-        """Load the edit in the content of a file; raises ValueError if there is none."""
+        """Load the edit in the content of a file; raises ValueError if there is none, or no photograph is open."""
+        if self.opened is None:
+            raise ValueError("open a photograph first; there is nothing to edit")
         self.load(Recipe.from_json(content, name))

@@ -6,6 +6,7 @@ sent the photograph and no file in the editor's folder is the same.
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,9 +57,10 @@ class Sidecar:
         except OSError as error:
             self.trouble = f"{self.path} cannot be read: {error.strerror or error}; the photograph is shown unedited"
         except ValueError as error:
-            aside = self.path.with_name(self.path.name + UNREADABLE)
-            self.path.replace(aside)
-            self.trouble = f"{error}; the photograph is shown unedited, and the file was renamed to {aside.name}"
+            self.trouble = f"{error}; the photograph is shown unedited"
+            with suppress(OSError):  # in a read-only folder the file stays, and nothing can replace it
+                aside = self.path.replace(self.path.with_name(self.path.name + UNREADABLE))
+                self.trouble += f", and the file was renamed to {aside.name}"
         return None
 
     def write(self, recipe: Recipe) -> None:

@@ -85,13 +85,11 @@ def batch(
     check_workers(workers, cluster)
     if cluster is not None:  # whose workers run in other folders
         folder, target = folder.absolute(), target.absolute()
-        if preset is not None and preset not in PRESETS:
-            preset = str(Path(preset).absolute())
     shared = free_memory() if memory is None else allowed_memory(memory)
     settings = {**given, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
     if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
-        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[preset])
+        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[str(Path(preset).absolute())])
     paths = pictures(folder)
     prepare(paths, target, settings)
     if others := left_out(folder):

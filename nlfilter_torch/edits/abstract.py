@@ -129,7 +129,7 @@ def flattened(
     def varying(pixels: Pixels) -> Tensor:
         return pixels.image - mean
 
-    exponent = torch.as_tensor(power).to(mean.device, torch.float64).reshape(-1, 1)
+    exponent = torch.as_tensor(power, dtype=torch.float64, device=mean.device).reshape(-1, 1)
     coefficients = operator.coefficients(varying)
     captured = synthesize(operator, torch.ones_like, coefficients)
     smoothed = synthesize(operator, lambda eigenvalues: eigenvalues**exponent, coefficients)

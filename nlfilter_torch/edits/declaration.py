@@ -154,7 +154,7 @@ class Parameter:
         if self.kind == "sliders":
             return (
                 isinstance(value, list | tuple)
-                and (len(value) == self.length or (not self.length and 2 <= len(value) <= MAX_SLIDERS))
+                and (self.length or 2) <= len(value) <= (self.length or MAX_SLIDERS)
                 and all(is_within(v, *GAINS) for v in value)
             )
         if self.kind == "number":

@@ -254,7 +254,7 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
     if not bool(shown.any()):
         raise ValueError(f"{second} must have pixels that are not clipped to black or white, got none; edit it less")
     grey, edited = (reduce_channels(image[None], "luminance")[0, 0, shown].double() for image in (before, after))
-    if min(float(grey.std()), float(edited.std())) < 1 / 255:
+    if min(float(grey.std(correction=0)), float(edited.std(correction=0))) < 1 / 255:
         return  # nothing to compare
     shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
     counts = torch.zeros(SHADES, dtype=torch.float64).index_add(0, shades, torch.ones_like(grey)).clamp(min=1)

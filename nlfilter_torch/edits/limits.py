@@ -33,7 +33,7 @@ class Balance:
     Attributes:
         restraint: fraction in [0, 1] that is removed from the part of the change that costs chroma, (B, 1, 1, 1); the
             number 0 if the loss of chroma is small.
-        curve: k of the tone curve ``y - k y (1 - y)`` applied after the change, (B, 1 or C, 1, 1).
+        curve: k of the tone curve ``y - k y (1 - y)`` applied after the change, in [0, 1], (B, 1 or C, 1, 1).
         colour: fraction in [0, 1] of the possible gain in saturation that is applied, (B, 1, 1, 1).
     """
 
@@ -125,8 +125,7 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
     def curve_of(restraint: float | Tensor) -> Tensor:
         def shifts(image: Tensor, moved: Tensor) -> Tensor:
             before, moved = _before(image, moved), _restrained(image, moved, restraint)
-            after = before + moved
-            return torch.cat([moved, before, after * (1 - after)], dim=1)
+            return torch.cat([moved, before, _bow(before + moved)], dim=1)
 
         shift, before, room = mean(shifts).chunk(3, dim=1)
         return ((shift - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
@@ -190,8 +189,13 @@ def _restrained(image: Tensor, moved: Tensor, restraint: float | Tensor) -> Tens
 
 def _bent(before: Tensor, moved: Tensor, curve: float | Tensor) -> Tensor:
     """Apply the tone curve after a change, within the headroom."""
-    after = before + moved
-    return _inside(before, moved - curve * after * (1 - after))
+    return _inside(before, moved - curve * _bow(before + moved))
+
+
+def _bow(values: Tensor) -> Tensor:
+    """``y (1 - y)``, by which the tone curve bends; 0 outside [0, 1]."""
+    inside = values.clamp(0.0, 1.0)
+    return inside * (1 - inside)
 
 
 def _saturation(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:

@@ -51,7 +51,8 @@ class Stroke:
         points, radius, paint = value["points"], value["radius"], value["paint"]
         if not (isinstance(points, list) and points and all(map(_is_point, points))):
             raise ValueError(
-                f"points of a stroke in {place} must be pairs of numbers, got {shown(points)}; correct them"
+                f"points of a stroke in {place} must be pairs of numbers, shares of width and height from -2 to 2, got "
+                f"{shown(points)}; correct them"
             )
         if not (is_within(radius, 0, 1) and radius > 0):
             raise ValueError(f"radius of a stroke in {place} must be in (0, 1], got {shown(radius)}; correct it")

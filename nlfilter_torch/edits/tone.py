@@ -67,7 +67,7 @@ def adjust_tone(
     TONE.check(source.batch, contrast=contrast, limits=limits, viewing_size=viewing_size, clarity=clarity)
 
     def slider(value: float | Tensor) -> Tensor:
-        return torch.as_tensor(value).to(source.dtype).reshape(-1).expand(source.batch)
+        return torch.as_tensor(value, dtype=source.dtype).reshape(-1).expand(source.batch)
 
     fine = [torch.zeros_like(slider(1.0))] * (order - 1)
     # Less 1, so that the filter gives the change.

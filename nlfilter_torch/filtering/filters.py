@@ -275,7 +275,7 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
         tensor([[3., 1., 2.],
                 [1., 1., 1.]])
     """
-    check_image(masks, "masks")
+    check_image(masks, "masks", empty=True)
     check_unit_range(masks, "masks")
     check_tensor(alpha, "alpha")
     check_dtype(alpha, "alpha", "write 1.0 instead of 1")
@@ -291,7 +291,7 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
     check_finite(alpha, "alpha")
     shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
     change = alpha.to(masks) - 1.0
-    batch = max(masks.shape[0], change.shape[0] if change.ndim == 3 else 1)
+    batch = len(change) if change.ndim == 3 and len(masks) == 1 else len(masks)
     return 1.0 + torch.einsum("bkhw,bkl->blhw", shares.expand(batch, -1, -1, -1), change.expand(batch, -1, -1))
 
 
@@ -331,8 +331,9 @@ def filter_regions(
         (True, False)
     """
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
-    check_image(image, "image")
-    check_image(masks, "masks", batch=max(operator.factor.shape[0], image.shape[0]))
+    check_image(image, "image", empty=True)
+    batch = max(operator.factor.shape[0], image.shape[0])
+    check_image(masks, "masks", batch=batch, empty=len(image) == 0)
     check_unit_range(masks, "masks")
     check_same_size(masks, operator.size, "masks", "operator", operator.factor)
     masks = masks.to(operator.factor)

@@ -151,7 +151,7 @@ def squared_distances(coordinates: Tensor, centres: Tensor) -> Tensor:
 
 def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") -> Tensor:
     """Check regions (B, K, H, W) and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
-    check_image(region, name, batch=spectrum.factor.shape[0])
+    check_image(region, name, batch=spectrum.factor.shape[0], empty=len(spectrum.factor) == 0)
     check_same_size(region, spectrum.size, name, "spectrum", spectrum.factor)
     flat = region.to(spectrum.factor).flatten(2)
     if not is_hidden(flat) and bool((flat < 0).any()):

@@ -80,7 +80,11 @@ class PolynomialSliders(nn.Module):
         return polynomial_filter(operator, image, self.alpha if alpha is None else alpha, residual=self.residual)
 
     def combine(self, layers: Tensor, alpha: Tensor | None = None) -> Tensor:
-        """Filter given the layers (B, k+1, C, H, W) of :func:`detail_layers`, with alpha_1 as ``residual``."""
+        """Filter given the layers (B, k+1, C, H, W) of :func:`detail_layers`; without a ``residual``."""
+        if self.residual is not None:
+            raise ValueError(
+                "residual must be None to combine layers, which lack it, got a weight; call the layer with an operator"
+            )
         check_tensor(layers, "layers")
         if layers.ndim != 5:
             raise ValueError(

@@ -8,6 +8,8 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.app import controls, drawing
+from nlfilter_torch.app.panel import entries_of
+from nlfilter_torch.edits.presets import PRESETS
 from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
@@ -45,6 +47,11 @@ def test_response_has_a_line_for_each_region_and_a_dot_for_each_eigenvalue() -> 
     assert svg.count('class="mark"') == 3
     # Gains from 0 to 3 lie between y = 112 and y = 10; sliders (3, 1) give 3, 2, 1.
     assert [f'cy="{y:.1f}" r="1.6" fill="red"' in svg for y in (10.0, 44.0, 78.0)] == [True] * 3
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_those_of_the_command(name: str) -> None:
+    assert Step("detail", **entries_of(name)) == PRESETS[name].step
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,20 @@ def test_a_file_that_is_damaged_is_set_aside(shots: Path) -> None:
     assert (shots / "cat.png.edit.json.unreadable").read_text() == "{"
 
 
+def test_a_damaged_file_in_a_read_only_folder_stays(shots: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (shots / "cat.png.edit.json").write_text("{")
+
+    def refuse(path: Path, target: Path) -> Path:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "replace", refuse)  # as root, a test cannot make a folder read-only
+    session = Library(shots).open(shots / "cat.png")
+    assert session.recipe == Recipe()
+    assert session.trouble is not None
+    assert session.trouble.endswith("the photograph is shown unedited")
+    assert (shots / "cat.png.edit.json").read_text() == "{"
+
+
 def test_a_file_that_someone_else_changed_counts(shots: Path) -> None:
     library = Library(shots)
     session = library.open(shots / "cat.png")
@@ -149,3 +163,13 @@ def test_addresses_open_what_was_edited_here_and_nothing_else(shots: Path, addre
 def test_an_address_after_a_new_start(shots: Path) -> None:
     recipe = edit(Library(shots).open(shots / "cat.png"))
     assert Library(shots).reopen("cat.png").recipe == recipe
+
+
+def test_the_photograph_is_not_replaced_by_its_edited_version(shots: Path) -> None:
+    """The edit that is kept for it would be applied to that again."""
+    session = Library(shots).open(shots / "cat.png")
+    edit(session)
+    with pytest.raises(ValueError, match=r"the name must not be that of the photograph, got 'cat\.png': .*; choose"):
+        session.save("cat.png")
+    assert difference(read_photograph(shots / "cat.png").pixels, cat()) < 1
+    session.save("other.png")

@@ -40,6 +40,14 @@ def test_a_stroke_before_a_photograph(tab: Tab) -> None:
     expect(tab.page.get_by_text("open a photograph first; there is nothing to save")).to_be_visible()
 
 
+def test_a_slider_before_a_photograph(tab: Tab, folder: Path) -> None:
+    tab.drag(tab.slider("Texture"), 0.2, 0.8)
+    expect(tab.page.get_by_text("1.00 ×")).to_have_count(4)
+    tab.open(folder / "cat.png")
+    tab.wait_until_ready()
+    expect(tab.page.get_by_role("button", name="Undo")).to_be_disabled()
+
+
 def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
     page = opened.page
     (folder / "notes.png").write_text("dear diary")

@@ -101,6 +101,12 @@ def test_a_stroke_before_a_photograph(tmp_path: Path) -> None:
         Session(tmp_path).add_stroke("detail", LINE, 0.03, "in")
 
 
+def test_an_edit_before_a_photograph(tmp_path: Path) -> None:
+    """The photograph that is opened next begins with its own edit."""
+    with pytest.raises(ValueError, match="open a photograph first; there is nothing to edit"):
+        Session(tmp_path).load_preset(Recipe((Step("tone"),)).to_json().encode(), "edit.json")
+
+
 def test_another_photograph_begins_a_new_edit(session: Session, tmp_path: Path) -> None:
     session.set("abstract", power=0.1)
     session.commit()

@@ -13,8 +13,10 @@ from torch.autograd import forward_ad
 from torch.func import jvp, vmap
 
 from nlfilter_torch import (
+    DiffusionMask,
     NonlocalFilter,
     NonlocalOperator,
+    SegmentMask,
     detail_layers,
     diffusion_mask,
     fit_filter,
@@ -139,17 +141,21 @@ def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) ->
 # --- empty batches and memory formats
 
 
-@pytest.mark.client("empty batches", "yes; edits of photographs refuse them")
+@pytest.mark.client("empty batches", "yes; edits, looks, strokes and the denoiser refuse them")
 def test_empty_batches_stay_empty() -> None:
     none = image()[:0]
     layer = NonlocalFilter(ALPHA, learn=("alpha", "residual"), residual=0.5, **OPTIONS)
     assert layer(none).shape == none.shape
     assert layer(none, image(batch=1)).shape == none.shape
     assert layer(none, mask=none[:, :1]).shape == none.shape
+    regions = NonlocalFilter((ALPHA, ALPHA), **OPTIONS)
+    assert regions(none, mask=none[:, :2]).shape == none.shape
     layer(none).sum().backward()
     assert bool((layer.alpha.grad == 0).all())  # type: ignore[union-attr]
     empty = nonlocal_operator(none, **OPTIONS)
     assert (empty @ none).shape == none.shape
+    assert DiffusionMask()(empty.spectrum(), none[:, :2]).shape == none[:, :2].shape
+    assert SegmentMask()(empty.spectrum(), none[:, :2]).shape == none[:, :2].shape
     assert detail_layers(operator(), none).shape == (0, 4, 3, 12, 13)
     assert spectral_filter(operator().spectrum(), none, torch.sqrt).shape == none.shape
     assert operator_from_features(torch.zeros(0, 3, 20), size=(4, 5), num_landmarks=6).factor.shape == (0, 6, 20)
