@@ -6,27 +6,42 @@ of the object that changes by at least half of the expected change, "outside" th
 by more than two grey levels, and "border" the RMS error at the border, in grey levels. For defocus, "kept" is the share
 of the object that stays in focus, "blurred" the share of the background that does not, and "halo" the error beside the
 object, compared with a background that is blurred alone.
+
+Blotches are measured in smooth areas of the photographs themselves, such as skies: connected areas without borders, of
+about one colour, in which one scribble is drawn. "Covered" is as above, "spread" the standard deviation of the new
+colour over the area (a* and b* of CIE Lab), "even" what it would be if the whole area were recoloured, and "before"
+that of the old colour.
 ``--set choosing`` takes the photographs and seeds that the defaults were chosen on.
 """
 
 import statistics
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.composites import Composite, composites, setup
+from benchmarks.composites import Composite, composites, draw_strokes, setup
 from nlfilter_torch import defocus, recolor
-from nlfilter_torch.edits.colour import merge_luminance, split_luminance
+from nlfilter_torch.edits.colour import hundredths_of_lab, merge_luminance, split_luminance
 from nlfilter_torch.edits.defocus import blur_kernel, convolve
 from nlfilter_torch.edits.matting import colours_beside
 from nlfilter_torch.edits.recolor import Recoloring
+from nlfilter_torch.edits.resizing import resize
 
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint
 RADIUS = 0.03  # of the blur, as a share of the short side
 BESIDE = 0.06  # width of the area beside the object, as a share of the short side
 CHANGED = 2 / 255
+AREA_PIXELS = 130_000  # size to which photographs are reduced for smooth areas
+# Smooth areas: blur and distance to borders as shares of the short side, largest change of colour along that distance,
+# largest differences from the colour of the innermost pixel in lightness and in a* and b*, all in units of Lab, and
+# smallest share of the photograph.
+SMOOTH_BLUR, SMOOTH_MARGIN, SMOOTH_CHANGE = 0.006, 0.008, 1.7
+SMOOTH_LIGHTNESS, SMOOTH_COLOUR, SMOOTH_SHARE = 30, 15, 0.1
 LIMITS = {"covered": 90.0, "outside": 10.0, "outside, keep": 5.0, "border": 20.0, "kept": 85.0, "kept, two": 95.0}
 
 
@@ -103,10 +118,57 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     }
 
 
+def reduced(image: Tensor, pixels: int) -> Tensor:
+    """Reduce a photograph to at most that number of pixels."""
+    scale = min(1.0, (pixels / (image.shape[-2] * image.shape[-1])) ** 0.5)
+    return resize(image, (int(scale * image.shape[-2]), int(scale * image.shape[-1]))).clamp(0, 1)
+
+
+def smooth_area(image: Tensor) -> NDArray[np.bool_] | None:
+    """Find the largest smooth area (H, W) of about one colour in a photograph (1, 3, H, W), if there is one."""
+    lab = 100 * hundredths_of_lab(image)[0].permute(1, 2, 0).numpy()
+    short = min(lab.shape[:2])
+    lab = cv2.GaussianBlur(lab, (0, 0), SMOOTH_BLUR * short)
+    slope = np.sqrt(sum(np.square(part).sum(2) for part in np.gradient(lab, axis=(0, 1))))
+    size = 2 * round(SMOOTH_MARGIN * short) + 1
+    flat = (slope * SMOOTH_MARGIN * short < SMOOTH_CHANGE).astype(np.uint8)
+    flat = cv2.erode(flat, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    labels, areas = cv2.connectedComponentsWithStats(flat)[1:3]
+    if len(areas) < 2:
+        return None
+    connected = labels == 1 + areas[1:, 4].argmax()
+    depth = cv2.distanceTransform(np.pad(connected, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    middle = np.unravel_index(depth.argmax(), depth.shape)
+    difference = np.abs(lab - lab[middle])
+    alike = (difference[..., 0] < SMOOTH_LIGHTNESS) & (np.hypot(*difference[..., 1:].T).T < SMOOTH_COLOUR)
+    labels = cv2.connectedComponents((connected & alike).astype(np.uint8))[1]
+    area: NDArray[np.bool_] = labels == labels[middle]
+    return area if area.mean() >= SMOOTH_SHARE else None
+
+
+def measure_smooth(image: Tensor, area: NDArray[np.bool_], number: int, seed: int) -> dict[str, float]:
+    """Measure the recolouring of a smooth area by one scribble: share in percent, and standard deviations."""
+    inside = draw_strokes(area, 1, np.random.default_rng(seed))
+    colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
+    found = recolor(image, (colour * inside).expand_as(image), inside)
+    whole = Composite("", image, torch.ones_like(inside), image, image)
+    before, even, after = (
+        100 * hundredths_of_lab(part)[0, 1:, torch.from_numpy(area)]
+        for part in (image, recoloured(whole, colour, inside), found)
+    )
+    ideal = (even - before).square().sum(0)
+    visible = ideal > 1  # a distance of 1 in Lab is just noticeable
+    along = ((after - before) * (even - before)).sum(0)[visible] / ideal[visible]
+    spreads = {
+        name: float(part.std(1).norm()) for name, part in (("spread", after), ("even", even), ("before", before))
+    }
+    return {"covered": 100 * float((along > 0.5).float().mean()), **spreads}
+
+
 def report(title: str, cases: list[dict[str, float]], limits: dict[str, str]) -> None:
     """Print means, the worst tenth, and the share of cases within each limit."""
     print(f"\n{title}: mean, worst tenth, of {len(cases)}")
-    for name in cases[0]:
+    for name in cases[0] if cases else ():
         values = sorted(case[name] for case in cases)
         high = name in ("covered", "kept", "blurred")
         tenth = values[len(values) // 10] if high else values[-1 - len(values) // 10]
@@ -132,6 +194,10 @@ def main(arguments: list[str] | None = None) -> None:
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})
     report("defocus, one scribble", [measure_defocus(s, 1, first + 10 * i) for i, s in scenes], {"kept": "kept"})
     report("defocus, two", [measure_defocus(s, 2, first + 10 * i) for i, s in scenes], {"kept": "kept, two"})
+    size = AREA_PIXELS // 16 if chosen.quick else AREA_PIXELS
+    images = (reduced(image, size) for _, image in sorted(chosen.images.items()))
+    smooth = [(image, area) for image in images if (area := smooth_area(image)) is not None]
+    report("recolor, smooth areas", [measure_smooth(*s, i, first + i) for i, s in enumerate(smooth)], {})
 
 
 if __name__ == "__main__":

@@ -113,6 +113,11 @@ def test_defocus(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
         run("defocus", photo, "--mask", tmp_path / "mask.png"),
         defocus(pixels, region, num_landmarks=40, generator=seeded()),
     )
+    background = box(30, 40, 8, 8)
+    assert is_written(
+        run("defocus", photo, "--region", "20,10,16,12", "--background", "40,30,8,8"),
+        defocus(pixels, region, background=background, num_landmarks=40, generator=seeded()),
+    )
 
 
 def test_abstract(photo: Path, pixels: torch.Tensor) -> None:

@@ -81,3 +81,31 @@ def test_reach_is_an_option_of_the_mask() -> None:
     found = [defocus(image, region, reach=reach, num_landmarks=20) for reach in (0.5, REACH)]
     torch.testing.assert_close(found[1], defocus(image, region, num_landmarks=20), rtol=0, atol=0)
     assert not torch.equal(found[0], found[1])
+
+
+def test_background_scribbles_are_blurred_with_what_resembles_them() -> None:
+    """Two squares of one colour: the one under a background scribble is blurred, the other stays sharp."""
+    image = 0.4 + 0.1 * torch.rand(1, 3, 60, 90, generator=torch.Generator().manual_seed(0))
+    subject, twin = box(20, 10, 20, 20, size=(60, 90)), box(20, 60, 20, 20, size=(60, 90))
+    image[:, 0] += 0.4 * (subject + twin)[:, 0]
+    region, background = box(26, 16, 8, 8, size=(60, 90)), box(26, 66, 8, 8, size=(60, 90))
+    inner = box(24, 64, 12, 12, size=(60, 90))
+    options = {"radius": 4.0, "spatial_bandwidth": float("inf"), "num_landmarks": 60}
+    alone = defocus(image, region, **options)
+    assert gradient_energy(alone, inner) > 0.9 * gradient_energy(image, inner)
+    blurred = defocus(image, region, background=background, **options)
+    assert gradient_energy(blurred, inner) < 0.3 * gradient_energy(image, inner)
+    own = box(24, 14, 12, 12, size=(60, 90))
+    assert gradient_energy(blurred, own) > 0.9 * gradient_energy(image, own)
+    none = defocus(image, region, background=torch.zeros_like(region), **options)
+    torch.testing.assert_close(none, alone, rtol=0, atol=0)
+
+
+def test_background_scribbles_have_a_gradient() -> None:
+    image = colour("chelsea", 40, 40).double()
+    background = 0.5 * box(4, 4, 8, 8).double()[..., :40, :40]
+    background.requires_grad_()
+    defocus(image, box(20, 20, 8, 8)[..., :40, :40], background=background, num_landmarks=20).square().mean().backward()
+    assert background.grad is not None
+    assert background.grad.isfinite().all()
+    assert background.grad.abs().max() > 0

@@ -138,6 +138,18 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
             "strokes must have batch size 1 or 2, got 3",
         ),
         (defocus, RGB, {"focus_region": 0 * SPOT}, "focus_region must hold a painted pixel"),
+        (
+            defocus,
+            RGB,
+            {"focus_region": SPOT, "background": torch.ones(1, 1, 9, 9)},
+            "background must have the height and width of the image",
+        ),
+        (
+            defocus,
+            RGB,
+            {"focus_region": SPOT, "background": 3 * SPOT},
+            r"background must be in \[0, 1\], got values from 0 to 3",
+        ),
         (defocus, RGB, {"focus_region": SPOT, "radius": 0.0}, "radius must be positive"),
         (defocus, RGB, {"focus_region": SPOT, "radius": 1e4}, "radius must be at most half the short side of the"),
         (defocus, RGB, {"focus_region": SPOT, "aperture": "square"}, "aperture must be one of 'disc', 'gaussian'"),

@@ -134,6 +134,9 @@ def test_colours(pixels: torch.Tensor) -> None:
 def test_blur_and_painting(pixels: torch.Tensor) -> None:
     blurred = defocus(pixels, mask_of([IN], SIZE), radius=0.04 * 48, generator=seeded())
     assert torch.equal(Recipe((DEFOCUS,)).apply(pixels), blurred)
+    behind = defocus(pixels, mask_of([IN], SIZE), background=mask_of([OUT], SIZE), radius=0.04 * 48, generator=seeded())
+    assert torch.equal(Recipe((DEFOCUS.changed(strokes=(IN, OUT)),)).apply(pixels), behind)
+    assert not torch.equal(behind, blurred)
     for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines have a minimum width in pixels
         step = ABSTRACT.changed(edge_width=line)
         wanted = abstract(pixels, power=0.2, edges=0.5, edge_width=width, tones=5, generator=seeded())

@@ -342,6 +342,7 @@ def run(verb: str, *arguments: object) -> int:
         ("abstract", "grey.tif", ()),
         ("defocus", "in.tif", ("--region", "80,60,20,20", "--region", "100,90,9,9")),
         ("defocus", "in.tif", ("--mask", "mask.tif", "--aperture", "gaussian")),
+        ("defocus", "in.tif", ("--region", "80,60,20,20", "--background", "5,5,20,20")),
     ],
 )
 def test_by_rows_as_whole(photo: Path, verb: str, source: str, options: tuple[str, ...]) -> None:

@@ -88,7 +88,12 @@ SCRIBBLES: dict[str, dict[str, Any]] = {
     },
     "denoise": {"map": options.NoiseMap},
     "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions, "show": options.Show},
-    "defocus": {"region": options.Regions, "mask": options.MaskFile, "show": options.Show},
+    "defocus": {
+        "region": options.Regions,
+        "background": options.Backgrounds,
+        "mask": options.MaskFile,
+        "show": options.Show,
+    },
     "mask": {
         "region": options.Regions,
         "background": options.Backgrounds,

@@ -177,7 +177,7 @@ Regions = _rectangles(
 Backgrounds = _rectangles(
     "--background",
     "X,Y,W,H",
-    "A rectangle of the background, where the mask covers too much. May be repeated.",
+    "A rectangle of the background, where too much is selected. May be repeated.",
 )
 SliderRegions = _rectangles(
     "--region",

@@ -171,7 +171,8 @@ def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tup
             raise ValueError(
                 "give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60"
             )
-        return (focus,), {}
+        background = selection(size, None, given.get("background"), "--background", read)
+        return (focus,), {} if background is None else {"background": background}
     if step.edit != "detail" or (mask is None and not regions):
         return (), {}
     masks, sliders = _slider_regions(size, mask, regions, torch.tensor(step["alpha"]), read)

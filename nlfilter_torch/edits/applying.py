@@ -68,7 +68,8 @@ def scribbles_of(
         keep = mask(step.painted("keep"), size)
         return colours(step.painted("colour"), size), {"keep": keep} if bool(keep.any()) else {}
     if step.edit == "defocus":
-        return (mask(step.painted("in"), size),), {}
+        background = mask(step.painted("out"), size)
+        return (mask(step.painted("in"), size),), {"background": background} if bool(background.any()) else {}
     if not step.has_region():
         return (), {}
     outer = mask(step.painted("out"), size)

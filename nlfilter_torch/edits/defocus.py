@@ -28,6 +28,7 @@ def defocus(
     /,
     focus_region: Tensor,
     *,
+    background: Tensor | None = None,
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
     photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
@@ -43,6 +44,8 @@ def defocus(
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject.
+        background: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that are blurred together with
+            similar ones. ``focus_region`` takes precedence over it.
         radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
             variance.
@@ -53,7 +56,7 @@ def defocus(
 
     Returns:
         (B, C, H, W), within the range of ``image`` and equal to it to rounding where it is in focus. Differentiable in
-        image and region.
+        image, region and background.
 
     Raises:
         TypeError, ValueError: if a tensor has another size, leaves its range, or the region is empty.
@@ -75,11 +78,12 @@ def defocus(
     blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
     check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
+    others = [] if background is None else [source.scribbles(background, None, "background", needed=False)]
     options = {"reach": REACH} | options
     found = fit_regions(
         source,
         [scribbles],
-        [],
+        others,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
         patch_size=patch_size,

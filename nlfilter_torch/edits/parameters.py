@@ -273,9 +273,12 @@ DEFOCUS = Edit(
     "defocus",
     """Blur a photograph as a wide aperture would, except for the object that you mark.
 
-    Mark some of it, or of each of its parts; the rest of it is found automatically.
+    Mark some of it, or of each of its parts; the rest of it is found automatically. If parts of the background stay
+    sharp, mark some of them with --background.
 
     Example: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --region 60,260,40,180`
+
+    Blur what resembles a rectangle: `nlfilter-torch defocus in.jpg out.jpg --region 190,60,60,60 --background 9,9,9,9`
     """,
     (
         number(
@@ -296,7 +299,7 @@ DEFOCUS = Edit(
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
     hint="Paint on some of the object to keep sharp; the rest of it is found, and the background is blurred.",
-    brushes=(("in", "Keep sharp"),),
+    brushes=(("in", "Keep sharp"), ("out", "Blur this")),
     requires_strokes=True,
 )
 
