@@ -4,9 +4,9 @@ Three estimates of the chroma are averaged: the regression on the strokes relate
 :class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
 errors are in different places, so that the mean is better than each. An estimate counts less the farther it is from the
 other two, the more saturated it is, and the more its hue differs from that of the estimate by relative differences,
-whose worst errors are smaller than those of the others and which therefore counts a little more. The regression extends chroma relative to :func:`usual_chroma`,
-since shadows and highlights of an object have less than its midtones; propagation between neighbours, relative to its
-square root.
+whose worst errors are smaller than those of the others and which therefore counts a little more. The regression extends
+chroma relative to :func:`usual_chroma`, since shadows and highlights of an object have less than its midtones;
+propagation between neighbours, relative to its square root.
 """
 
 import math
