@@ -25,8 +25,7 @@ from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
-from nlfilter_torch.operator.nystrom import Kernel
-from nlfilter_torch.operator.operator import Columns, NonlocalOperator
+from nlfilter_torch.operator.operator import Columns, Kernel, NonlocalOperator
 from nlfilter_torch.operator.scaling import PixelScaling
 
 

@@ -37,8 +37,8 @@ from nlfilter_torch.operator.features import (
     unit_window,
 )
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
-from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
-from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 
 

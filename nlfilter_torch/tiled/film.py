@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step, seeded
 from nlfilter_torch.edits.recipe import Recipe
@@ -21,7 +22,6 @@ from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.operator import TiledOperator, first_plane

@@ -12,8 +12,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.source import SAMPLE, Blocks, Planes, sampled_pairs, sampled_places
 from nlfilter_torch.filtering.fitted import layers_of_columns
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.nystrom import Kernel
-from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.operator import Columns, Kernel
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling

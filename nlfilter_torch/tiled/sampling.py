@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.build import Construction, check_bandwidths
@@ -25,9 +26,9 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
-from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.operator import Columns, Kernel
 from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
 from nlfilter_torch.tiled.workers import in_order, single_threaded

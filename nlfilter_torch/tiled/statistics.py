@@ -23,9 +23,8 @@ from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
-from nlfilter_torch.operator.newton import LARGEST
 from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
+from nlfilter_torch.operator.scaling import LARGEST, PixelScaling, scaling_from_moment
 
 CONVERGED = {
     torch.float32: 1e-5,
