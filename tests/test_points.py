@@ -22,7 +22,7 @@ from nlfilter_torch import (
     segment_mask,
     spectral_filter,
 )
-from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import KernelMatrix, Solution, damped
 from tests import reference
 from tests.problems import noise, picture, seeded

@@ -24,7 +24,7 @@ from nlfilter_torch.app.script import SCRIPT
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.tiled.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress

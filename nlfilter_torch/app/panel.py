@@ -203,4 +203,4 @@ class Panel:
 
 def _entries_of(name: str) -> dict[str, Any]:
     """What a preset sets."""
-    return {entry: getattr(PRESETS[name], entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth")}
+    return {entry: PRESETS[name].steps[0][entry] for entry in ("alpha", "bandwidth", "spatial_bandwidth")}

@@ -12,7 +12,7 @@ from torch import Tensor
 from nlfilter_torch.app.preview import PIXELS, Preview
 from nlfilter_torch.app.sidecar import Sidecar
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.scribbles import Stroke, thin
 from nlfilter_torch.edits.steps import Step
@@ -255,7 +255,7 @@ class Session:
         """The parts of the photograph, with an edit fitted to the whole."""
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to show")
-        self.opened.parts.fit(recipe, self._passes(self.opened.photograph, report))
+        self.opened.parts.fit(recipe.steps, self._passes(self.opened.photograph, report))
         return self.opened.parts
 
     def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
@@ -330,7 +330,7 @@ class Session:
             rows = photograph.pixels[0].permute(1, 2, 0).numpy()
             channels = 3 if recipe.gives_colour else rows.shape[2]
             pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-            for part, values in edit_rows(self._passes(photograph, report), rows, recipe, self.opened.name):
+            for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, self.opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(photograph.with_pixels(pixels), target)

@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.io.writing import open_beside
 
 ENDING = ".edit.json"

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.activity import activity, limit_by_activity
-from nlfilter_torch.edits.detail import split_sliders
+from nlfilter_torch.edits.changes import activity, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.limits import Balance, Limits
 from nlfilter_torch.edits.parameters import DETAIL

@@ -20,7 +20,8 @@ from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.operator import Columns, NonlocalOperator
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 P = ParamSpec("P")

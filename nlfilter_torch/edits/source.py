@@ -18,7 +18,7 @@ from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
-from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
 
 SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, where an edit allows it

@@ -24,8 +24,9 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
-from nlfilter_torch.operator.operator import Columns, Kernel, NonlocalOperator
+from nlfilter_torch.filtering.filters import layers_of_columns, residual_change, weigh_layers
+from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 
 
@@ -133,22 +134,6 @@ class FittedFilter:
 
 
 loadable(FittedFilter)
-
-
-def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:
-    """Compute detail layers (B, k+1, C, n) of some pixels.
-
-    Args:
-        columns: of the pixels.
-        coefficients: moments of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
-        image: y at the pixels, (B, C, n).
-    """
-    rows = coefficients.to(columns.factor).transpose(2, 3)  # (1, k, C, M), for one read of the columns
-    affinities = spread(rows.flatten(1, 2), columns.factor, columns.scaling).unflatten(1, rows.shape[1:3])
-    smoothed, remainder = [image], columns.remainder.unsqueeze(1)
-    for affinity in affinities.unbind(1):  # one for each power of W
-        smoothed.append(torch.addcmul(affinity, remainder, smoothed[-1]))
-    return layers_between(torch.stack(smoothed, dim=1))
 
 
 @full_precision

@@ -20,7 +20,7 @@ from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import Completion, nystrom_factor
-from nlfilter_torch.operator.products import apply_powers
+from nlfilter_torch.operator.products import Columns, apply_powers
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
@@ -74,21 +74,6 @@ class Kernel:
         landmarks, inverse = self.landmarks.expand(shape), self.inverse_cholesky.expand(shape)
         factor, diagonal = nystrom_factor(features, landmarks, inverse, self.completion)
         return factor if self.limiter is None else self.limiter @ factor, diagonal
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
-
-    Attributes:
-        factor: u, (B, M, n).
-        scaling: d, (B, n).
-        remainder: r, (B, n).
-    """
-
-    factor: Tensor
-    scaling: Tensor
-    remainder: Tensor
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
-"""Products with ``W = F^T F + diag(r)``, where F = factor diag(d). Paper: eq. (13)."""
+"""Columns of ``W = F^T F + diag(r)``, where F = factor diag(d), and products with it. Paper: eq. (13)."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,6 +10,21 @@ from nlfilter_torch.core.autograd import once_differentiable, outer_product
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
+
+    Attributes:
+        factor: u, (B, M, n).
+        scaling: d, (B, n).
+        remainder: r, (B, n).
+    """
+
+    factor: Tensor
+    scaling: Tensor
+    remainder: Tensor
 
 
 def apply_powers(

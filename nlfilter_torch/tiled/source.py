@@ -21,8 +21,8 @@ from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
 from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
-from nlfilter_torch.tiled.sampling import ColumnCache, take_pilot, visit
+from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
+from nlfilter_torch.tiled.sampling import ColumnCache, GuidePicture, take_pilot, visit
 from nlfilter_torch.tiled.scribbles import (
     check_scribble_memory,
     floats_per_scribbled_pixel,

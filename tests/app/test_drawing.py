@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.app import controls, drawing
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from tests.problems import cat
