@@ -46,11 +46,7 @@ DISCONNECTED = "window.socket.on('disconnect', () => { window.unsaved = false; }
 
 
 class Editor:
-    """One tab of the browser, and the session of the photograph that it shows.
-
-    Args:
-        library: where sessions come from.
-    """
+    """One tab of the browser, and the session, from a library, of the photograph that it shows."""
 
     def __init__(self, library: Library) -> None:
         self.library = library

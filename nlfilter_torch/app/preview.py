@@ -211,12 +211,7 @@ class Preview:
         return self._mask[1]
 
     def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
-        """The preview under an edit, (1, 1 or 3, h, w) in [0, 1].
-
-        Args:
-            recipe: the edit.
-            upto: name of the last step to apply; None is all of them.
-        """
+        """The preview under an edit, or under its steps up to the one named ``upto``: (1, 1 or 3, h, w) in [0, 1]."""
         result, drawn = self.pixels, False
         key: Key = ()
         places = [i for i, step in enumerate(recipe.steps) if step.edit == upto]

@@ -216,12 +216,8 @@ class Session:
     def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
 
-        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph.
-
-        Args:
-            place: of the part.
-            recipe: the edit.
-            report: told of the progress; may raise an error to interrupt.
+        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph. The
+        report of the progress may raise an error to interrupt.
 
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
@@ -233,10 +229,7 @@ class Session:
         """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.
 
         :meth:`render` is fast, and approximate for edits that depend on single pixels; this takes as long as saving.
-
-        Args:
-            recipe: the edit.
-            report: told of the progress; may raise an error to interrupt.
+        The report of the progress may raise an error to interrupt.
 
         Raises:
             ValueError, OSError, MemoryError: as :meth:`part`.
@@ -313,11 +306,7 @@ class Session:
         return f"{path.stem}-edited{suffix}"
 
     def save(self, name: str, report: Report = in_silence) -> Path:
-        """Edit the photograph at its full size and write it; the file appears complete or not at all.
-
-        Args:
-            name: of a file in the folder.
-            report: told of the progress.
+        """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
 
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.

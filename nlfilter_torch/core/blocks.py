@@ -65,12 +65,7 @@ def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = 
 
 
 def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Tensor]]]:
-    """Generate the blocks of :func:`pixel_blocks` with ``count`` uninitialised (B, M, n) buffers, which are reused.
-
-    Args:
-        factor: (B, M, N), from which the buffers take shape, dtype and device.
-        count: number of buffers.
-    """
+    """Generate the blocks of :func:`pixel_blocks` with ``count`` uninitialised (B, M, n) buffers, which are reused."""
     batch, landmarks, pixels = factor.shape
     storage: list[Tensor] = []
     for block in pixel_blocks(pixels, batch, factor.device):

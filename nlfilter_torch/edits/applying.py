@@ -35,13 +35,9 @@ def scribbles_of(
     colours: Callable[[Sequence[Stroke], tuple[int, int]], tuple[Any, ...]] = paint,
     mask: Callable[[Sequence[Stroke], tuple[int, int]], Any] = mask_of,
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Convert the strokes of a step to the function's arguments after the image, positional and by keyword.
+    """Convert the strokes of a step to the function's arguments after an image (H, W), positional and by keyword.
 
-    Args:
-        step: step of an edit.
-        size: (H, W) of the image.
-        colours: function that rasterises strokes to colours and their mask, by default as tensors.
-        mask: function that rasterises strokes to a mask, by default as a tensor.
+    ``colours`` and ``mask`` rasterise strokes to colours with their mask, and to a mask; by default to tensors.
     """
     if step.edit in ("recolor", "colorize"):
         keep = mask(step.painted("keep"), size)
@@ -119,12 +115,9 @@ def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step],
 
 
 def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
-    """Sampling step of a picture relative to the size at which the step counts pixels, the viewing size if it has one.
+    """Sampling step of a picture (H, W) relative to the size at which the step counts pixels: its viewing size, if any.
 
-    Args:
-        step: step of an edit.
-        size: (H, W) of the picture.
-        stride: sampling step of the picture relative to the photograph.
+    ``stride`` is the sampling step of the picture relative to the photograph.
     """
     if stride == 1 or "viewing_size" not in step.arguments(size):
         return stride

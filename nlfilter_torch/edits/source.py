@@ -173,13 +173,7 @@ class Source(Protocol):
         """
 
     def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
-        """The result of a function of the picture and of given tensors; a preview keeps it for the next edit.
-
-        Args:
-            name: of the result.
-            given: tensors that it depends on.
-            compute: the function.
-        """
+        """Result, called ``name``, of a function of picture and tensors; a preview keeps it for the next edit."""
 
     def measured(self, function: Callable[["Source"], Tensor]) -> Tensor:
         """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""

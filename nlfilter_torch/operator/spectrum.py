@@ -48,11 +48,9 @@ class RitzPairs:
 
     @staticmethod
     def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
-        """Compute the matrices from sums over all pixels.
+        """Compute the matrices from ``F F^T`` and, if W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M).
 
-        Args:
-            grams: ``F F^T`` and, if W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
-            dtype: of the factor, which determines the rounding error of ``grams``.
+        The sums are in float64; ``dtype`` is that of the factor, which determines their rounding error.
         """
         gram = SymmetricMatrix.of(grams[:, 0])
         kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]

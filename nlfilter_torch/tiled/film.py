@@ -88,13 +88,7 @@ class FrameOperator(TiledOperator):
 
 
 class Frame(Tiled):
-    """A frame as the source of an edit that is fitted to reference frames.
-
-    Args:
-        picture: the frame.
-        passes: tiling options.
-        references: frames of the same size.
-    """
+    """A frame as the source of an edit that is fitted to reference frames of the same size."""
 
     def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
         super().__init__(picture, passes)

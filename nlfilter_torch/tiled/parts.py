@@ -165,10 +165,6 @@ class Parts:
 
         After an error, including one raised by the progress report, the steps fitted until then remain valid.
 
-        Args:
-            edit: its steps.
-            passes: tiling options.
-
         Raises:
             ValueError, MemoryError, OSError: as :func:`~nlfilter_torch.tiled.recipe.edit_rows`.
         """
@@ -199,9 +195,7 @@ class Parts:
     def reduced(self, size: tuple[int, int], report: Report = in_silence) -> Tensor:
         """The whole picture after the edit that was fitted last, reduced to a smaller size, (1, C, h, w) in [0, 1].
 
-        Args:
-            size: (h, w).
-            report: told how many of the rows are done; may raise an error to interrupt.
+        ``report`` is told how many of the rows are done, and may raise an error to interrupt.
         """
         height, width = self._stages[0].picture.size
 

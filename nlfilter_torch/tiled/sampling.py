@@ -101,12 +101,7 @@ class GuidePicture(Picture):
 
 
 class ColumnCache:
-    """Cache of columns between passes, for the first pixels of a picture.
-
-    Args:
-        block_pixels: pixels in a block of a pass.
-        max_pixels: largest number of pixels to keep.
-    """
+    """Cache of columns between passes, in blocks of ``block_pixels``, for the first ``max_pixels`` of a picture."""
 
     def __init__(self, block_pixels: int, max_pixels: int) -> None:
         self.block_pixels, self.max_pixels = block_pixels, max_pixels

@@ -37,13 +37,7 @@ FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: image
 
 
 class Tiled:
-    """A picture that is read in tiles, as the source of an edit.
-
-    Args:
-        picture: rows.
-        passes: tiling options.
-        strokes: name of the scribbles, for error messages.
-    """
+    """A picture that is read in tiles, as the source of an edit; errors call its scribbles ``strokes``."""
 
     batch = 1
     whole = False
@@ -339,9 +333,7 @@ class Tiled:
     def tiling(self, fitted: Fitted, *, plain: bool = False) -> Iterator[Tiling]:
         """Yield the rows of the edited picture, not yet computed; they can be computed within the block.
 
-        Args:
-            fitted: edit fitted to this source.
-            plain: whether rows are in the dtype of the computation, without transparency.
+        With ``plain`` they are in the dtype of the computation, without transparency.
         """
         passes = replace(self.plain, processes=None) if plain else self.passes  # for an edit that is being fitted
         landmarks = self.num_landmarks

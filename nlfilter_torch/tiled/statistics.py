@@ -196,12 +196,9 @@ class Guess:
 
 
 def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
-    """Compute the sums for the first ``order`` powers of W, in one pass.
+    """Compute the sums for the first ``order`` powers of W, in one pass over blocks of pixels.
 
-    Args:
-        blocks: the pass over blocks of pixels.
-        values: computes the planes y (1, C, n) to filter in a block, and its columns.
-        order: k, at least 1.
+    ``values`` computes the planes y (1, C, n) to filter in a block, and its columns.
     """
 
     def part(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
