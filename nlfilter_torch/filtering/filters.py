@@ -15,7 +15,7 @@ from nlfilter_torch.core.checks import (
     check_shape,
     check_tensor,
     check_unit_range,
-    check_weight,
+    check_values,
     checked_response,
 )
 from nlfilter_torch.core.kernels.tall_skinny import spread
@@ -144,7 +144,7 @@ def polynomial_filter(
     check_alpha(alpha)
     if residual is not None:
         batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
-        check_weight(residual, "residual", batch)
+        check_values(residual, "residual", "finite", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
     alpha = alpha if alpha.ndim == 4 else operator.among.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
@@ -215,7 +215,7 @@ def spectral_filter(
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     response = checked_response(response, spectrum.support)
-    check_weight(residual, "residual", spectrum.factor.shape[0])
+    check_values(residual, "residual", "finite", spectrum.factor.shape[0])
     check_tensor(image, "image", "convert it with torch.as_tensor")
     if image.ndim == 4 and len(image) == 0:
         check_image(image, "image", empty=True)

@@ -19,7 +19,7 @@ from nlfilter_torch.core.checks import (
     check_pair,
     check_same_size,
     check_tensor,
-    check_weight,
+    check_values,
 )
 from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
@@ -90,7 +90,7 @@ class FittedFilter:
         check_tensor(image, "image", "convert it with torch.as_tensor")
         check_alpha(alpha)
         if residual is not None:
-            check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
+            check_values(residual, "residual", "finite", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
         planes = self._planes(image, guide, origin, halo, with_residual=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
