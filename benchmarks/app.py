@@ -30,7 +30,7 @@ from benchmarks.whole import measure
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.closeup import Closeup
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 REPEATS = 20

@@ -256,7 +256,7 @@ def compare_scales(name: str, image: Tensor, megapixels: float) -> None:
         gains, views = [], []
         for factor in FACTORS:
             large = sized(image, factor)
-            step = PRESETS[preset].step.changed(viewing_size=megapixels)
+            step = PRESETS[preset].steps[0].changed(viewing_size=megapixels)
             views.append(sized(apply_step(step, large), 1))
             gains.append(Scene(sized(large, 1)).gain(views[-1]))
         apart = 100 * (max(gains) / min(gains) - 1)

@@ -17,7 +17,7 @@ from nlfilter_torch.edits.shared_parameters import FILTER
 
 PACKAGE = Path(nlfilter_torch.__file__).parent
 INTERFACES = ("cli", "app")  # folders whose files could declare parameters of any edit
-FILES = ("edits/presets.py", "edits/recipe.py", "edits/steps.py", "edits/applying.py", "tiled/recipe.py")
+FILES = ("edits/presets.py", "edits/steps.py", "edits/applying.py", "tiled/recipe.py")
 HEAD = """# Parameters
 
 Every edit's parameters, with the names, units, ranges and defaults that its command, files for `apply` and the editor

@@ -35,7 +35,7 @@ from nlfilter_torch.app.preview import PIXELS
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits import mask
 from nlfilter_torch.edits.parameters import VIEWING_SIZE
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step

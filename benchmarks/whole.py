@@ -23,7 +23,7 @@ import torch.nn.functional as F
 
 from benchmarks import editors
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 

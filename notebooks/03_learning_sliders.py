@@ -27,7 +27,8 @@ from skimage.transform import resize
 
 from nlfilter_torch import estimate_bandwidth, fit_alpha, nonlocal_operator, polynomial_filter
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.presets import PRESETS, Preset
+from nlfilter_torch.edits.presets import PRESETS, Recipe
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.plotting import plot_response, show_images
 
 
@@ -77,8 +78,8 @@ plot_response(alpha, operator.spectrum())
 # `nlfilter-torch detail photo.jpg out.jpg --preset look.json`.
 
 # %%
-look = Preset(tuple(round(a, 3) for a in alpha.tolist()))
-print(look.to_json())
+look = Recipe((Step("detail", alpha=tuple(round(a, 3) for a in alpha.tolist())),))
+print(look.to_json(complete=True))
 show_images({"another photograph": other, "with the same look": look.apply(other)}, side=380)
 
 # %% [markdown]

@@ -91,3 +91,13 @@ def build(guide: torch.Tensor, **kwargs: object) -> NonlocalOperator:
     """Build an operator, with at most as many landmarks as pixels."""
     count = min(int(str(kwargs.pop("num_landmarks", 100))), guide.shape[-2] * guide.shape[-1])
     return nonlocal_operator(guide, num_landmarks=count, generator=seeded(), **kwargs)  # type: ignore[arg-type]
+
+
+def noisy(image: torch.Tensor, noise: float | torch.Tensor, seed: int = 0) -> torch.Tensor:
+    """The image with white noise of that standard deviation."""
+    return image + noise * torch.randn(image.shape, generator=seeded(seed))
+
+
+def decibels(image: torch.Tensor, clean: torch.Tensor) -> float:
+    """Peak signal-to-noise ratio."""
+    return float(-10 * (image - clean).square().mean().log10())

@@ -18,8 +18,7 @@ from PIL import Image
 from nlfilter_torch.cli import folders, interrupts, main, workers
 from nlfilter_torch.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
 from nlfilter_torch.cli.workers import DEATHS
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import PRESETS, Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.writing import open_beside
 
@@ -294,9 +293,9 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert (seen["workers"], seen["threads"]) == (2, 6)
     settings = seen["args"][2].keywords
     assert settings.pop("memory") == 4.0  # of two workers
-    smooth = PRESETS["smooth"]
+    smooth = PRESETS["smooth"].steps[0]
     assert settings["alpha"] == "0,0,0,1"
-    assert (settings["bandwidth"], settings["seed"]) == (f"{smooth.bandwidth:g}", 5)
+    assert (settings["bandwidth"], settings["seed"]) == (f"{smooth['bandwidth']:g}", 5)
     assert json.loads((tmp_path / "out" / RECORD).read_text()) == settings
     assert main(arguments) == 0
     assert (seen["workers"], seen["threads"]) == (9, 1)

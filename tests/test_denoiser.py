@@ -1,30 +1,16 @@
-"""The trained denoiser: no change without noise, no seams between tiles, kinds of noise, gradients, and its file."""
-
-import json
-from pathlib import Path
+"""The trained denoiser: no change without noise, no seams between tiles, precisions, gradients and what it refuses."""
 
 import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.train_denoiser import PlainDenoiser
-from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
-from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.noise import Noise, noise_of
+from nlfilter_torch import NonlocalDenoiser, denoise
 from nlfilter_torch.nn import denoiser as module
-from nlfilter_torch.nn.denoiser import SIDE, STEP, TRAINED, in_tiles, join_colours, noise_map, split_colours
-from tests.problems import colour, picture, seeded
+from nlfilter_torch.nn.denoiser import SIDE, STEP, in_tiles, join_colours, noise_map, split_colours
+from tests.problems import colour, decibels, noisy, seeded
 
 TRAINED_ONE = NonlocalDenoiser.trained()
 CAT = colour("chelsea", 96, 128)
-
-
-def noisy(image: Tensor, noise: float | Tensor, seed: int = 0) -> Tensor:
-    return image + noise * torch.randn(image.shape, generator=seeded(seed))
-
-
-def decibels(image: Tensor, clean: Tensor) -> float:
-    return float(-10 * (image - clean).square().mean().log10())
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -210,51 +196,6 @@ def test_precisions() -> None:
     assert (double - denoise(image, noise_level=0.1)).abs().mean() < 1e-3
 
 
-def test_noise_that_grows_with_the_light_is_found() -> None:
-    ramp = torch.linspace(0.1, 0.9, 200).expand(1, 3, 160, 200)
-    gain, floor = 0.004, (3 / 255) ** 2
-    image = noisy(ramp, (gain * ramp + floor).sqrt())
-    noise = noise_of(InMemory(image))
-    torch.testing.assert_close(noise.gain, torch.tensor([gain]), rtol=0.1, atol=0)
-    wanted = (gain * ramp + floor).sqrt()
-    assert (noise.at(image) / wanted - 1).abs().mean() < 0.06
-    even = noise_of(InMemory(noisy(ramp, 0.04)))
-    assert even.gain == 0
-    torch.testing.assert_close(even.level, torch.tensor([0.04]), rtol=0.04, atol=0)
-
-
-def test_noise_is_not_that_of_the_dark() -> None:
-    """A bright disc on black: the flattest windows are black, and their noise is not that of the disc."""
-    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 200), indexing="ij")
-    radius = (rows.square() + columns.square()).sqrt()
-    clean = torch.where(radius < 0.85, 0.6 - 0.25 * radius, 0.0)[None, None]
-    image = noisy(clean, (0.01 * clean + (2 / 255) ** 2).sqrt())
-    noise = noise_of(InMemory(image))
-    torch.testing.assert_close(noise.gain, torch.tensor([0.01]), rtol=0.15, atol=0)
-    assert decibels(denoise(image), clean) > decibels(denoise(image, noise_level=noise.level), clean)
-
-
-@pytest.mark.parametrize("level", [5, 15, 25, 50])
-def test_noise_is_found_beside_texture(level: int) -> None:
-    """Half of the picture is gravel, whose finest detail is as strong as noise of 20 grey levels."""
-    gravel = picture("gravel", 160, 160, torch.float32)
-    clean = torch.cat([gravel, torch.linspace(0.3, 0.7, 160).expand(1, 1, 160, 160)], dim=3)
-    found = 255 * estimate_noise(noisy(clean, level / 255))
-    assert float(found) == pytest.approx(level, rel=0.1)
-
-
-def test_clipped_pixels_do_not_hide_noise() -> None:
-    clean = torch.ones(1, 1, 120, 160)
-    clean[..., 60:] = 0.5
-    assert float(estimate_noise(noisy(clean, 0.08).clamp(0, 1))) == pytest.approx(0.08, rel=0.1)
-
-
-def test_even_noise_has_one_level() -> None:
-    noise = Noise.even(torch.tensor([0.1, 0.2]))
-    torch.testing.assert_close(noise.level, torch.tensor([0.1, 0.2]))
-    torch.testing.assert_close(noise.at(CAT.expand(2, -1, -1, -1)).mean((1, 2, 3)), torch.tensor([0.1, 0.2]))
-
-
 @pytest.mark.parametrize(
     ("image", "noise", "error", "message"),
     [
@@ -290,93 +231,6 @@ def test_the_edit_refuses_what_it_cannot_take() -> None:
         denoise(CAT, landmark=3)
 
 
-def test_the_file_of_the_package_is_small_and_says_how_it_was_trained() -> None:
-    from safetensors import safe_open
-    from safetensors.torch import load_file
-
-    assert TRAINED.stat().st_size < 1_000_000
-    weights = load_file(TRAINED)
-    assert sum(value.numel() for value in weights.values()) <= 150_000
-    for name, value in TRAINED_ONE.state_dict().items():
-        assert torch.equal(value, weights[name])
-    with safe_open(TRAINED, "pt") as file:
-        assert {"steps", "seed", "side", "rate", "loss"} <= file.metadata().keys()
-
-
-def test_files_that_are_damaged_or_of_something_else_name_themselves(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
-
-    path = tmp_path / "weights.safetensors"
-    with pytest.raises(FileNotFoundError, match=r"weights\.safetensors cannot be read: No such file"):
-        NonlocalDenoiser.trained(path)
-    whole = TRAINED.read_bytes()
-    for damaged in (b"", whole[:1000], whole[:-4], b"\0" * 100, b"\xff" * 100, b"\2\0\0\0\0\0\0\0[]"):
-        path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"weights\.safetensors is damaged"):
-            NonlocalDenoiser.trained(path)
-    save_file(PlainDenoiser().state_dict(), path)
-    with pytest.raises(
-        ValueError, match=r"must hold log_bandwidths of shape \(2,\), but .*weights.safetensors has none"
-    ):
-        NonlocalDenoiser.trained(path)
-    half = {name: value.half() for name, value in TRAINED_ONE.state_dict().items()}
-    save_file(half, path)
-    with pytest.raises(ValueError, match="numbers must be F32, got F16"):
-        NonlocalDenoiser.trained(path)
-
-
-def test_a_second_pass_repeats_the_first_until_it_is_trained(tmp_path: Path) -> None:
-    """So files without its weights, which had one pass, give what they gave."""
-    from safetensors.torch import save_file
-
-    once = NonlocalDenoiser(passes=1)
-    save_file({n: v for n, v in once.state_dict().items() if not n.startswith("again")}, tmp_path / "once.safetensors")
-    twice = NonlocalDenoiser.trained(tmp_path / "once.safetensors")
-    assert twice.passes == 2
-    image = CAT[..., :40, :40]
-    with torch.no_grad():
-        assert torch.equal(once(image, 0.1), twice(image, 0.1))
-        assert not torch.equal(TRAINED_ONE(image, 0.1), once(image, 0.1))
-
-
-def test_a_second_pass_is_trained_with_the_first() -> None:
-    denoiser = NonlocalDenoiser()
-    denoiser(CAT[..., :24, :24], 0.1).square().mean().backward()
-    assert denoiser.again.weight.grad is not None
-    assert denoiser.again.weight.grad.abs().max() > 0
-
-
-def test_where_the_second_pass_diverges_the_first_result_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With features that are too large, as regular stripes beside an even area may have."""
-    denoiser = NonlocalDenoiser()
-    denoiser.load_state_dict(TRAINED_ONE.state_dict())
-    clean = CAT[..., :64, :64]
-    image = noisy(clean, 4 / 255)
-    with torch.no_grad():
-        for further in (60.0, 140.0):
-            denoiser.again.bias += further
-            assert decibels(denoiser(image, 4 / 255), clean) > decibels(image, clean) + 1
-        monkeypatch.setattr(module, "LARGEST", 1e6)
-        assert decibels(denoiser(image, 4 / 255), clean) < 20
-
-
-def test_passes_are_counted() -> None:
-    with pytest.raises(ValueError, match="passes must be at least 1, got 0"):
-        NonlocalDenoiser(passes=0)
-
-
-def test_weights_of_ones_own_are_loaded(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
-
-    model = NonlocalDenoiser()
-    save_file(model.state_dict(), tmp_path / "own.safetensors", {"steps": "0"})
-    loaded = NonlocalDenoiser.trained(tmp_path / "own.safetensors")
-    for name, value in model.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value)
-    header = json.loads((tmp_path / "own.safetensors").read_bytes()[8:].split(b"}}", 1)[0] + b"}}")
-    assert header["__metadata__"] == {"steps": "0"}
-
-
 def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[int, ...]] = []
 
@@ -390,14 +244,6 @@ def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.Monkey
     assert min(sides) >= module.SMALLEST
     assert max(sides) == module.SIDE
     assert max(size[0] for size in seen) <= module.TILE_BATCH
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_weights_in_half_precision_denoise_colours(dtype: torch.dtype) -> None:
-    noisy = 0.5 + 0.1 * torch.randn(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        found = NonlocalDenoiser.trained(dtype=dtype)(noisy, 0.1)
-    assert (found - 0.5).std() < 0.04
 
 
 @pytest.mark.parametrize("channels", [1, 3])

@@ -155,9 +155,9 @@ def test_the_table_of_presets_is_theirs() -> None:
     rows = re.findall(r"^\| ([a-z ]+) \| ([\d., ]+) \| (\w+) \| (.*) \|$", PAGES["presets"].text, flags=re.MULTILINE)
     assert [name for name, *_ in rows] == list(PRESETS)
     for name, sliders, bandwidth, purpose in rows:
-        preset = PRESETS[name]
-        assert tuple(map(float, sliders.split(","))) == preset.alpha
-        assert bandwidth == (preset.bandwidth if isinstance(preset.bandwidth, str) else f"{preset.bandwidth:g}")
+        step = PRESETS[name].steps[0]
+        assert tuple(map(float, sliders.split(","))) == step["alpha"]
+        assert bandwidth == (step["bandwidth"] if isinstance(step["bandwidth"], str) else f"{step['bandwidth']:g}")
         assert purpose == PURPOSES[name]
 
 

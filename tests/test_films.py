@@ -17,7 +17,7 @@ from av.video.reformatter import Interpolation
 
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.films import display_matrix, open_film, write_film
@@ -55,7 +55,7 @@ def edited(step: Step, frame: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.edit)
 def test_fitted_to_one_frame_it_is_the_edit_of_that_frame(step: Step) -> None:
     frame = crop(90, 190)
-    found, wanted = FilmEdit(Recipe((step,)), [frame], PASSES)(frame), edited(step, frame)
+    found, wanted = FilmEdit((step,), [frame], PASSES)(frame), edited(step, frame)
     assert np.abs(wanted - frame).mean() > 0.1 / 255
     np.testing.assert_allclose(found, wanted, atol=0.05 / 255)
 
@@ -64,7 +64,7 @@ def test_distance_does_not_count_unless_asked_for() -> None:
     frame = crop(90, 190)
     for edit, far in (("tone", "none"), ("denoise", UNLIMITED_BANDWIDTH)):
         values: dict[str, Any] = {"noise_level": 12.0} if edit == "denoise" else {}
-        found = FilmEdit(Recipe((Step(edit, **values, **FEW),)), [frame], PASSES)(frame)
+        found = FilmEdit((Step(edit, **values, **FEW),), [frame], PASSES)(frame)
         np.testing.assert_allclose(found, edited(Step(edit, spatial_bandwidth=far, **values, **FEW), frame), atol=1e-4)
 
 
@@ -73,7 +73,7 @@ def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.operator.build.choose_landmarks", lambda features, *_: features[:, :, :1900:48])
     frame = crop(90, 190)
     for step in STEPS:
-        one, three = (FilmEdit(Recipe((step,)), [frame] * count, PASSES)(frame) for count in (1, 3))
+        one, three = (FilmEdit((step,), [frame] * count, PASSES)(frame) for count in (1, 3))
         np.testing.assert_allclose(one, three, atol=0.1 / 255, err_msg=step.edit)
 
 
@@ -85,13 +85,13 @@ def test_a_pan_does_not_flicker(step: Step) -> None:
         return float(np.mean([np.abs(a[6:, 6:] - b[:-6, :-6]).mean() for a, b in pairwise(frames)]))
 
     assert flicker(film) == 0
-    edit = FilmEdit(Recipe((step,)), [film[0], film[5]], PASSES)
+    edit = FilmEdit((step,), [film[0], film[5]], PASSES)
     assert flicker([edit(frame) for frame in film]) <= flicker([edited(step, frame) for frame in film]) / 4
 
 
 def test_steps_follow_each_other() -> None:
     frame, steps = crop(90, 190), (STEPS[3], STEPS[0])
-    found = FilmEdit(Recipe(steps), [frame], PASSES)(frame)
+    found = FilmEdit(steps, [frame], PASSES)(frame)
     apart = np.abs(found - edited(steps[1], edited(steps[0], frame).clip(0, 1)))
     assert apart.mean() < 0.02 / 255
     assert apart.max() < 2 / 255  # candidates for landmarks depend on rounding
@@ -101,7 +101,7 @@ def test_strokes_are_refused() -> None:
     stroke = Stroke(((0.5, 0.5),), 0.1, "in")
     for step in (Step("detail", (stroke,)), Step("recolor"), Step("defocus", (stroke,))):
         with pytest.raises(ValueError, match="edits of a film must not have strokes, got"):
-            FilmEdit(Recipe((step,)), [crop(0, 0)], PASSES)
+            FilmEdit((step,), [crop(0, 0)], PASSES)
 
 
 # --- files
@@ -376,7 +376,7 @@ def test_a_film_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str
     ):
         assert main([*arguments, *more]) == 0
         assert capsys.readouterr().out == f"6 frames in {target}\n"
-        edit = FilmEdit(Recipe(steps), samples, PASSES)
+        edit = FilmEdit(steps, samples, PASSES)
         with open_film(target) as film:
             for frame, rows in zip(film.frames(), before, strict=True):
                 wanted, found = edit(rows).clip(0, 1), film.pixels(frame)

@@ -9,7 +9,7 @@ import torch
 
 from nlfilter_torch import apply_look
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import Preset
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb
@@ -37,8 +37,8 @@ def test_fit_finds_the_sliders_and_how_much_they_explain(before: Path, capsys: p
     preset = before.with_name("look.json")
     assert fit(before, edit(before), preset) == 0
     printed = capsys.readouterr().out
-    found = Preset.from_json(preset.read_text(), "look.json")
-    assert found.alpha == pytest.approx(ALPHA, rel=0.02)
+    found = Recipe.from_json(preset.read_text(), "look.json").steps[0]
+    assert found["alpha"] == pytest.approx(ALPHA, rel=0.02)
     assert "alpha: 2.2" in printed
     explained = float(printed.split("explained: ")[1].split(" %")[0])
     assert explained > 99.0
@@ -81,16 +81,17 @@ def test_a_preset_is_the_edit(before: Path) -> None:
 
 def test_options_count_for_more_than_the_preset(before: Path) -> None:
     preset = before.with_name("look.json")
-    preset.write_text(Preset(ALPHA, landmarks=40).to_json())
+    preset.write_text(Recipe((Step("detail", alpha=ALPHA, landmarks=40),)).to_json())
     out = before.with_name("out.png")
     assert main(["detail", str(before), str(out), "--preset", str(preset), "--alpha", "1,1"]) == 0
     assert torch.equal(read_photograph(out).pixels, read_photograph(before).pixels)
 
 
 def test_preset_keeps_every_entry() -> None:
-    preset = Preset((3.0, 0.25, 1.0), 12.5, 40.0, 7, 60, "uniform")
-    assert Preset.from_json(preset.to_json(), "it") == preset
-    assert Preset.from_json('{"alpha": [2, 1]}', "it") == Preset((2.0, 1.0))
+    values = {"alpha": (3.0, 0.25, 1.0), "bandwidth": 12.5, "spatial_bandwidth": 40.0, "patch_size": 7, "landmarks": 60}
+    preset = Recipe((Step("detail", **values, sampling="uniform"),))
+    assert Recipe.from_json(preset.to_json(complete=True), "it") == preset
+    assert Recipe.from_json('{"alpha": [2, 1]}', "it") == Recipe((Step("detail", alpha=(2.0, 1.0)),))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def test_a_preset_is_written_over(before: Path) -> None:
     preset = before.with_name("look.json")
     preset.write_text("an older one")
     assert fit(before, edit(before), preset) == 0
-    assert Preset.from_json(preset.read_text(), "look.json").alpha == pytest.approx(ALPHA, rel=0.02)
+    assert Recipe.from_json(preset.read_text(), "look.json").steps[0]["alpha"] == pytest.approx(ALPHA, rel=0.02)
 
 
 def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixture[str]) -> None:

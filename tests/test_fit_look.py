@@ -18,7 +18,7 @@ from nlfilter_torch import apply_look, fit_look
 from nlfilter_torch.edits.alignment import align
 from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.look_pixels import EditedPhotograph
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.look_fit import MOST, nonnegative, sample
 from nlfilter_torch.operator.features import reduce_channels

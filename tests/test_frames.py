@@ -12,8 +12,7 @@ from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_op
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import PRESETS, Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
@@ -232,7 +231,7 @@ def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert [path.name for path in (tmp_path / "out").iterdir() if path not in edited] == [".nlfilter-frames.json"]
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").glob("[0-9]*"))]
     recipe = Recipe((Step("detail", alpha=(3.0, 3.0, 1.0), landmarks=40),))
-    edit = FilmEdit(recipe, [rows_of(stored[0]), rows_of(stored[3])], Passes("float32"))
+    edit = FilmEdit(recipe.steps, [rows_of(stored[0]), rows_of(stored[3])], Passes("float32"))
     for path, frame in zip(edited, stored, strict=True):
         found = read_photograph(path)
         assert np.abs(rows_of(found.pixels) - edit(rows_of(frame)).clip(0, 1)).max() < 0.6 / 255
@@ -249,7 +248,7 @@ def test_frames_by_every_preset(name: str, tmp_path: Path) -> None:
     assert main([*arguments, "--preset", name]) == 0
     stored = [read_photograph(path).pixels for path in sorted((tmp_path / "film").iterdir())]
     paths = sorted((tmp_path / "out").glob("[0-9]*"))
-    step = preset.step.changed(landmarks=40, spatial_bandwidth="none")
+    step = preset.steps[0].changed(landmarks=40, spatial_bandwidth="none")
     wanted = apply_step(step, stored[0])  # the frame that the filter was fitted to
     assert (read_photograph(paths[0]).pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
     for path, before in zip(paths, stored, strict=True):

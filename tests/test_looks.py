@@ -12,7 +12,6 @@ from torch import Tensor
 
 from nlfilter_torch import Look, apply_look, enhance, fit_look
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.look import bands_of, tone_curve
 from nlfilter_torch.tiled.recipe import edit_rows
@@ -149,7 +148,7 @@ def test_tiles_are_the_image_in_memory(viewing: float, channels: int, tmp_path: 
     image = CAT[:, :channels]
     whole = apply_step(step, image)
     passes = Passes(memory=1 << 30, tile_rows=13, kind="float32", folder=tmp_path)
-    rows = [values for _, values in edit_rows(passes, image[0].permute(1, 2, 0).numpy(), Recipe((step,)), "it")]
+    rows = [values for _, values in edit_rows(passes, image[0].permute(1, 2, 0).numpy(), (step,), "it")]
     tiled = torch.cat([torch.from_numpy(part) for part in rows]).permute(2, 0, 1)[None]
     assert (tiled - whole).abs().max() < 2e-3
     assert (whole - image).abs().mean() > 0.02

@@ -15,10 +15,9 @@ from nlfilter_torch.core.kernels import definitions_only, library
 from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.operator import landmarks, newton
-from nlfilter_torch.operator.newton import weighted_moment
+from nlfilter_torch.operator import landmarks
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
-from nlfilter_torch.operator.scaling import KernelMatrix
+from nlfilter_torch.operator.scaling import KernelMatrix, _sweep, weighted_moment
 from tests import reference
 
 LEVELS = [
@@ -137,7 +136,7 @@ def test_far_features_meet_the_floor_and_nan_is_not_hidden(level: int) -> None:
 
 
 def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-    return newton._sweep(KernelMatrix(factor, diagonal), total)
+    return _sweep(KernelMatrix(factor, diagonal), total)
 
 
 @pytest.mark.parametrize(("pixels", "marks"), sizes([1, 7, 255, 8256, 40_000], [1, 3, 50, 900]))

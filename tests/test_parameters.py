@@ -45,8 +45,7 @@ def test_defaults_are_valid(edit: Edit, parameter: Parameter) -> None:
         parameter.check_argument(parameter.argument_of(value, (400, 600)))
 
 
-PUBLIC = {"detail": "enhance", "tone": "adjust_tone", "look": "apply_look", "mask": "region_mask"}
-NAMES = [PUBLIC.get(name, name) for name in (*EDITS, "mask")]
+NAMES = [edit.function or edit.name for edit in (*EDITS.values(), MASK)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -74,7 +73,7 @@ def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
 
 @pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
 def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> None:
-    function = inspect.signature(getattr(nlfilter_torch, PUBLIC.get(edit.name, edit.name))).parameters
+    function = inspect.signature(getattr(nlfilter_torch, edit.function or edit.name)).parameters
     for parameter in edit:
         if parameter.kind == "number" and parameter.domain is not None:
             annotation = function[parameter.keyword].annotation
@@ -83,7 +82,7 @@ def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> 
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
 def test_functions_have_the_declared_defaults(edit: Edit) -> None:
-    function = inspect.signature(getattr(nlfilter_torch, PUBLIC.get(edit.name, edit.name))).parameters
+    function = inspect.signature(getattr(nlfilter_torch, edit.function or edit.name)).parameters
     for parameter in edit:
         name = parameter.keyword
         if name in function and parameter.kind != "sliders" and name != "photometric_bandwidth":

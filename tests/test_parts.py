@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nlfilter_torch.edits.applying import fit_step
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled import recipe as whole_edit
 from nlfilter_torch.tiled.parts import Parts, Rectangle
@@ -48,7 +48,7 @@ EDITS = {
 
 
 def whole(recipe: Recipe, source: NDArray[Any], passes: Passes) -> torch.Tensor:
-    rows = [rows for _, rows in whole_edit.edit_rows(passes, source, recipe, "scan.tif")]
+    rows = [rows for _, rows in whole_edit.edit_rows(passes, source, recipe.steps, "scan.tif")]
     return torch.from_numpy(np.concatenate(rows)).permute(2, 0, 1)[None].clamp(0, 1)
 
 
@@ -65,7 +65,7 @@ def test_a_part_is_that_of_the_whole(
     source, passes = rows_of(cat(5)), Passes("float32", folder=tmp_path, **options)
     wanted = whole(EDITS[name], source, passes)
     parts = Parts(source, "scan.tif")
-    parts.fit(EDITS[name], passes)
+    parts.fit(EDITS[name].steps, passes)
     for place in PLACES:
         part = wanted[..., place.rows.start : place.rows.stop, place.columns.start : place.columns.stop]
         torch.testing.assert_close(parts.edited(place), part, atol=2e-4, rtol=0)  # 0.05 grey levels
@@ -95,14 +95,14 @@ def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPa
         ((recolor,), ["recolor"]),
     ):
         fitted.clear()
-        parts.fit(Recipe(steps), passes)
+        parts.fit(steps, passes)
         assert fitted == wanted
         found = parts.edited(place)
         fresh = Parts(source, "scan.tif")
-        fresh.fit(Recipe(steps), passes)
+        fresh.fit(steps, passes)
         assert torch.equal(found, fresh.edited(place))
     fitted.clear()
-    parts.fit(Recipe((recolor,)), replace(passes, statistics="sample"))  # a sample gives other sums
+    parts.fit((recolor,), replace(passes, statistics="sample"))  # a sample gives other sums
     assert fitted == ["recolor"]
 
 
@@ -124,11 +124,11 @@ def test_a_fit_that_is_interrupted_leaves_what_was_known(after: int) -> None:
 
     parts, fresh = Parts(source, "scan.tif"), Parts(source, "scan.tif")
     passes = Passes("float32", "full")
-    parts.fit(Recipe((RECOLOR,)), passes)
+    parts.fit((RECOLOR,), passes)
     with pytest.raises(InterruptedError):
-        parts.fit(recipe, replace(passes, report=interrupt))
-    parts.fit(recipe, passes)
-    fresh.fit(recipe, passes)
+        parts.fit(recipe.steps, replace(passes, report=interrupt))
+    parts.fit(recipe.steps, passes)
+    fresh.fit(recipe.steps, passes)
     assert torch.equal(parts.edited(place), fresh.edited(place))
 
 
@@ -139,7 +139,7 @@ def test_a_part_of_a_picture_of_many_tiles_of_the_network() -> None:
     recipe = Recipe((Step("denoise", noise_level=8.0),))
     wanted = whole(recipe, source, passes)
     parts = Parts(source, "scan.tif")
-    parts.fit(recipe, passes)
+    parts.fit(recipe.steps, passes)
     for place in (Rectangle(range(150, 190), range(400, 470)), Rectangle(range(290, 300), range(870, 900))):
         part = wanted[..., place.rows.start : place.rows.stop, place.columns.start : place.columns.stop]
         torch.testing.assert_close(parts.edited(place), part, atol=2e-4, rtol=0)

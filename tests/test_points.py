@@ -22,9 +22,8 @@ from nlfilter_torch import (
     segment_mask,
     spectral_filter,
 )
-from nlfilter_torch.operator.newton import damped
-from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import KernelMatrix, Solution
+from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.operator.scaling import KernelMatrix, Solution, damped
 from tests import reference
 from tests.problems import noise, picture, seeded
 

@@ -7,7 +7,8 @@ import skimage.data
 import torch
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import PRESETS, PURPOSES, Preset, find_preset
+from nlfilter_torch.edits.presets import PRESETS, PURPOSES, Recipe, find_recipe
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 
 
@@ -57,10 +58,11 @@ def test_none_takes_light_or_shadow_away(name: str) -> None:
 
 
 def test_names_and_files_are_found(photo: Path) -> None:
-    assert find_preset("soft-skin") == find_preset("Soft_Skin") == PRESETS["soft skin"]
+    assert find_recipe("soft-skin") == find_recipe("Soft_Skin") == PRESETS["soft skin"]
     path = photo.with_name("mine.json")
-    path.write_text(Preset((2.0, 1.0), landmarks=30).to_json())
-    assert find_preset(str(path)) == Preset((2.0, 1.0), landmarks=30)
+    mine = Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30),))
+    path.write_text(mine.to_json(complete=True))
+    assert find_recipe(str(path)) == mine
 
 
 def test_an_option_counts_for_more_than_a_name(photo: Path) -> None:
@@ -87,7 +89,7 @@ def test_the_list_names_them_all(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_one_is_printed_as_a_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["presets", "soft-skin"]) == 0
-    assert Preset.from_json(capsys.readouterr().out, "it") == PRESETS["soft skin"]
+    assert Recipe.from_json(capsys.readouterr().out, "it") == PRESETS["soft skin"]
 
 
 def test_gradient_reaches_the_image() -> None:

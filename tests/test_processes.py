@@ -18,7 +18,7 @@ from torch import Tensor
 from nlfilter_torch.cli import main, processes
 from nlfilter_torch.cli.processes import ZarrProcesses, zarr_processes
 from nlfilter_torch.cli.workers import DEATHS, Workers
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.rows import open_picture, write_picture

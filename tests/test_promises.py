@@ -15,8 +15,7 @@ from nlfilter_torch import (
     polynomial_filter,
 )
 from nlfilter_torch.operator.balancing import balance
-from nlfilter_torch.operator.newton import LARGEST, damped
-from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling, Solution, scaling_from_moment
+from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, PixelScaling, Solution, damped, scaling_from_moment
 from nlfilter_torch.tiled import stream_detail
 from tests import reference
 from tests.problems import noise, picture, seeded

@@ -13,8 +13,7 @@ from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, en
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.colour import edit_luminance
 from nlfilter_torch.edits.parameters import CRISP, EDITS
-from nlfilter_torch.edits.presets import PRESETS, Preset, find_recipe
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
 from nlfilter_torch.edits.steps import Step, working_bytes
 from nlfilter_torch.filtering.filters import polynomial_filter
@@ -213,16 +212,14 @@ def test_files_from_before_there_was_a_list_of_steps() -> None:
     preset = '{"alpha": [2, 1], "bandwidth": 20, "landmarks": 30, "sampling": "uniform", "spatial_bandwidth": null}'
     step = Step("detail", alpha=(2.0, 1.0), bandwidth=20, landmarks=30, sampling="uniform")
     assert Recipe.from_json(preset, "look.json") == Recipe((step,))
-    assert Preset.from_json(preset, "look.json") == Preset((2.0, 1.0), 20, landmarks=30, sampling="uniform")
 
 
 def test_presets_are_edits(tmp_path: Path) -> None:
     crisp = PRESETS["crisp"]
-    assert find_recipe("crisp") == Recipe((crisp.step,))
+    assert find_recipe("crisp") == crisp
     path = tmp_path / "look.json"
     path.write_text(crisp.to_json())
-    assert find_recipe(str(path)) == Recipe((crisp.step,))
-    assert Preset.from_json(find_recipe("crisp").to_json(), "it") == crisp  # so that detail --preset accepts it too
+    assert find_recipe(str(path)) == crisp
 
 
 @pytest.mark.parametrize(

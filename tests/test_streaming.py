@@ -18,8 +18,8 @@ from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
 from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.pictures import GuidePicture, Picture
-from nlfilter_torch.tiled.sampling import ColumnCache, Draws, draw, over_all
+from nlfilter_torch.tiled.pictures import Picture
+from nlfilter_torch.tiled.sampling import ColumnCache, Draws, GuidePicture, draw, over_all
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.tiled.tiles import Passes

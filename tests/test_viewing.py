@@ -9,8 +9,7 @@ import torch.nn.functional as F
 
 from nlfilter_torch import adjust_tone, enhance, sharpen
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.activity import limit_by_activity
-from nlfilter_torch.edits.detail import split_sliders
+from nlfilter_torch.edits.changes import limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.limits import Balance, Limits
 from nlfilter_torch.edits.pixels import Fitted, part_of

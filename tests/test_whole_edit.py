@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nlfilter_torch.cli import main
 from nlfilter_torch.edits.matting import pyramid_levels
 from nlfilter_torch.edits.noise import estimate_noise, noise_of
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
@@ -45,14 +45,14 @@ def from_rows(rows: NDArray[Any]) -> torch.Tensor:
 
 def by_rows(recipe: Recipe, source: NDArray[Any], folder: Path, **options: Any) -> NDArray[Any]:
     passes = Passes("float32", "full", folder=folder, **options)
-    return np.concatenate([rows for _, rows in whole_edit.edit_rows(passes, source, recipe, "scan.tif")])
+    return np.concatenate([rows for _, rows in whole_edit.edit_rows(passes, source, recipe.steps, "scan.tif")])
 
 
 def test_denoising_by_a_sample_is_within_a_grey_level() -> None:
     noise = np.random.default_rng(0).normal(0, 0.06, (200, 260, 3))
     picture = (photograph(200, 260) + noise).clip(0, 1).astype(np.float32)
     step, options = Recipe((Step("denoise", landmarks=60),)), {"sample": 4096}
-    rows = [rows for _, rows in whole_edit.edit_rows(Passes("float32", **options), picture, step, "scan.tif")]
+    rows = [rows for _, rows in whole_edit.edit_rows(Passes("float32", **options), picture, step.steps, "scan.tif")]
     assert difference(from_rows(np.concatenate(rows)), step.apply(from_rows(picture))) < 1  # grey level
 
 

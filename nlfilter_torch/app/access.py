@@ -69,12 +69,7 @@ def _is_figures(host: str) -> bool:
 
 
 class Guard:
-    """Refuses requests and websockets that :func:`refusal` names.
-
-    Args:
-        app: what is guarded.
-        host: on which the editor listens.
-    """
+    """Refuses requests to an application, and websockets, that :func:`refusal` names for the host it listens on."""
 
     def __init__(self, app: ASGIApp, host: str) -> None:
         self._app, self._host, self._names = app, host, names_of(host)

@@ -10,7 +10,7 @@ from torch import Tensor
 from nlfilter_torch.app.closeup import OutdatedError, Run, Start, interrupted
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 
 QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
 

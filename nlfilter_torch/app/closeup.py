@@ -10,7 +10,7 @@ from torch import Tensor
 from nlfilter_torch.app import drawing
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.tiled.parts import Rectangle
 from nlfilter_torch.tiled.sampling import Report
 

@@ -9,7 +9,7 @@ from nicegui import ui
 from nlfilter_torch.edits import declaration
 from nlfilter_torch.edits.declaration import Parameter
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 
 Change = Callable[[str, dict[str, Any], bool], None]  # step, entries, whether the change is complete
 UNITS = {"gain": "\u00d7", "%": "%"}

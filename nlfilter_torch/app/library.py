@@ -14,9 +14,7 @@ GONE = "open the photograph again: this page lost it, but its edit is kept"
 class Library:
     """Sessions by the address that a page has in its location, which survives a reload.
 
-    Args:
-        folder: where files are saved.
-        photographs: where photographs lie beside which edits are kept; None is ``folder``.
+    Files are saved in ``folder``; edits are kept beside the photographs in ``photographs``, by default the same folder.
     """
 
     def __init__(self, folder: Path, photographs: Path | None = None) -> None:

@@ -24,7 +24,7 @@ from nlfilter_torch.app.script import SCRIPT
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.app.style import CSS
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.tiled.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress
@@ -46,11 +46,7 @@ DISCONNECTED = "window.socket.on('disconnect', () => { window.unsaved = false; }
 
 
 class Editor:
-    """One tab of the browser, and the session of the photograph that it shows.
-
-    Args:
-        library: where sessions come from.
-    """
+    """One tab of the browser, and the session, from a library, of the photograph that it shows."""
 
     def __init__(self, library: Library) -> None:
         self.library = library

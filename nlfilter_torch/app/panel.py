@@ -203,4 +203,5 @@ class Panel:
 
 def entries_of(name: str) -> dict[str, Any]:
     """What a preset sets."""
-    return {entry: getattr(PRESETS[name], entry) for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}
+    detail = PRESETS[name].steps[0]
+    return {entry: detail[entry] for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}

@@ -19,15 +19,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.activity import activity, limit_by_activity
 from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
+from nlfilter_torch.edits.changes import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.declaration import Edit
-from nlfilter_torch.edits.detail import change_of_mean, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import DETAIL, MASK
 from nlfilter_torch.edits.pixels import Fitted, Pixels, part_of
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.steps import Step
@@ -212,12 +211,7 @@ class Preview:
         return self._mask[1]
 
     def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
-        """The preview under an edit, (1, 1 or 3, h, w) in [0, 1].
-
-        Args:
-            recipe: the edit.
-            upto: name of the last step to apply; None is all of them.
-        """
+        """The preview under an edit, or under its steps up to the one named ``upto``: (1, 1 or 3, h, w) in [0, 1]."""
         result, drawn = self.pixels, False
         key: Key = ()
         places = [i for i, step in enumerate(recipe.steps) if step.edit == upto]

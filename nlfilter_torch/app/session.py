@@ -12,7 +12,7 @@ from torch import Tensor
 from nlfilter_torch.app.preview import PIXELS, Preview
 from nlfilter_torch.app.sidecar import Sidecar
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.scribbles import Stroke, thin
 from nlfilter_torch.edits.steps import Step
@@ -227,12 +227,8 @@ class Session:
     def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
 
-        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph.
-
-        Args:
-            place: of the part.
-            recipe: the edit.
-            report: told of the progress; may raise an error to interrupt.
+        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph. The
+        report of the progress may raise an error to interrupt.
 
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
@@ -244,10 +240,7 @@ class Session:
         """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.
 
         :meth:`render` is fast, and approximate for edits that depend on single pixels; this takes as long as saving.
-
-        Args:
-            recipe: the edit.
-            report: told of the progress; may raise an error to interrupt.
+        The report of the progress may raise an error to interrupt.
 
         Raises:
             ValueError, OSError, MemoryError: as :meth:`part`.
@@ -266,7 +259,7 @@ class Session:
         """The parts of the photograph, with an edit fitted to the whole."""
         if self.opened is None:
             raise ValueError("open a photograph first; there is nothing to show")
-        self.opened.parts.fit(recipe, self._passes(self.opened.photograph, report))
+        self.opened.parts.fit(recipe.steps, self._passes(self.opened.photograph, report))
         return self.opened.parts
 
     def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
@@ -329,11 +322,7 @@ class Session:
         return f"{path.stem}-edited{suffix}"
 
     def save(self, name: str, report: Report = in_silence) -> Path:
-        """Edit the photograph at its full size and write it; the file appears complete or not at all.
-
-        Args:
-            name: of a file in the folder.
-            report: told of the progress.
+        """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
 
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
@@ -346,7 +335,7 @@ class Session:
             rows = photograph.pixels[0].permute(1, 2, 0).numpy()
             channels = 3 if recipe.gives_colour else rows.shape[2]
             pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-            for part, values in edit_rows(self._passes(photograph, report), rows, recipe, self.opened.name):
+            for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, self.opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(photograph.with_pixels(pixels), target)

@@ -52,7 +52,7 @@ def apply(
 
     from nlfilter_torch.cli import editing, showing
     from nlfilter_torch.cli.editing import Job
-    from nlfilter_torch.edits.detail import blend_edited
+    from nlfilter_torch.edits.changes import blend_edited
     from nlfilter_torch.io.photographs import Photograph
     from nlfilter_torch.tiled.pictures import Picture
     from nlfilter_torch.tiled.recipe import edit_regions, edit_tiling
@@ -77,7 +77,7 @@ def apply(
             picture = Picture(job.picture.rows, source)
             showing.note_colours(source, job.size, lambda rows: picture.tile(rows.start, rows.stop, 0).pixels)
         if not masks:
-            return edit_tiling(passes, job.picture.rows, recipes[0], source)
+            return edit_tiling(passes, job.picture.rows, recipes[0].steps, source)
         found = [job.open(path) for path in masks]
         for path, one in zip(masks, found, strict=True):
             if tuple(one.shape[:2]) != job.size:
@@ -85,7 +85,8 @@ def apply(
                     f"{path} must have the size of {source}, {job.size[1]}x{job.size[0]}, got "
                     f"{one.shape[1]}x{one.shape[0]}; resize it"
                 )
-        return edit_regions(passes, job.picture.rows, recipes, [one.rows for one in found], source)
+        edits = [recipe.steps for recipe in recipes]
+        return edit_regions(passes, job.picture.rows, edits, [one.rows for one in found], source)
 
     editing.edit_file(
         source,

@@ -11,8 +11,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import PRESETS, find_recipe
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.edits.steps import Step
 
 #: Options of detail that do not concern regions.

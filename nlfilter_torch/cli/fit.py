@@ -229,7 +229,7 @@ def _judged(
     looks: "Sequence[FittedLook]", image: "Tensor", edited: "Tensor", masks: "Tensor | None" = None
 ) -> "tuple[Tensor, Tensor, Tensor]":
     """A pair at the viewing size, and what the looks make of the photograph, each in its region."""
-    from nlfilter_torch.edits.detail import blend_edited
+    from nlfilter_torch.edits.changes import blend_edited
     from nlfilter_torch.edits.resizing import resize
     from nlfilter_torch.edits.viewing import viewed_size
 

@@ -151,8 +151,7 @@ def edit_folder(
         edit: edits one of them in a worker; its errors and warnings are reported.
         workers: number of processes on this machine.
         threads: of each process.
-        cluster: address of a cluster as in :func:`worker_pool`, whose workers see the folders under the same names;
-            None is this machine.
+        cluster: address of a cluster as in :func:`worker_pool`, whose workers see the folders under the same names.
         tell: called with a sentence for every failure and warning, as they happen.
         begin: called with the name of every file that ended.
         tally: updated as each file ends, so that it is correct after an interrupt too.

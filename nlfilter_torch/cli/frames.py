@@ -9,8 +9,7 @@ import typer
 from nlfilter_torch.cli import options
 from nlfilter_torch.cli.edits import DETAIL_OPTIONS, other_recipe, preset_option, step_of, typed_options, with_options
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import PRESETS, Recipe
 
 if TYPE_CHECKING:
     from nlfilter_torch.tiled.film import FilmEdit
@@ -93,11 +92,11 @@ def frames(
     from nlfilter_torch.tiled.film import FilmEdit, film_steps
     from nlfilter_torch.tiled.tiles import Passes
 
-    film_steps(recipe)
+    film_steps(recipe.steps)
     passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
     def fit(samples: list[Any]) -> FilmEdit:
-        return FilmEdit(recipe, samples, passes, seed=seed)
+        return FilmEdit(recipe.steps, samples, passes, seed=seed)
 
     work = edit_film if is_film(source) and not source.is_dir() else edit_folder
     count = work(source, target, references, fit)

@@ -86,10 +86,9 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
     """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
     from nlfilter_torch.edits.applying import seeded
-    from nlfilter_torch.edits.detail import options_of
     from nlfilter_torch.operator.build import nonlocal_operator
 
-    parameters = options_of(step, (guide.shape[-2], guide.shape[-1]))
+    parameters = step.filter_options((guide.shape[-2], guide.shape[-1]))
     return nonlocal_operator(guide, **parameters, generator=seeded(seed))
 
 

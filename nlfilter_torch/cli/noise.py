@@ -24,12 +24,7 @@ ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and addit
 
 
 class NoiseReport:
-    """Noise of a photograph, and how much denoising changed it, in grey levels.
-
-    Args:
-        noise: of the photograph.
-        given: whether the noise level was given by the user.
-    """
+    """Noise of a photograph, measured or ``given`` by the user, and how much denoising changed it, in grey levels."""
 
     def __init__(self, noise: Noise, *, given: bool) -> None:
         self._level, self._given = float(noise.level), given

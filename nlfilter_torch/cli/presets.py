@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from nlfilter_torch.edits.presets import PRESETS, PURPOSES, find_preset
+from nlfilter_torch.edits.presets import PRESETS, PURPOSES, find_recipe
 
 Name = Annotated[
     str | None,
@@ -18,14 +18,15 @@ def presets(name: Name = None) -> None:
     To start one of your own: `nlfilter-torch presets crisp > mine.json`
     """
     if name is not None:
-        typer.echo(find_preset(name).to_json(), nl=False)
+        typer.echo(find_recipe(name).to_json(complete=True), nl=False)
         return
     from rich.console import Console
     from rich.table import Table
 
     table = Table("preset", "alpha", "bandwidth", "what it does")
     for title, preset in PRESETS.items():
-        sliders = ", ".join(f"{value:g}" for value in preset.alpha)
-        bandwidth = preset.bandwidth if isinstance(preset.bandwidth, str) else f"{preset.bandwidth:g}"
+        step = preset.steps[0]
+        sliders = ", ".join(f"{value:g}" for value in step["alpha"])
+        bandwidth = step["bandwidth"] if isinstance(step["bandwidth"], str) else f"{step['bandwidth']:g}"
         table.add_row(title, sliders, bandwidth, PURPOSES[title])
     Console().print(table)

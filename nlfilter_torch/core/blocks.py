@@ -1,4 +1,4 @@
-"""Planes of pixels: division into blocks that fit the cache, folding of batches into channels, and weighting."""
+"""Planes of pixels: blocks that fit the cache, batches folded into channels, weights, and a stratified sample."""
 
 import math
 from collections.abc import Iterator
@@ -65,12 +65,7 @@ def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = 
 
 
 def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Tensor]]]:
-    """Generate the blocks of :func:`pixel_blocks` with ``count`` uninitialised (B, M, n) buffers, which are reused.
-
-    Args:
-        factor: (B, M, N), from which the buffers take shape, dtype and device.
-        count: number of buffers.
-    """
+    """Generate the blocks of :func:`pixel_blocks` with ``count`` uninitialised (B, M, n) buffers, which are reused."""
     batch, landmarks, pixels = factor.shape
     storage: list[Tensor] = []
     for block in pixel_blocks(pixels, batch, factor.device):
@@ -115,3 +110,14 @@ def weighted(values: Tensor, weights: Tensor | None) -> Tensor:
 def root_weighted(scaling: Tensor, weights: Tensor | None) -> Tensor:
     """``d sqrt(w)``, (B, N): the scaling of the symmetric matrix with the same eigenvalues as W."""
     return scaling if weights is None else scaling * weights.sqrt()
+
+
+def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
+    """Draw ``count`` pixels, one from each of ``count`` equal intervals of pixel indices.
+
+    They are distinct if an interval has one pixel or at least two; between that, some may be drawn twice.
+    In ascending order, since gathering them takes a third of the time that it takes in random order.
+    """
+    device = generator.device
+    offsets = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
+    return ((torch.arange(count, device=device) + offsets) * (pixels / count)).long().clamp_(max=pixels - 1)

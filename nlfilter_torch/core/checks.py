@@ -171,11 +171,6 @@ def check_positive(value: float | Tensor, name: str, batch: int | None = None) -
     check_values(value, name, "positive", batch)
 
 
-def check_weight(value: float | Tensor, name: str, batch: int | None = None) -> None:
-    """Raise unless ``value`` is finite; see :func:`check_values`."""
-    check_values(value, name, "finite", batch)
-
-
 def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:
     """Raise unless ``value`` is a number, or a tensor of shape () or (batch,), in a domain named in :data:`DOMAINS`.
 

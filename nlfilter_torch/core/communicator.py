@@ -67,10 +67,9 @@ class Communicator:
         return features.gather(2, indices.expand(*features.shape[:2], -1))
 
     def with_halo(self, rows: Tensor, margin: int) -> tuple[Tensor, tuple[int, int]]:
-        """The rows (B, C, H, W) with up to ``margin`` rows of the neighbours above and below; differentiable.
+        """The rows (B, C, H, W) with ``margin`` rows of the neighbours above and below, and how many were added there.
 
-        Returns:
-            The rows, and how many were added above and below: ``margin``, or as many as the image has there.
+        Differentiable. Fewer rows are added where the image has fewer.
         """
         return rows, (0, 0)
 

@@ -68,12 +68,7 @@ def are_derived(arguments: Sequence[Any]) -> bool:
 
 
 def refuse_transforms(name: str, *values: object) -> None:
-    """Raise if ``values`` are under a transform that does not support building an operator.
-
-    Args:
-        name: name of the first value.
-        *values: differentiable arguments, tensors or not.
-    """
+    """Raise if one of ``values``, the first called ``name``, is transformed in a way that operators cannot be built."""
     if torch.compiler.is_compiling():
         return
     # These three checks take less than a microsecond.

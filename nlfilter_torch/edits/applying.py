@@ -7,36 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import nlfilter_torch
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.edits.abstract import abstract
-from nlfilter_torch.edits.colorize import colorize
-from nlfilter_torch.edits.defocus import defocus
-from nlfilter_torch.edits.denoise import denoise
-from nlfilter_torch.edits.detail import enhance
 from nlfilter_torch.edits.in_memory import InMemory, edited
-from nlfilter_torch.edits.look import apply_look
-from nlfilter_torch.edits.recolor import recolor
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.shared_parameters import FILTER
-from nlfilter_torch.edits.sharpen import sharpen
 from nlfilter_torch.edits.source import Fitted, Source
 from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.tone import adjust_tone
 from nlfilter_torch.edits.viewing import viewed_size
-
-#: For each edit, the function that fits it to a source, given the scribbles and the parameters.
-FITS: dict[str, Callable[..., Fitted]] = {
-    "denoise": denoise.fit,
-    "detail": enhance.fit,
-    "tone": adjust_tone.fit,
-    "sharpen": sharpen.fit,
-    "colorize": colorize.fit,
-    "recolor": recolor.fit,
-    "defocus": defocus.fit,
-    "abstract": abstract.fit,
-    "look": apply_look.fit,
-}
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -56,13 +35,9 @@ def scribbles_of(
     colours: Callable[[Sequence[Stroke], tuple[int, int]], tuple[Any, ...]] = paint,
     mask: Callable[[Sequence[Stroke], tuple[int, int]], Any] = mask_of,
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Convert the strokes of a step to the function's arguments after the image, positional and by keyword.
+    """Convert the strokes of a step to the function's arguments after an image (H, W), positional and by keyword.
 
-    Args:
-        step: step of an edit.
-        size: (H, W) of the image.
-        colours: function that rasterises strokes to colours and their mask, by default as tensors.
-        mask: function that rasterises strokes to a mask, by default as a tensor.
+    ``colours`` and ``mask`` rasterise strokes to colours with their mask, and to a mask; by default to tensors.
     """
     if step.edit in ("recolor", "colorize"):
         keep = mask(step.painted("keep"), size)
@@ -98,10 +73,11 @@ def fit_step(
         generator: source of randomness; None is that of the command line.
     """
     check_channels(step.edit, source.channels)
+    function = getattr(nlfilter_torch, step.declared.function or step.edit)  # imports its module if it is the first use
     arguments = step.arguments(source.size, viewed_stride(step, source.size, stride)) | named
     if step.edit == "detail":
         scribbles = (torch.as_tensor(arguments.pop("alpha")), *scribbles)
-    return FITS[step.edit](source, *scribbles, **arguments, generator=generator or seeded())
+    return function.fit(source, *scribbles, **arguments, generator=generator or seeded())
 
 
 @full_precision
@@ -140,12 +116,9 @@ def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step],
 
 
 def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
-    """Sampling step of a picture relative to the size at which the step counts pixels, the viewing size if it has one.
+    """Sampling step of a picture (H, W) relative to the size at which the step counts pixels: its viewing size, if any.
 
-    Args:
-        step: step of an edit.
-        size: (H, W) of the picture.
-        stride: sampling step of the picture relative to the photograph.
+    ``stride`` is the sampling step of the picture relative to the photograph.
     """
     if stride == 1 or "viewing_size" not in step.arguments(size):
         return stride

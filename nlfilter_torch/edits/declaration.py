@@ -240,6 +240,7 @@ class Edit:
         name: name of its command, and of its steps in files.
         help: help text of the command.
         parameters: parameters of the edit itself, then those of its filter.
+        function: public name of its function, if that is not ``name``.
         hint: sentence shown in the editor.
         brushes: what strokes can mean, each with its label in the editor; ``colour`` stands for any colour.
         requires_strokes: whether the edit has no effect without strokes.
@@ -249,6 +250,7 @@ class Edit:
     name: str
     help: str
     parameters: tuple[Parameter, ...]
+    function: str = ""
     hint: str = ""
     brushes: tuple[tuple[str, str], ...] = ()
     requires_strokes: bool = False

@@ -1,6 +1,5 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,14 +14,20 @@ from nlfilter_torch.core.checks import (
     check_shape,
 )
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.edits.activity import VARIANCE_SIGMA, activity, limit_by_activity, sum_of
+from nlfilter_torch.edits.changes import (
+    VARIANCE_SIGMA,
+    activity,
+    blend_changes,
+    change_of_mean,
+    limit_by_activity,
+    split_sliders,
+    sum_of,
+)
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.mask import select_regions
 from nlfilter_torch.edits.parameters import DETAIL, MASK
-from nlfilter_torch.edits.shared_parameters import FILTER
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Source, luminance
-from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change
 from nlfilter_torch.operator.features import blur_margin
@@ -172,48 +177,3 @@ def enhance(
         brighter = sliders[..., -1].reshape(-1, 1, 1, 1)
     brighter = None if brighter is None else brighter.to(source.dtype)
     return fit_change(source, change, planes, viewing_size, limits, brighter=brighter)
-
-
-def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
-    """Split sliders less 1 into those that amplify detail and the others, each with 0 in place of the rest."""
-    dim = 1 if sliders.ndim == 4 else sliders.ndim - 1
-    places = torch.arange(sliders.shape[dim], device=sliders.device)
-    is_detail = (places < sliders.shape[dim] - 1).view(-1, *[1] * (sliders.ndim - dim - 1))
-    zero = torch.zeros_like(sliders)
-    raised = (sliders > 0) & is_detail
-    return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
-
-
-def change_of_mean(sliders: Tensor) -> Tensor | None:
-    """Relative change of the mean of a picture by sliders less 1, (K, k+1), one row for each part of the picture.
-
-    W preserves means, so only the last slider counts. Returns None, for no correction of the mean, if a part stays
-    unchanged or the last sliders differ.
-    """
-    last = sliders[:, -1]
-    return last[0] if bool((sliders != 0).any(1).all() & (last == last[0]).all()) else None
-
-
-def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
-    """Blend the changes of K regions and of the background, (B, (K + 1) S, H, W), by masks (B, K, H, W).
-
-    Where the masks sum to more than 1, they are divided by their sum.
-    """
-    shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
-    rest = (1 - shares.sum(1, keepdim=True)).clamp(min=0.0)
-    apart = changes.unflatten(1, (masks.shape[1] + 1, -1))
-    return (torch.cat([shares, rest], dim=1).unsqueeze(2) * apart).sum(1)
-
-
-def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tensor:
-    """The image (B, C, H, W), edited in K ways (B, C', H, W) where the masks (B, K, H, W) are 1."""
-    before = image.expand(-1, max(one.shape[1] for one in edited), -1, -1)
-    changes = [one - before for one in edited]
-    return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)
-
-
-def options_of(step: Step, size: tuple[int, int]) -> dict[str, Any]:
-    """Return the options of :func:`nonlocal_operator` for a step on an image of size (H, W), the viewing size."""
-    found = {name: value for name, value in step.arguments(size).items() if name in FILTER}
-    distance = DETAIL["spatial_bandwidth"].distance(found["spatial_bandwidth"], size)
-    return found | {"spatial_bandwidth": distance}

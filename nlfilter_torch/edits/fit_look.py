@@ -13,7 +13,7 @@ from nlfilter_torch.edits.alignment import inside_frame
 from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.look_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.look_pixels import EditedPhotograph, SomePixels
-from nlfilter_torch.edits.recipe import in_file
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.fit import fit_layers
 from nlfilter_torch.filtering.look import NAMES
@@ -78,7 +78,7 @@ class FittedLook:
 
     def to_json(self) -> str:
         """A file for ``nlfilter-torch apply``: a recipe of one step."""
-        return in_file([self.step.to_json("    ", complete=True)])
+        return Recipe((self.step,)).to_json(complete=True)
 
 
 @torch.no_grad()

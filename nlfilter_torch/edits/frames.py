@@ -6,10 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_weight
+from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_values
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.activity import activity, limit_by_activity
-from nlfilter_torch.edits.detail import split_sliders
+from nlfilter_torch.edits.changes import activity, limit_by_activity, split_sliders
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.limits import Balance, Limits
 from nlfilter_torch.edits.parameters import DETAIL
@@ -68,7 +67,7 @@ def filter_frames(
             f"frames must be an iterable of images, got {type(frames).__name__}; pass a list or a generator"
         )
     if residual is not None:
-        check_weight(residual, "residual")
+        check_values(residual, "residual", "finite")
     if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
     if len(references) > 1 and options.get("spatial_bandwidth") is not None:

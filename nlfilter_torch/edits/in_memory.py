@@ -20,18 +20,17 @@ from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.operator import Columns, NonlocalOperator
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 P = ParamSpec("P")
 
 
 class InMemory:
-    """An image in memory, both as a source and as the set of all its pixels.
+    """An image (B, C, H, W), float32 or float64, in memory: both a source and the set of all its pixels.
 
-    Args:
-        image: (B, C, H, W), float32 or float64.
-        cache: cache of its operators, by their options, and of what they compute; None caches nothing.
+    ``cache`` holds its operators, by their options, and what they compute; None caches nothing.
     """
 
     first = 0
@@ -244,9 +243,7 @@ def edit_of(picture: str, *, channels: int | None = None) -> Any:
     source and receive the edited image, in its dtype; the docstring and the annotations are written for them. The
     function of a source remains available as the attribute ``fit``.
 
-    Args:
-        picture: name of the image, for callers and in errors.
-        channels: number of channels that it must have; None is any.
+    Callers know the image by the name ``picture``; it must have so many ``channels``, if given.
     """
 
     def decorate(fit: Callable[..., Fitted]) -> Any:

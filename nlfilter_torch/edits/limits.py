@@ -199,14 +199,10 @@ def _bow(values: Tensor) -> Tensor:
 
 
 def _saturation(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
-    """Required and possible relative changes of chroma for the channels to stay within their limits.
+    """Required and possible relative changes of chroma for the channels of RGB to stay within their limits.
 
-    Args:
-        image: RGB (B, 3, H, W).
-        moved: its change of luminance (B, 1, H, W).
-
-    Returns:
-        The required decrease, from -1 to 0, and the possible increase, from 0 to 1, both (B, 1, H, W).
+    For a change ``moved`` of luminance: the required decrease, from -1 to 0, and the possible increase, from 0 to 1,
+    all (B, 1, H, W).
     """
     luminance, chroma = split_luminance(image)
     share = _share(image, luminance, chroma, moved)

@@ -108,11 +108,8 @@ class LocalValues:
     def __call__(self, own: Tensor, first: int) -> Tensor:
         """Return mean values of scribbles, and their influence in [0, 1], for a rectangle: (B, C+1, h, w).
 
-        The influence is the square root of the interpolated solution for ones.
-
-        Args:
-            own: luminance of the pixels, (B, 1, h, w).
-            first: row-major index of the first pixel.
+        The influence is the square root of the interpolated solution for ones. ``own`` is the luminance of the pixels,
+        (B, 1, h, w), and ``first`` the row-major index of the first of them.
         """
         found = self._at(own, *divmod(first, self.width))
         influence = found[:, -1:].clamp(min=MIN_INFLUENCE)

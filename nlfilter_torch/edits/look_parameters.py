@@ -98,5 +98,6 @@ LOOK = Edit(
         VIEWING_SIZE,
         *WITHOUT_SHADING,
     ),
+    function="apply_look",
     hint="A look that was found by `nlfilter-torch fit`; load its file, and choose how much of it.",
 )

@@ -9,7 +9,6 @@ from torch import Tensor
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.alignment import inside_frame
 from nlfilter_torch.edits.applying import seeded
-from nlfilter_torch.edits.detail import options_of
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
@@ -89,7 +88,7 @@ class EditedPhotograph:
         self.image, self.order = before[None], order
         self.before, self.after = before.flatten(1), after.flatten(1)
         self.free, self.masks = free.flatten(1), masks
-        self.options = options_of(step, self.size)
+        self.options = step.filter_options(self.size)
         self.generator = generator or seeded()
 
     @cached_property

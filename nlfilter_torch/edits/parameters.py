@@ -91,6 +91,7 @@ DETAIL = Edit(
         VIEWING_SIZE,
         *WITHOUT_SHADING,
     ),
+    function="enhance",
     hint="Paint on an area to give it its own sliders; everything that resembles it is selected too.",
     brushes=(("in", "Edit this"), ("out", "Not this")),
 )
@@ -154,6 +155,7 @@ TONE = Edit(
         VIEWING_SIZE,
         *WITHOUT_SHADING,
     ),
+    function="adjust_tone",
     hint="Contrast of large shapes, and of the largest details on them.",
 )
 
@@ -320,6 +322,7 @@ MASK = Edit(
         TOLERANCE,
         *(p for p in filter_parameters(share=0.6)[1:] if p.name != "patch_size"),
     ),
+    function="region_mask",
 )
 
 ABSTRACT = Edit(

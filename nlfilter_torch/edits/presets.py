@@ -1,146 +1,208 @@
-"""Presets: sliders and the options of their filter, as a small JSON file that applies to any photograph.
+"""Recipes: an ordered list of steps, each with its parameters and strokes, as a small JSON file; and the named presets.
 
-Names and units are those of the command line, so that the file can be edited by hand. :data:`PRESETS` are the named
-presets.
+The editor saves, and ``nlfilter-torch apply`` and ``batch`` read::
+
+    {
+      "version": 1,
+      "steps": [
+        {"edit": "denoise"},
+        {"edit": "detail", "alpha": [2.0, 2.0, 2.0, 1.0]}
+      ]
+    }
+
+Omitted entries have the defaults of the command of that name. Coordinates of strokes are relative to the picture, so
+that an edit made on a preview applies to the photograph. Does not import torch until a recipe is applied.
 """
 
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.edits.parameters import DETAIL
-from nlfilter_torch.edits.recipe import Recipe, in_file
+from nlfilter_torch.edits.declaration import parse_json, shown
+from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.steps import Step
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+VERSION = 1
+ORDER = tuple(EDITS)  # order in which the editor adds steps
+FORMER_ORDER = ("detail", "colorize", "recolor", "defocus", "abstract")  # order in files without a list of steps
+REMEDY = "save one in the editor"
+
 
 @dataclass(frozen=True)
-class Preset:
-    """An edit of the details of a photograph.
+class Recipe:
+    """An edit of a photograph as a sequence of steps; without steps it changes nothing.
 
     Attributes:
-        alpha: sliders, fine to coarse, at least two. Paper: eq. (12).
-        bandwidth: photometric bandwidth in grey levels from 0 to 255, or ``"auto"``.
-        spatial_bandwidth: in pixels, ``"none"`` for none, or None for a twelfth of the short side.
-        patch_size: odd.
-        landmarks: number of landmarks.
-        sampling: ``"kmeans"``, ``"uniform"`` or ``"random"``.
-        residual: gain of the residual of the landmarks, or None for that of the finest layer.
-        channels: ``"luminance"`` or ``"all"``.
-        threshold: in grey levels, contrast of detail below which it is amplified less.
-        limits: ``"soft"`` or ``"none"``.
-        viewing_size: in megapixels.
+        steps: each applied to the result of the one before; of any kind, in any order, and any number of times.
     """
 
-    alpha: tuple[float, ...]
-    bandwidth: float | str = DETAIL["bandwidth"].default
-    spatial_bandwidth: float | str | None = DETAIL["spatial_bandwidth"].default
-    patch_size: int = DETAIL["patch_size"].default
-    landmarks: int = DETAIL["landmarks"].default
-    sampling: str = DETAIL["sampling"].default
-    residual: float | None = DETAIL["residual"].default
-    channels: str = DETAIL["channels"].default
-    threshold: float = DETAIL["threshold"].default
-    limits: str = DETAIL["limits"].default
-    viewing_size: float = DETAIL["viewing_size"].default
+    steps: tuple[Step, ...] = ()
 
-    def apply(self, image: "Tensor", *, generator: "torch.Generator | None" = None) -> "Tensor":
-        """Edit a photograph as ``nlfilter-torch detail --preset`` does.
+    @property
+    def acting(self) -> tuple[Step, ...]:
+        """The steps that have an effect."""
+        return tuple(step for step in self.steps if step.changes())
+
+    @property
+    def drawn(self) -> "Recipe":
+        """The recipe without the steps that have neither an effect nor strokes."""
+        return Recipe(tuple(step for step in self.steps if step.changes() or step.strokes))
+
+    def last(self, edit: str) -> Step:
+        """Return the last step of an edit, or one that changes nothing if there is none."""
+        return next((step for step in reversed(self.steps) if step.edit == edit), Step.idle(edit))
+
+    def with_last(self, step: Step) -> "Recipe":
+        """Replace the last step of the same edit, or insert the step at its usual place if there is none."""
+        places = [i for i, other in enumerate(self.steps) if other.edit == step.edit]
+        if places:
+            return Recipe((*self.steps[: places[-1]], step, *self.steps[places[-1] + 1 :]))
+        rank = ORDER.index(step.edit)
+        place = max((i + 1 for i, other in enumerate(self.steps) if ORDER.index(other.edit) < rank), default=0)
+        return Recipe((*self.steps[:place], step, *self.steps[place:]))
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """Memory in bytes per pixel of the step that needs most."""
+        return max((step.bytes_per_pixel() for step in self.acting), default=0)
+
+    @property
+    def gives_colour(self) -> bool:
+        """Whether a grey photograph becomes one in colour."""
+        return any(step.declared.coloured for step in self.acting)
+
+    def apply(
+        self,
+        image: "Tensor",
+        report: Callable[[int, int], object] | None = None,
+        *,
+        generator: "torch.Generator | None" = None,
+    ) -> "Tensor":
+        """Edit a photograph as ``nlfilter-torch apply`` does.
 
         Args:
-            image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and its colours are kept.
-            generator: source of randomness for the landmarks; None draws the same for every call.
+            image: (B, C, H, W) in [0, 1], C = 1 or 3.
+            report: called before each step with how many are done, and of how many.
+            generator: source of randomness for the landmarks; None draws the same for every step and call.
 
         Returns:
-            (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in the image.
+            (B, C, H, W), with C = 3 if a step added colour; the image itself if no step has an effect. Values may leave
+            [0, 1]. Differentiable in the image.
 
         Raises:
-            TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or an entry leaves its range.
+            ValueError: if a step cannot be applied to such an image.
 
         Example:
             >>> import torch
             >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
-            >>> PRESETS["crisp"].apply(image).shape
-            torch.Size([1, 3, 24, 24])
+            >>> recipe = Recipe((Step("detail", alpha=(3.0, 1.0)), Step("tone"), Step("detail", alpha=(0.5, 1.0))))
+            >>> recipe.apply(image).shape, Recipe().apply(image) is image
+            (torch.Size([1, 3, 24, 24]), True)
         """
         from nlfilter_torch.edits.applying import apply_step
 
-        return apply_step(self.step, image, generator=generator)
+        result, steps = image, self.acting
+        for done, step in enumerate(steps):
+            if report is not None:
+                report(done, len(steps))
+            result = apply_step(step, image if result is image else result.clamp(0, 1), generator=generator)
+        return result
 
-    @property
-    def step(self) -> Step:
-        """The edit as a step of a :class:`~nlfilter_torch.edits.recipe.Recipe`."""
-        return Step("detail", **asdict(self))
-
-    def to_json(self) -> str:
-        """Format the preset as JSON: a recipe of one step.
-
-        >>> print(Preset((3.0, 1.0), 20.0).to_json())
-        {
-          "version": 1,
-          "steps": [
-            {
-              "edit": "detail",
-              "alpha": [3.0, 1.0],
-              "residual": null,
-              "channels": "luminance",
-              "reach": 0.6,
-              "tolerance": 8.0,
-              "threshold": 5.0,
-              "limits": "soft",
-              "viewing_size": 1.5,
-              "bandwidth": 20.0,
-              "spatial_bandwidth": null,
-              "patch_size": 5,
-              "landmarks": 300,
-              "sampling": "kmeans"
-            }
-          ]
-        }
-        <BLANKLINE>
-        """
-        return in_file([self.step.to_json("    ", complete=True)])
-
-    @staticmethod
-    def from_json(text: str | bytes, name: str) -> "Preset":
-        """Parse the output of :meth:`to_json`; omitted entries have their defaults.
+    def to_json(self, *, drawn: bool = False, complete: bool = False) -> str:
+        """Format the recipe as JSON, without steps that change nothing and without defaults.
 
         Args:
-            text: the file's content.
-            name: the file's name in errors.
+            drawn: whether to keep the steps that change nothing but have strokes.
+            complete: whether to write all steps, with their defaults, so that they can be edited by hand.
+
+        Example:
+            >>> print(Recipe((Step("tone"), Step("detail", alpha=(2.0, 1.0)))).to_json())
+            {
+              "version": 1,
+              "steps": [
+                {
+                  "edit": "tone",
+                  "contrast": 1.2
+                },
+                {
+                  "edit": "detail",
+                  "alpha": [2.0, 1.0]
+                }
+              ]
+            }
+            <BLANKLINE>
+        """
+        steps = self.steps if complete else self.drawn.steps if drawn else self.acting
+        text = ",\n".join(step.to_json("    ", complete=complete) for step in steps)
+        listed = f"[\n{text}\n  ]" if text else "[]"
+        return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
+
+    @staticmethod
+    def from_json(text: str | bytes, name: str, remedy: str = REMEDY) -> "Recipe":
+        """Parse the output of :meth:`to_json`, or a file in the former format without a list of steps.
 
         Raises:
-            ValueError: if ``text`` is no JSON object, or holds more than a single detail step without strokes.
+            ValueError: if ``text`` is no JSON object, or an entry is unknown or invalid. ``name`` is the file's name in
+                the message, which ends in ``remedy`` if the file is no recipe at all.
         """
-        return _preset(Recipe.from_json(text, name, REMEDY), name)
-
-
-REMEDY = "create one with nlfilter-torch fit"
-
-
-def _preset(recipe: Recipe, name: str) -> Preset:
-    """Convert a recipe of a single detail step without strokes."""
-    if [step.edit for step in recipe.steps] != ["detail"] or recipe.steps[0].strokes:
-        raise ValueError(
-            f"{name} is not a preset: it must hold a single detail step without strokes; use nlfilter-torch apply"
+        entries = parse_json(text, name, remedy)
+        if isinstance(entries, dict) and "alpha" in entries:
+            return Recipe((Step.from_entries("detail", entries, name, whole_file=True, former_format=True),))
+        if isinstance(entries, dict) and "steps" in entries:
+            return Recipe(tuple(_read_steps(entries, name)))
+        if not isinstance(entries, dict) or not set(entries) <= set(FORMER_ORDER):
+            raise ValueError(f"{name} is not a preset: it must hold a list of steps; {remedy}")
+        former = [edit for edit in FORMER_ORDER if edit in entries]
+        return Recipe(
+            tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", former_format=True) for edit in former)
         )
-    return Preset(**{field: recipe.steps[0][field] for field in Preset.__dataclass_fields__})
+
+
+def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
+    """Parse the steps of a file."""
+    unknown = entries.keys() - {"version", "steps"}
+    if unknown:
+        raise ValueError(f"{name} must have no entries other than version and steps, got {min(unknown)}; remove it")
+    if entries.get("version") != VERSION:
+        raise ValueError(
+            f"version in {name} must be {VERSION}, got {shown(entries.get('version'))}; "
+            "update nlfilter-torch to read newer files"
+        )
+    if not isinstance(entries["steps"], list):
+        raise ValueError(f"steps in {name} must be a list, got {shown(entries['steps'])}; correct it")
+    steps = []
+    for number, step in enumerate(entries["steps"], 1):
+        if not isinstance(step, dict) or step.get("edit") not in ORDER:
+            raise ValueError(
+                f"step {number} in {name} must have an entry edit, one of {', '.join(ORDER)}, got {shown(step)}; "
+                "correct it"
+            )
+        rest = {entry: value for entry, value in step.items() if entry != "edit"}
+        steps.append(Step.from_entries(step["edit"], rest, f"{step['edit']}, step {number} in {name}"))
+    return steps
+
+
+def _detail(**values: Any) -> Recipe:
+    """A recipe of a single step of ``detail``."""
+    return Recipe((Step("detail", **values),))
 
 
 #: The named presets. Chosen by eye on astronaut, chelsea and rocket of scikit-image and seven photographs of
 #: landscapes, buildings and plants. The presets that remove grain work better without a spatial term.
-PRESETS: dict[str, Preset] = {
-    "crisp": Preset((2.2, 2.2, 2.2, 1.0)),
-    "clear": Preset((1.5, 1.5, 1.5, 1.0)),
-    "texture": Preset((2.5, 1.3, 1.0, 1.0)),
-    "dramatic": Preset((2.0, 2.5, 3.5, 1.0), 40.0),
-    "glow": Preset((0.5, 1.0, 2.5, 1.0), 40.0),
-    "soft skin": Preset((0.1, 0.4, 1.0, 1.0), 8.0, "none", landmarks=100),
-    "calm": Preset((0.8, 0.6, 0.4, 1.0), 40.0),
-    "smooth": Preset((0.0, 0.0, 0.0, 1.0), 12.0, "none", landmarks=100),
+PRESETS: dict[str, Recipe] = {
+    "crisp": _detail(alpha=(2.2, 2.2, 2.2, 1.0)),
+    "clear": _detail(alpha=(1.5, 1.5, 1.5, 1.0)),
+    "texture": _detail(alpha=(2.5, 1.3, 1.0, 1.0)),
+    "dramatic": _detail(alpha=(2.0, 2.5, 3.5, 1.0), bandwidth=40.0),
+    "glow": _detail(alpha=(0.5, 1.0, 2.5, 1.0), bandwidth=40.0),
+    "soft skin": _detail(alpha=(0.1, 0.4, 1.0, 1.0), bandwidth=8.0, spatial_bandwidth="none", landmarks=100),
+    "calm": _detail(alpha=(0.8, 0.6, 0.4, 1.0), bandwidth=40.0),
+    "smooth": _detail(alpha=(0.0, 0.0, 0.0, 1.0), bandwidth=12.0, spatial_bandwidth="none", landmarks=100),
 }
 
 #: Short description of each of :data:`PRESETS`.
@@ -156,28 +218,19 @@ PURPOSES: dict[str, str] = {
 }
 
 
-def find_preset(name: str) -> Preset:
-    """Return the preset of that name (``soft-skin`` is ``soft skin``), or read it from the file at that path.
-
-    Raises:
-        ValueError: if there is neither, or the file holds no preset.
-
-    Example:
-        >>> find_preset("soft-skin").alpha
-        (0.1, 0.4, 1.0, 1.0)
-    """
-    return _preset(find_recipe(name), name)
-
-
 def find_recipe(name: str) -> Recipe:
     """Return the preset of that name (``soft-skin`` is ``soft skin``), or read the recipe in the file at that path.
 
     Raises:
         ValueError: if there is neither, or the file holds no recipe.
+
+    Example:
+        >>> find_recipe("soft-skin").steps[0]["alpha"]
+        (0.1, 0.4, 1.0, 1.0)
     """
     spoken = name.lower().replace("-", " ").replace("_", " ")
     if spoken in PRESETS:
-        return Recipe((PRESETS[spoken].step,))
+        return PRESETS[spoken]
     path = Path(name)
     if not path.is_file():
         raise ValueError(

@@ -21,14 +21,9 @@ def resized(
     rows: range | None = None,
     columns: range | None = None,
 ) -> Tensor:
-    """Resize a picture, or compute a part of the resized picture, by bicubic interpolation with antialiasing.
+    """Resize a picture, or compute some rows and columns of the result, by bicubic interpolation with antialiasing.
 
-    Args:
-        read: returns rows of the picture.
-        size: (H, W) of the picture.
-        wanted: (H, W) of the resized picture.
-        rows: rows of the result, all by default.
-        columns: columns of the result, all by default.
+    ``read`` returns rows of the picture (H, W); ``wanted`` is its new size.
     """
     parts = resized_parts(lambda start, stop: partial(read, start, stop), size, wanted, rows, columns)
     return torch.cat([part() for part in parts], dim=2)
@@ -64,13 +59,7 @@ def _part(rows: Callable[[], Tensor], weights: Tensor, across: tuple[slice, Tens
 
 @cached_constants  # strips of one picture have the same columns
 def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tensor]:
-    """Return the part of an axis that positions of the resized axis depend on, and weights (places, part) in float64.
-
-    Args:
-        places: positions on the resized axis.
-        length: length of the axis.
-        wanted: length of the resized axis.
-    """
+    """Part of an axis that places on it, resized to ``wanted``, depend on, and weights (places, part) in float64."""
     scale = length / wanted
     kernel_radius = 2 * max(scale, 1.0)
     first = max(0, math.floor((places.start + 0.5) * scale - kernel_radius))
@@ -118,11 +107,7 @@ def _shares(length: int, step: float) -> Tensor:
 def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
     """Interpolate a part (B, C, h, w) of a picture bilinearly between the centres of blocks (B, C, n, m).
 
-    Args:
-        blocks: values of blocks as those of :func:`block_means`.
-        step: side of a block in pixels.
-        corner: row and column of the first pixel of the part.
-        size: (h, w) of the part.
+    ``step`` is the side of a block of :func:`block_means`, ``corner`` row and column of the first pixel of the part.
     """
     above, below, share_below = _nearest_blocks(corner[0], size[0], step, blocks.shape[2])
     left, right, share_right = _nearest_blocks(corner[1], size[1], step, blocks.shape[3])

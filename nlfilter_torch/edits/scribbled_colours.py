@@ -36,15 +36,10 @@ def frame_places(size: tuple[int, int]) -> Tensor:
 
 
 def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
-    """Similarity, in [0, 1], of the colours of other pixels to those of scribbled pixels, (B, 1, k).
+    """Similarity (B, 1, k), in [0, 1], of other colours (B, C, k) to those of scribbled pixels, (B, C, n).
 
-    Position does not matter: the far end of a sky still counts as the same sky.
-
-    Args:
-        scribbled: colours (B, C, n) of scribbled pixels.
-        weights: their weights (B, n); pixels of weight 0 do not count.
-        others: colours (B, C, k) of the other pixels.
-        bandwidth: photometric bandwidth of the regression.
+    Position does not matter: the far end of a sky still counts as the same sky. Pixels of weight 0, of (B, n), do not
+    count. The bandwidth is that of the regression.
     """
     some, counted = every_nth(scribbled, (weights.detach() > 0).to(others), NUM_COMPARED)
     scale = per_image(bandwidth, others, 3)
@@ -79,13 +74,8 @@ def colour_likelihood(
 def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
     """Every n-th pixel of positive weight, about ``number`` for each image, whatever the others in the batch have.
 
-    Args:
-        colours: (B, C, n).
-        weights: (B, n).
-        number: of pixels.
-
-    Returns:
-        Colours (B, C, m) of the pixels chosen for any image, and their weights (B, m), 0 for those of other images.
+    Takes colours (B, C, n) and weights (B, n). Returns colours (B, C, m) of the pixels chosen for any image, and their
+    weights (B, m), 0 for those of other images.
     """
     counted = weights.detach() > 0
     place = counted.cumsum(1) - 1
@@ -95,13 +85,9 @@ def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Te
 
 
 def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) -> Tensor:
-    """Weighted mean (B, 1, k) of Gaussians around points, at other places; 0 if all weights are 0.
+    """Weighted mean (B, 1, k) of Gaussians around points (B, C, m), at places (B, C, k); 0 if all weights (B, m) are 0.
 
-    Args:
-        places: (B, C, k).
-        points: (B, C, m).
-        weights: (B, m).
-        bandwidth: (B or 1, 1, 1); the Gaussian is ``exp(-d / bandwidth^2)``, with d the mean square over the channels.
+    The Gaussian is ``exp(-d / bandwidth^2)``, with d the mean square over the channels.
     """
     places, points = (t / (bandwidth * math.sqrt(t.shape[1])) for t in (places, points))
     squares = points.square().sum(1, keepdim=True)

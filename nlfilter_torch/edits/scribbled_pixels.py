@@ -67,9 +67,7 @@ def scribbled_blocks(
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Yield columns (B, M, n), weights (B, 1, n) and values (B, C, n) of pixels, block by block, for a regression.
 
-    Args:
-        known: for each set of pixels, a function that returns the blocks of their columns, and the weights and values
-            of the whole set.
+    Each set of pixels is a function that returns the blocks of its columns, and the weights and values of all of it.
     """
     for columns, weights, values in known:
         first = 0

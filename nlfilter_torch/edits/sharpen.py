@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.edits.activity import VARIANCE_SIGMA, activity
+from nlfilter_torch.edits.changes import VARIANCE_SIGMA, activity
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.noise import noise_of

@@ -12,13 +12,13 @@ from typing import Any, Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.edits.pixels import Fitted as Fitted
 from nlfilter_torch.edits.pixels import Pixels as Pixels
 from nlfilter_torch.edits.pixels import Planes as Planes
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
-from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.products import compute_grams
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
 
 SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, where an edit allows it
@@ -173,13 +173,7 @@ class Source(Protocol):
         """
 
     def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
-        """The result of a function of the picture and of given tensors; a preview keeps it for the next edit.
-
-        Args:
-            name: of the result.
-            given: tensors that it depends on.
-            compute: the function.
-        """
+        """Result, called ``name``, of a function of picture and tensors; a preview keeps it for the next edit."""
 
     def measured(self, function: Callable[["Source"], Tensor]) -> Tensor:
         """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.edits.declaration import Edit, Parameter, is_within, shown
 from nlfilter_torch.edits.parameters import EDITS
+from nlfilter_torch.edits.shared_parameters import FILTER
 
 if TYPE_CHECKING:
     from nlfilter_torch.edits.scribbles import Stroke
@@ -107,6 +108,12 @@ class Step:
     def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
         """Return the arguments of the edit's function for an image of that size; see :meth:`Parameter.argument_of`."""
         return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_option}
+
+    def filter_options(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Return the options of :func:`nonlocal_operator` for an image of size (H, W), the viewing size."""
+        found = {name: value for name, value in self.arguments(size).items() if name in FILTER}
+        distance = self.declared["spatial_bandwidth"].distance(found["spatial_bandwidth"], size)
+        return found | {"spatial_bandwidth": distance}
 
     def to_json(self, indent: str = "", *, complete: bool = False) -> str:
         """Format the step as a JSON object, with one line for each entry and each stroke.

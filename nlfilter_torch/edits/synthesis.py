@@ -23,8 +23,7 @@ def polynomial(
 ) -> Callable[..., Tensor]:
     """Prepare :func:`polynomial_filter` of planes of a picture.
 
-    Returns:
-        A function of pixels, sliders and, optionally, a weight of the residual that replaces ``residual``.
+    Returns a function of pixels, sliders and, optionally, a weight of the residual that replaces ``residual``.
     """
     layers = operator.layers(planes, order)
     if residual is None:

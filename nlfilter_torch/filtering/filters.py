@@ -15,11 +15,13 @@ from nlfilter_torch.core.checks import (
     check_shape,
     check_tensor,
     check_unit_range,
-    check_weight,
+    check_values,
     checked_response,
 )
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import as_given, full_precision, per_image
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import Response, Spectrum
 
 
@@ -63,6 +65,19 @@ def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
 def layers_between(smoothed: Tensor) -> Tensor:
     """Differences of consecutive images in ``y, W y, ..., W^k y`` (B, k+1, ...), followed by the last image."""
     return torch.cat([smoothed[:, :-1] - smoothed[:, 1:], smoothed[:, -1:]], dim=1)
+
+
+def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:
+    """Detail layers (B, k+1, C, n) of some pixels with y = ``image``, (B, C, n).
+
+    ``coefficients`` are the moments of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
+    """
+    rows = coefficients.to(columns.factor).transpose(2, 3)  # (1, k, C, M), for one read of the columns
+    affinities = spread(rows.flatten(1, 2), columns.factor, columns.scaling).unflatten(1, rows.shape[1:3])
+    smoothed, remainder = [image], columns.remainder.unsqueeze(1)
+    for affinity in affinities.unbind(1):  # one for each power of W
+        smoothed.append(torch.addcmul(affinity, remainder, smoothed[-1]))
+    return layers_between(torch.stack(smoothed, dim=1))
 
 
 def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
@@ -129,7 +144,7 @@ def polynomial_filter(
     check_alpha(alpha)
     if residual is not None:
         batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
-        check_weight(residual, "residual", batch)
+        check_values(residual, "residual", "finite", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
     alpha = alpha if alpha.ndim == 4 else operator.among.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
@@ -200,7 +215,7 @@ def spectral_filter(
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     response = checked_response(response, spectrum.support)
-    check_weight(residual, "residual", spectrum.factor.shape[0])
+    check_values(residual, "residual", "finite", spectrum.factor.shape[0])
     check_tensor(image, "image", "convert it with torch.as_tensor")
     if image.ndim == 4 and len(image) == 0:
         check_image(image, "image", empty=True)

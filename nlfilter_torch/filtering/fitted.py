@@ -19,14 +19,14 @@ from nlfilter_torch.core.checks import (
     check_pair,
     check_same_size,
     check_tensor,
-    check_weight,
+    check_values,
 )
 from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.filtering.filters import layers_between, residual_change, weigh_layers
-from nlfilter_torch.operator.nystrom import Kernel
-from nlfilter_torch.operator.operator import Columns, NonlocalOperator
+from nlfilter_torch.filtering.filters import layers_of_columns, residual_change, weigh_layers
+from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 
 
@@ -90,7 +90,7 @@ class FittedFilter:
         check_tensor(image, "image", "convert it with torch.as_tensor")
         check_alpha(alpha)
         if residual is not None:
-            check_weight(residual, "residual", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
+            check_values(residual, "residual", "finite", max([1, *(len(t) for t in (image, alpha) if t.ndim > 1)]))
         planes = self._planes(image, guide, origin, halo, with_residual=residual is not None)
         count = self.moments.shape[1] + 1
         filtered = weigh_layers(planes[:, :count], alpha)
@@ -134,22 +134,6 @@ class FittedFilter:
 
 
 loadable(FittedFilter)
-
-
-def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> Tensor:
-    """Compute detail layers (B, k+1, C, n) of some pixels.
-
-    Args:
-        columns: of the pixels.
-        coefficients: moments of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
-        image: y at the pixels, (B, C, n).
-    """
-    rows = coefficients.to(columns.factor).transpose(2, 3)  # (1, k, C, M), for one read of the columns
-    affinities = spread(rows.flatten(1, 2), columns.factor, columns.scaling).unflatten(1, rows.shape[1:3])
-    smoothed, remainder = [image], columns.remainder.unsqueeze(1)
-    for affinity in affinities.unbind(1):  # one for each power of W
-        smoothed.append(torch.addcmul(affinity, remainder, smoothed[-1]))
-    return layers_between(torch.stack(smoothed, dim=1))
 
 
 @full_precision

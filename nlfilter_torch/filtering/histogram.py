@@ -118,12 +118,9 @@ class LocalCurves:
 
     @staticmethod
     def of(size: tuple[int, int], stretch: Stretch, reduced: Callable[[int], Tensor]) -> "LocalCurves":
-        """The curves of a picture of a size (H, W), one for each of :data:`LIMITS`.
+        """The curves of a picture of size (H, W), one for each of :data:`LIMITS`.
 
-        Args:
-            size: of the picture.
-            stretch: range of its brightness.
-            reduced: means of its :func:`ramps` over blocks of so many pixels, (B, 2 (K - 1), h, w).
+        ``reduced`` returns means of its :func:`ramps` over blocks of so many pixels, (B, 2 (K - 1), h, w).
         """
         step = max(1, min(size) // (TILES * FINE))
         means = reduced(step).unflatten(1, (2, SHADES - 1))

@@ -350,12 +350,7 @@ def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: Layout) -> Tensor:
 
 
 def nonnegative(matrix: Tensor, vector: Tensor) -> Tensor:
-    """The x >= 0 that minimises ``x^T A x / 2 - b^T x``, by active sets after Lawson and Hanson.
-
-    Args:
-        matrix: A (n, n), positive semi-definite.
-        vector: b (n,).
-    """
+    """The x >= 0 that minimises ``x^T A x / 2 - b^T x``, for A positive semi-definite, after Lawson and Hanson."""
     count = len(vector)
     x, free = torch.zeros_like(vector), torch.zeros(count, dtype=torch.bool)
     least = 1e-10 * vector.abs().max().clamp(min=1e-30)

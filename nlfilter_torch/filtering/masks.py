@@ -131,10 +131,7 @@ def check_negative(count: int, regions: int) -> None:
 def _distances_to_means(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     """Squared distances (B, K, N) of all pixels to the means of K regions in the coordinates ``basis @ F``.
 
-    Args:
-        spectrum: has the scaled factor F.
-        basis: (B, M, M), float64.
-        weights: of the regions, (B, K, N), each with unit sum.
+    ``basis`` is (B, M, M) in float64; the weights of the regions, (B, K, N), have unit sum.
     """
     factor, scaling = spectrum.factor, spectrum.scaling.unsqueeze(1)
     centres = _sums(spectrum, basis, weights).mT.to(factor)  # (B, K, M)

@@ -26,14 +26,9 @@ PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from pixel
 
 
 def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tensor:
-    """Compute weights between neighbours from their squared distances.
+    """Weights (B, 4, H, W) of each pixel of a guide with its neighbours at :data:`OFFSETS`, 0 where there is none.
 
-    Args:
-        guide: (B, C, H, W).
-        weight: function of squared distances (B, h, w), summed over the channels.
-
-    Returns:
-        (B, 4, H, W): weights of each pixel with its neighbour at each of :data:`OFFSETS`, 0 where there is none.
+    ``weight`` is a function of squared distances (B, h, w), summed over the channels.
     """
     weights = []
     for (here, there), padding in zip(SIDES, PADDING, strict=True):

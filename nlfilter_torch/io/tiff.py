@@ -152,24 +152,9 @@ def write_rows(
 
     big = height * width * samples * dtype.itemsize > MAX_CLASSIC_BYTES
     # Compressing ahead in threads would queue hundreds of megabytes.
-    options = {
-        "tile": (TILE_SIZE, TILE_SIZE),
-        "maxworkers": 1,
-        "buffersize": TILE_SIZE * TILE_SIZE * samples * dtype.itemsize,
-    }
-    write(
-        stream,
-        tiles(),
-        plain_shape,
-        dtype,
-        alpha,
-        icc,
-        None if big else exif,
-        xmp,
-        bigtiff=big,
-        **options,
-        **resolution,
-    )
+    options: dict[str, Any] = {"maxworkers": 1, "buffersize": TILE_SIZE * TILE_SIZE * samples * dtype.itemsize}
+    options |= {"tile": (TILE_SIZE, TILE_SIZE), "bigtiff": big, **resolution}
+    write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, xmp, **options)
 
 
 def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
@@ -330,11 +315,8 @@ class TiffRows:
     @property
     def cached(self) -> int:
         """Bytes of decoded strips or tiles that are cached while rows are read."""
-        return (
-            0
-            if self._raw
-            else (CACHED_BANDS + 1) * self.segment[0] * self.shape[1] * self.shape[2] * self.dtype.itemsize
-        )
+        rows = 0 if self._raw else (CACHED_BANDS + 1) * self.segment[0]
+        return rows * self.shape[1] * self.shape[2] * self.dtype.itemsize
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         """Read the rows from ``rows.start`` to ``rows.stop``.

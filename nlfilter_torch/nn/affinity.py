@@ -10,11 +10,12 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.communicator import check_group
 from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
-from nlfilter_torch.operator.build import Construction, nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import GuideChannels, unit_window
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.options import Construction
 
 
 class NonlocalAffinity(Learnable):

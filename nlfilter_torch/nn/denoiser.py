@@ -219,13 +219,7 @@ def shapes_of(denoiser: NonlocalDenoiser) -> dict[str, tuple[int, ...]]:
 
 
 def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tensor:
-    """Expand noise levels, a number, (B,) or a map (B, 1 or C, H, W), to a map.
-
-    Args:
-        noise: standard deviations.
-        image: the noisy image, (B, C, H, W).
-        name: name of the argument in error messages.
-    """
+    """Expand noise levels, a number, (B,) or a map (B, 1 or C, H, W), to a map; errors call them ``name``."""
     if isinstance(noise, Tensor) and noise.ndim == 4:
         check_image(noise, name, batch=image.shape[0])
         check_same_size(noise, (image.shape[-2], image.shape[-1]), name, "image")

@@ -12,7 +12,7 @@ from nlfilter_torch.core.checks import (
     check_same_size,
     check_tensor,
     check_unit_range,
-    check_weight,
+    check_values,
     described,
 )
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
@@ -57,7 +57,7 @@ class PolynomialSliders(nn.Module):
         start = _sliders(alpha)
         check_alpha(start, dimensions=(1, 2))
         if residual is not None:
-            check_weight(residual, "residual")
+            check_values(residual, "residual", "finite")
         if residual is None and "residual" in names:
             weight: Tensor | None = start[..., 0].mean().reshape(1)
         else:

@@ -1,6 +1,6 @@
 """Balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
-A kernel with a completed diagonal is balanced by Newton's method (:mod:`~nlfilter_torch.operator.newton`), any other
+A kernel with a completed diagonal is balanced by Newton's method (:mod:`~nlfilter_torch.operator.scaling`), any other
 kernel by Chebyshev semi-iteration on ``log d``. On CPUs, a damped Newton method continues where these do not converge.
 The gradient is implicit and the same for all methods.
 
@@ -24,9 +24,16 @@ from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.library import register
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
 from nlfilter_torch.core.values import is_hidden
-from nlfilter_torch.operator import newton
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, shifted_gram, slack
-from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, Solution, isolated
+from nlfilter_torch.operator.scaling import (
+    Balancing,
+    KernelMatrix,
+    Solution,
+    conjugate_gradients,
+    damped,
+    isolated,
+    newton,
+)
 
 Found = TypeVar("Found", bound=Balancing)
 
@@ -96,7 +103,7 @@ class _Balanced(torch.autograd.Function):
     is ``-(z a^T + s d^T)``, with z = factor d and s = factor a; with respect to the diagonal it is ``-a d``.
 
     With r = d^2 c the equation for x reads ``(1 + r) x + d (factor^T s) = d * g``: x follows from s, the solution of M
-    equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.newton`. They are solved by conjugate
+    equations whose matrix is the Jacobian J of :mod:`~nlfilter_torch.operator.scaling`. They are solved by conjugate
     gradients, preconditioned by the approximate inverse of J from balancing.
     """
 
@@ -129,10 +136,10 @@ class _Balanced(torch.autograd.Function):
 
 def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
     """Balance a kernel by the method that suits it, and continue with the damped method if that does not converge."""
-    found = newton.solve(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
+    found = newton(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
     goal = attainable(matrix.factor, tolerance, matrix.among)
     if not is_hidden(matrix.factor) and not bool((found.residual <= goal).all()):
-        found = newton.damped(matrix, found, goal)
+        found = damped(matrix, found, goal)
     return found
 
 
@@ -148,7 +155,7 @@ def implicit_gradients(
     weight = scaling.square() * share
     matrix = KernelMatrix(factor, diagonal, None, among)
     right = matrix.moment(weight * grad)
-    solution = newton.conjugate_gradients(factor, weighted(weight, weights), right, inverse, among)
+    solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, among)
     affinity = weighted(matrix.affinities(solution), weights)
     a = scaling * scaling * share * (grad - affinity)
     totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)

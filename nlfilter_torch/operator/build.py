@@ -1,6 +1,6 @@
 """Building an operator from a guide or from features: landmarks, Nystrom factor, balancing. Paper: Sec. II."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -10,17 +10,11 @@ from nlfilter_torch.core.blocks import root_weighted
 from nlfilter_torch.core.checks import (
     called_by_edit,
     check_choice,
-    check_count,
     check_features,
     check_image,
-    check_instance,
-    check_number,
-    check_positive,
     check_scale,
     check_size,
     check_weights,
-    described,
-    warn,
     warn_of_scale,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
@@ -37,51 +31,10 @@ from nlfilter_torch.operator.features import (
     unit_window,
 )
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
-from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
-from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
+from nlfilter_torch.operator.options import Construction, check_bandwidths
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
-
-
-@dataclass(frozen=True)
-class Construction:
-    """Checked options for building an operator from features; see :func:`nonlocal_operator`."""
-
-    num_landmarks: int
-    landmarks: Sampling
-    completion: Completion
-    tolerance: float | None
-    generator: torch.Generator | None
-
-    def __post_init__(self) -> None:
-        """Raise an error for an invalid option."""
-        remedy = "choose one of these, and pass the number of landmarks as num_landmarks"
-        check_choice(self.landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
-        check_choice(self.completion, "completion", ("diagonal", "none"))
-        check_count(self.num_landmarks, "num_landmarks")
-        if self.tolerance is not None:
-            check_number(self.tolerance, "tolerance", "pass a float or None")
-            check_positive(self.tolerance, "tolerance")
-        if self.generator is not None:
-            check_instance(self.generator, torch.Generator, "generator", "create one with torch.Generator()")
-
-    def count(self, points: int) -> int:
-        """Number of landmarks, reduced with a warning where there are fewer points."""
-        if self.num_landmarks > points:
-            got = described(self.num_landmarks)
-            warn(f"num_landmarks must be at most the number of pixels, {points}, got {got}; using every pixel")
-        return min(self.num_landmarks, points)
-
-
-def check_bandwidths(
-    photometric: float | Tensor | str, spatial: float | Tensor | None, batch: int | None = None
-) -> None:
-    """Raise unless these are bandwidths, for all images or for each of a batch."""
-    if isinstance(photometric, str):
-        check_choice(photometric, "photometric_bandwidth", ("auto",), "pass it or a number")
-    else:
-        check_positive(photometric, "photometric_bandwidth", batch)
-    if spatial is not None:
-        check_positive(spatial, "spatial_bandwidth", batch)
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:

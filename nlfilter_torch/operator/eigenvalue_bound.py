@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.communicator import Communicator
+from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
-from nlfilter_torch.operator.products import compute_grams
 
 # Amount by which eigenvalues may exceed 1 through rounding and inexact row sums; r exceeds 1 by less.
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}

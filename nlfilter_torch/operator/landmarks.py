@@ -6,6 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
 from nlfilter_torch.core.kernels.library import register
@@ -144,17 +145,6 @@ def _grid(size: tuple[int, int], count: int) -> Tensor:
         x = (2 * torch.arange(length) + 1) * width // (2 * length)
         lines.append(y * width + x)
     return torch.cat(lines)
-
-
-def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
-    """Draw ``count`` pixels, one from each of ``count`` equal intervals of pixel indices.
-
-    They are distinct if an interval has one pixel or at least two; between that, some may be drawn twice.
-    In ascending order, since gathering them takes a third of the time that it takes in random order.
-    """
-    device = generator.device
-    offsets = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
-    return ((torch.arange(count, device=device) + offsets) * (pixels / count)).long().clamp_(max=pixels - 1)
 
 
 def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -9,7 +9,6 @@ and one vector of length M. Tiles of a large image, rows on another machine and 
 exact columns, without seams or flicker, if they share landmarks and moments.
 """
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -19,7 +18,6 @@ from nlfilter_torch.core.autograd import factors_of, once_differentiable
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
 from nlfilter_torch.core.kernels.library import register
 from nlfilter_torch.core.values import is_hidden
-from nlfilter_torch.operator.features import GuideFeatures
 
 Completion = Literal["diagonal", "none"]
 
@@ -104,52 +102,3 @@ class _NystromFactor(torch.autograd.Function):
             diagonal=grad_diagonal,
         )
         return *gradients, None
-
-
-@dataclass(frozen=True, eq=False)
-class Kernel:
-    """Affinities to a fixed set of landmarks.
-
-    Attributes:
-        landmarks: (B, D, M).
-        inverse_cholesky: (B, M, M).
-        completion: ``"diagonal"`` or ``"none"``.
-        limiter: (B, M, M) matrix by which the factor is multiplied so that no eigenvalue of W exceeds 1, or None.
-        features: computes features of a guide; None if the operator was made from features.
-    """
-
-    landmarks: Tensor
-    inverse_cholesky: Tensor
-    completion: Completion
-    limiter: Tensor | None = None
-    features: GuideFeatures | None = None
-
-    @property
-    def recipe(self) -> GuideFeatures:
-        """The function that computes features of a guide.
-
-        Raises:
-            ValueError: if the operator was made from features.
-        """
-        if self.features is None:
-            raise ValueError(
-                "operator must be built by nonlocal_operator to be applied to other guides, got one from features; "
-                "use operator.at(features)"
-            )
-        return self.features
-
-    def columns(
-        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0)
-    ) -> tuple[Tensor, Tensor]:
-        """Compute factor (B, M, N) and diagonal (B, N) of the pixels of any guide; see :class:`GuideFeatures`."""
-        return self.factor(self.recipe(guide, origin=origin, halo=halo))
-
-    def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n).
-
-        Landmarks with a batch size of 1 serve for all images.
-        """
-        shape = (features.shape[0], -1, -1)
-        landmarks, inverse = self.landmarks.expand(shape), self.inverse_cholesky.expand(shape)
-        factor, diagonal = nystrom_factor(features, landmarks, inverse, self.completion)
-        return factor if self.limiter is None else self.limiter @ factor, diagonal

@@ -19,8 +19,8 @@ from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
-from nlfilter_torch.operator.nystrom import Kernel
-from nlfilter_torch.operator.products import apply_powers
+from nlfilter_torch.operator.nystrom import Completion, nystrom_factor
+from nlfilter_torch.operator.products import Columns, apply_powers
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
@@ -28,18 +28,52 @@ DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB 
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
-    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
+class Kernel:
+    """Affinities to a fixed set of landmarks.
 
     Attributes:
-        factor: u, (B, M, n).
-        scaling: d, (B, n).
-        remainder: r, (B, n).
+        landmarks: (B, D, M).
+        inverse_cholesky: (B, M, M).
+        completion: ``"diagonal"`` or ``"none"``.
+        limiter: (B, M, M) matrix by which the factor is multiplied so that no eigenvalue of W exceeds 1, or None.
+        features: computes features of a guide; None if the operator was made from features.
     """
 
-    factor: Tensor
-    scaling: Tensor
-    remainder: Tensor
+    landmarks: Tensor
+    inverse_cholesky: Tensor
+    completion: Completion
+    limiter: Tensor | None = None
+    features: GuideFeatures | None = None
+
+    @property
+    def recipe(self) -> GuideFeatures:
+        """The function that computes features of a guide.
+
+        Raises:
+            ValueError: if the operator was made from features.
+        """
+        if self.features is None:
+            raise ValueError(
+                "operator must be built by nonlocal_operator to be applied to other guides, got one from features; "
+                "use operator.at(features)"
+            )
+        return self.features
+
+    def columns(
+        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0)
+    ) -> tuple[Tensor, Tensor]:
+        """Compute factor (B, M, N) and diagonal (B, N) of the pixels of any guide; see :class:`GuideFeatures`."""
+        return self.factor(self.recipe(guide, origin=origin, halo=halo))
+
+    def factor(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute factor (B, M, n) and diagonal (B, n) of pixels with features (B, D, n).
+
+        Landmarks with a batch size of 1 serve for all images.
+        """
+        shape = (features.shape[0], -1, -1)
+        landmarks, inverse = self.landmarks.expand(shape), self.inverse_cholesky.expand(shape)
+        factor, diagonal = nystrom_factor(features, landmarks, inverse, self.completion)
+        return factor if self.limiter is None else self.limiter @ factor, diagonal
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,30 @@
-"""Products with ``W = F^T F + diag(r)``, where F = factor diag(d), and Gram matrices of F. Paper: eq. (13)."""
+"""Columns of ``W = F^T F + diag(r)``, where F = factor diag(d), and products with it. Paper: eq. (13)."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.autograd import once_differentiable, outer_product
-from nlfilter_torch.core.blocks import SWEPT, buffered_blocks, pixel_blocks, weighted
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
+
+    Attributes:
+        factor: u, (B, M, n).
+        scaling: d, (B, n).
+        remainder: r, (B, n).
+    """
+
+    factor: Tensor
+    scaling: Tensor
+    remainder: Tensor
 
 
 def apply_powers(
@@ -90,52 +105,3 @@ class _Powers(torch.autograd.Function):
             adjoint = weighted(d * affinity, weights) + r * adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
         return grad_factor, grad_scaling, grad_remainder, adjoint, None, None, None
-
-
-def compute_grams(
-    factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, *, exact: bool = False
-) -> Tensor:
-    """:func:`sum_grams` with a gradient, in float64 if ``exact``."""
-    recorded = torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad)
-    sums = _Grams.apply if recorded else _exact_or_quick  # torch.func transforms do not support the class
-    grams: Tensor = sums(factor, scaling, remainder, count, exact)
-    return grams
-
-
-def _exact_or_quick(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, exact: bool) -> Tensor:
-    """:func:`sum_grams`; if ``exact``, in float64, block by block."""
-    if not exact:
-        return sum_grams(factor, scaling, remainder, count)
-    total = factor.new_zeros(())
-    for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
-        part = None if remainder is None else remainder[:, block].double()
-        total = total + sum_grams(factor[:, :, block].double(), scaling[:, block].double(), part, count)
-    return total
-
-
-class _Grams(torch.autograd.Function):
-    """:func:`sum_grams` with a hand-written gradient, for which no intermediate blocks are stored."""
-
-    @staticmethod
-    def forward(ctx: Any, factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, exact: bool) -> Tensor:
-        ctx.save_for_backward(factor, scaling, remainder)
-        return _exact_or_quick(factor, scaling, remainder, count, exact)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder = ctx.saved_tensors
-        grad_factor, grad_scaling = torch.empty_like(factor), torch.empty_like(scaling)
-        grad_remainder = None if remainder is None else torch.empty_like(remainder)
-        symmetric = (grad + grad.mT).to(factor)  # (B, J, M, M)
-        for block, (rows, pulled, inner, product) in buffered_blocks(factor, 4):
-            d = scaling[:, None, block]
-            torch.mul(factor[:, :, block], d, out=rows)
-            torch.bmm(symmetric[:, 0], rows, out=pulled)
-            if remainder is not None and grad_remainder is not None:
-                torch.bmm(symmetric[:, 1], rows, out=inner)
-                grad_remainder[:, block] = torch.mul(inner, rows, out=product).sum(1) / 2
-                pulled.addcmul_(inner, remainder[:, None, block])
-            grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
-            grad_factor[:, :, block] = pulled.mul_(d)
-        return grad_factor, grad_scaling, grad_remainder, None, None

@@ -16,11 +16,11 @@ from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, 
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Target, loadable, moved
+from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.values import is_hidden
-from nlfilter_torch.operator.products import compute_grams
 
 # Eigenvalues of G below this, relative to the largest, are rounding errors.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -48,11 +48,9 @@ class RitzPairs:
 
     @staticmethod
     def of_sums(grams: Tensor, dtype: torch.dtype) -> "RitzPairs":
-        """Compute the matrices from sums over all pixels.
+        """Compute the matrices from ``F F^T`` and, if W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M).
 
-        Args:
-            grams: ``F F^T`` and, if W has a diagonal part, ``F diag(r) F^T``: (B, 1 or 2, M, M) in float64.
-            dtype: of the factor, which determines the rounding error of ``grams``.
+        The sums are in float64; ``dtype`` is that of the factor, which determines their rounding error.
         """
         gram = SymmetricMatrix.of(grams[:, 0])
         kept = gram.eigenvalues > CUT[dtype] * gram.eigenvalues[:, :1]

@@ -14,19 +14,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step, seeded
-from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.landmarks import stratified
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled.operator import TiledOperator, first_plane
-from nlfilter_torch.tiled.pictures import GuidePicture, Picture
-from nlfilter_torch.tiled.sampling import CHUNK, ColumnCache, Pilot
+from nlfilter_torch.tiled.pictures import Picture
+from nlfilter_torch.tiled.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.statistics import Block, Sums
 from nlfilter_torch.tiled.tiles import Passes
@@ -89,13 +88,7 @@ class FrameOperator(TiledOperator):
 
 
 class Frame(Tiled):
-    """A frame as the source of an edit that is fitted to reference frames.
-
-    Args:
-        picture: the frame.
-        passes: tiling options.
-        references: frames of the same size.
-    """
+    """A frame as the source of an edit that is fitted to reference frames of the same size."""
 
     def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
         super().__init__(picture, passes)
@@ -218,7 +211,7 @@ def whole(picture: Picture) -> Tensor:
     return picture.tile(0, picture.size[0], 0).pixels
 
 
-def film_steps(recipe: Recipe) -> tuple[Step, ...]:
+def film_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
     """Adapt the steps of an edit to a film: position is ignored unless a spatial bandwidth is set.
 
     An object that moves far from its position in all references would otherwise be edited differently.
@@ -226,7 +219,7 @@ def film_steps(recipe: Recipe) -> tuple[Step, ...]:
     Raises:
         ValueError: if a step has or needs strokes.
     """
-    for step in recipe.steps:
+    for step in steps:
         if step.strokes or step.declared.requires_strokes:
             raise ValueError(f"edits of a film must not have strokes, got {step.edit} with strokes; remove that step")
     return tuple(
@@ -235,7 +228,8 @@ def film_steps(recipe: Recipe) -> tuple[Step, ...]:
         )
         if step["spatial_bandwidth"] is None
         else step
-        for step in recipe.acting
+        for step in steps
+        if step.changes()
     )
 
 
@@ -243,7 +237,7 @@ class FilmEdit:
     """A whole edit, fitted to some frames of a film.
 
     Args:
-        recipe: steps without strokes.
+        steps: without strokes.
         references: frames (H, W, C) of one size.
         passes: tiling options; ``kind`` is ignored.
         seed: of the random numbers of every step.
@@ -252,8 +246,10 @@ class FilmEdit:
         ValueError: if a step has strokes, or references differ in size.
     """
 
-    def __init__(self, recipe: Recipe, references: Sequence[FrameArray], passes: Passes, *, seed: int = 0) -> None:
-        self.steps, self.passes, self.seed = film_steps(recipe), replace(passes, kind="float32"), seed
+    def __init__(
+        self, steps: Sequence[Step], references: Sequence[FrameArray], passes: Passes, *, seed: int = 0
+    ) -> None:
+        self.steps, self.passes, self.seed = film_steps(steps), replace(passes, kind="float32"), seed
         self.references: list[References] = []
         self.size = references[0].shape[:2]
         pictures = [Picture(reference, "reference") for reference in references]

@@ -10,17 +10,18 @@ from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.source import SAMPLE, Blocks, Planes, sampled_pairs, sampled_places
-from nlfilter_torch.filtering.fitted import layers_of_columns
+from nlfilter_torch.filtering.filters import layers_of_columns
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.nystrom import Kernel
-from nlfilter_torch.operator.operator import Columns
+from nlfilter_torch.operator.operator import Kernel
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.pictures import GuidePicture, Tile
+from nlfilter_torch.tiled.pictures import Tile
 from nlfilter_torch.tiled.sampling import (
     ColumnCache,
     Draws,
+    GuidePicture,
     Pilot,
     Report,
     in_silence,

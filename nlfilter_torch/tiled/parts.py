@@ -4,6 +4,7 @@ Each step is fitted to the whole picture as in :mod:`nlfilter_torch.tiled.recipe
 rectangle's own pixels are needed. This is how the editor shows a part of a large photograph at full size.
 """
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
@@ -13,13 +14,12 @@ from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step, scribbles_of
-from nlfilter_torch.edits.recipe import Recipe
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.pictures import GuidePicture, LazyRows, Picture, RowSource
-from nlfilter_torch.tiled.sampling import ColumnCache, Report, in_silence
+from nlfilter_torch.tiled.pictures import LazyRows, Picture, RowSource
+from nlfilter_torch.tiled.sampling import ColumnCache, GuidePicture, Report, in_silence
 from nlfilter_torch.tiled.scribbles import colour_rows, mask_rows
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import Passes, Statistics, intermediate
@@ -160,19 +160,15 @@ class Parts:
         self._known: tuple[Statistics, tuple[Step, ...]] = ("sample", ())  # statistics, and steps between the stages
         self._last: tuple[Tiled, Fitted] | None = None
 
-    def fit(self, recipe: Recipe, passes: Passes) -> None:
+    def fit(self, edit: Sequence[Step], passes: Passes) -> None:
         """Fit an edit to the whole picture, reusing steps that are fitted already; this may take long.
 
         After an error, including one raised by the progress report, the steps fitted until then remain valid.
 
-        Args:
-            recipe: the edit.
-            passes: tiling options.
-
         Raises:
             ValueError, MemoryError, OSError: as :func:`~nlfilter_torch.tiled.recipe.edit_rows`.
         """
-        steps, (statistics, known) = recipe.acting, self._known
+        steps, (statistics, known) = tuple(step for step in edit if step.changes()), self._known
         self._last = None
         same = 0
         while statistics == passes.statistics and steps[same : same + 1] == known[same : same + 1] != ():
@@ -199,9 +195,7 @@ class Parts:
     def reduced(self, size: tuple[int, int], report: Report = in_silence) -> Tensor:
         """The whole picture after the edit that was fitted last, reduced to a smaller size, (1, C, h, w) in [0, 1].
 
-        Args:
-            size: (h, w).
-            report: told how many of the rows are done; may raise an error to interrupt.
+        ``report`` is told how many of the rows are done, and may raise an error to interrupt.
         """
         height, width = self._stages[0].picture.size
 

@@ -10,9 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nlfilter_torch.edits.source import Guide
-from nlfilter_torch.tiled.workers import in_order
-
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
@@ -182,60 +179,6 @@ class Picture:
     def statistics_rows(self) -> int:
         """Rows in a block of a pass that computes statistics."""
         return 2 * max(1, STATISTICS_PIXELS // 2 // self.size[1])
-
-
-class GuidePicture(Picture):
-    """The guide of a picture.
-
-    Attributes:
-        picture: whose guide this is.
-        guide: computes the guide from the picture.
-        stored: the whole guide (1, C, H, W), if kept in memory.
-    """
-
-    def __init__(self, picture: Picture, guide: Guide) -> None:
-        super().__init__(picture.source, picture.name)
-        self.picture, self.guide = picture, guide
-        self.stored: Tensor | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The guide in another process, which computes it from the picture."""
-        return self.__dict__ | {"stored": None}
-
-    def store(self, rows: int, workers: int) -> None:
-        """Compute the whole guide in tiles of ``rows``, and keep it in memory for further passes."""
-        planes: Tensor | None = None
-        tiles = self.picture.tiles(self.margin, rows)
-        for start, part in in_order(lambda tile: (tile.start, self.seen(tile, 0).pixels), tiles, workers):
-            if planes is None:
-                planes = part.new_empty(*part.shape[:2], *self.size)
-            planes[:, :, start : start + part.shape[2]] = part
-        self.stored = planes
-
-    @property
-    def margin(self) -> int:
-        """Number of pixels around a pixel that are read to compute its guide."""
-        return 0 if self.stored is not None else self.guide.margin
-
-    def tile(self, start: int, stop: int, margin: int) -> Tile:
-        """Read a tile of the guide, as :meth:`Picture.tile`."""
-        return self.seen(super().tile(start, stop, margin + self.margin), margin)
-
-    def seen(self, tile: Tile, margin: int) -> Tile:
-        """The guide, with ``margin``, of a tile of the picture that has a margin large enough to compute it."""
-        stop = tile.start + tile.stored.shape[0]
-        halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
-        if self.stored is not None:
-            seen = self.stored[:, :, tile.start - halo[0] : stop + halo[1]]
-            return Tile(tile.start, lambda: seen, halo, tile.stored)
-        around = tuple(min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
-
-        def guide() -> Tensor:
-            rows = tile.pixels.shape[2]
-            image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]
-            return self.guide(image)[:, :, around[0] - halo[0] : image.shape[2] - around[1] + halo[1]]
-
-        return Tile(tile.start, guide, halo, tile.stored)
 
 
 def stored_as(values: Tensor, kind: str) -> NDArray[Any]:

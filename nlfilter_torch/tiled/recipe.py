@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.edits.applying import fit_step, scribbles_of
-from nlfilter_torch.edits.detail import blend_edited
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.changes import blend_edited
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
@@ -19,14 +18,14 @@ from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
 from nlfilter_torch.tiled.workers import single_threaded
 
 
-def edit_rows(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Rows:
+def edit_rows(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Rows:
     """Yield the rows (h, W, S) of the picture edited as by :meth:`Recipe.apply`, in order; see :func:`edit_tiling`."""
-    with edit_tiling(passes, source, recipe, name) as tiling:
+    with edit_tiling(passes, source, steps, name) as tiling:
         yield from tiling
 
 
 @contextmanager
-def edit_tiling(passes: Passes, source: RowSource, recipe: Recipe, name: str) -> Iterator[Tiling]:
+def edit_tiling(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Iterator[Tiling]:
     """Yield the rows of the picture edited as by :meth:`Recipe.apply`, not yet computed after the last step.
 
     ``name`` is that of the source, for error messages.
@@ -35,7 +34,7 @@ def edit_tiling(passes: Passes, source: RowSource, recipe: Recipe, name: str) ->
         ValueError: if a step needs the whole picture at once, or does not suit the picture.
         OSError: if a temporary file does not fit.
     """
-    steps = recipe.acting
+    steps = [step for step in steps if step.changes()]
     with ExitStack() as stack:
         for step in steps[:-1]:
             with step_tiling(step, replace(passes, kind="float32"), source, name) as tiling:
@@ -48,7 +47,7 @@ def edit_tiling(passes: Passes, source: RowSource, recipe: Recipe, name: str) ->
 
 @contextmanager
 def edit_regions(
-    passes: Passes, source: RowSource, recipes: Sequence[Recipe], masks: Sequence[RowSource], name: str
+    passes: Passes, source: RowSource, edits: Sequence[Sequence[Step]], masks: Sequence[RowSource], name: str
 ) -> Iterator[Tiling]:
     """The rows of the picture under one edit for each mask, whose rows are of a grey picture of the same size.
 
@@ -57,8 +56,8 @@ def edit_regions(
     """
     each, edited = replace(passes, kind="float32"), []
     with ExitStack() as stack:
-        for recipe in recipes:
-            with edit_tiling(each, source, recipe, name) as tiling:
+        for steps in edits:
+            with edit_tiling(each, source, steps, name) as tiling:
                 edited.append(Picture(stack.enter_context(passes.stored(tiling))))
         shares = [Picture(mask) for mask in masks]
 

@@ -1,4 +1,4 @@
-"""Sampling a picture that is read by rows.
+"""The guide of a picture that is read by rows, and samples of it.
 
 One pass over the picture yields the pilot: the kernel of its filter and an even sample of its pixels. A second sample,
 for the sums that define the filter, favours rare pixels and has no gaps.
@@ -7,15 +7,16 @@ for the sums that define the filter, favours rare pixels and has no gaps.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
+from nlfilter_torch.edits.source import Guide
 from nlfilter_torch.operator.balancing import balance
-from nlfilter_torch.operator.build import Construction, check_bandwidths
 from nlfilter_torch.operator.features import (
     GuideChannels,
     GuideFeatures,
@@ -25,10 +26,12 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense, stratified
-from nlfilter_torch.operator.nystrom import Completion, Kernel, inverse_cholesky
-from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Tile
+from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense
+from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.operator import Kernel
+from nlfilter_torch.operator.options import Construction, check_bandwidths
+from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.tiled.pictures import Picture, Tile
 from nlfilter_torch.tiled.statistics import Block, Pass
 from nlfilter_torch.tiled.workers import in_order, single_threaded
 
@@ -43,13 +46,62 @@ def in_silence(stage: str, done: int, rows: int) -> None:
     """Report nothing."""
 
 
-class ColumnCache:
-    """Cache of columns between passes, for the first pixels of a picture.
+class GuidePicture(Picture):
+    """The guide of a picture.
 
-    Args:
-        block_pixels: pixels in a block of a pass.
-        max_pixels: largest number of pixels to keep.
+    Attributes:
+        picture: whose guide this is.
+        guide: computes the guide from the picture.
+        stored: the whole guide (1, C, H, W), if kept in memory.
     """
+
+    def __init__(self, picture: Picture, guide: Guide) -> None:
+        super().__init__(picture.source, picture.name)
+        self.picture, self.guide = picture, guide
+        self.stored: Tensor | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The guide in another process, which computes it from the picture."""
+        return self.__dict__ | {"stored": None}
+
+    def store(self, rows: int, workers: int) -> None:
+        """Compute the whole guide in tiles of ``rows``, and keep it in memory for further passes."""
+        planes: Tensor | None = None
+        tiles = self.picture.tiles(self.margin, rows)
+        for start, part in in_order(lambda tile: (tile.start, self.seen(tile, 0).pixels), tiles, workers):
+            if planes is None:
+                planes = part.new_empty(*part.shape[:2], *self.size)
+            planes[:, :, start : start + part.shape[2]] = part
+        self.stored = planes
+
+    @property
+    def margin(self) -> int:
+        """Number of pixels around a pixel that are read to compute its guide."""
+        return 0 if self.stored is not None else self.guide.margin
+
+    def tile(self, start: int, stop: int, margin: int) -> Tile:
+        """Read a tile of the guide, as :meth:`Picture.tile`."""
+        return self.seen(super().tile(start, stop, margin + self.margin), margin)
+
+    def seen(self, tile: Tile, margin: int) -> Tile:
+        """The guide, with ``margin``, of a tile of the picture that has a margin large enough to compute it."""
+        stop = tile.start + tile.stored.shape[0]
+        halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
+        if self.stored is not None:
+            seen = self.stored[:, :, tile.start - halo[0] : stop + halo[1]]
+            return Tile(tile.start, lambda: seen, halo, tile.stored)
+        around = tuple(min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
+
+        def guide() -> Tensor:
+            rows = tile.pixels.shape[2]
+            image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]
+            return self.guide(image)[:, :, around[0] - halo[0] : image.shape[2] - around[1] + halo[1]]
+
+        return Tile(tile.start, guide, halo, tile.stored)
+
+
+class ColumnCache:
+    """Cache of columns between passes, in blocks of ``block_pixels``, for the first ``max_pixels`` of a picture."""
 
     def __init__(self, block_pixels: int, max_pixels: int) -> None:
         self.block_pixels, self.max_pixels = block_pixels, max_pixels

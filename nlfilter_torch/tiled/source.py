@@ -21,8 +21,8 @@ from nlfilter_torch.edits.source import Fitted, Guide, Kept, Planes, Source
 from nlfilter_torch.filtering.histogram import ends_of
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.tiled.pictures import GuidePicture, Picture, Rows, RowSource, Tile
-from nlfilter_torch.tiled.sampling import ColumnCache, take_pilot, visit
+from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
+from nlfilter_torch.tiled.sampling import ColumnCache, GuidePicture, take_pilot, visit
 from nlfilter_torch.tiled.scribbles import (
     check_scribble_memory,
     floats_per_scribbled_pixel,
@@ -37,13 +37,7 @@ FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: image
 
 
 class Tiled:
-    """A picture that is read in tiles, as the source of an edit.
-
-    Args:
-        picture: rows.
-        passes: tiling options.
-        strokes: name of the scribbles, for error messages.
-    """
+    """A picture that is read in tiles, as the source of an edit; errors call its scribbles ``strokes``."""
 
     batch = 1
     whole = False
@@ -339,9 +333,7 @@ class Tiled:
     def tiling(self, fitted: Fitted, *, plain: bool = False) -> Iterator[Tiling]:
         """Yield the rows of the edited picture, not yet computed; they can be computed within the block.
 
-        Args:
-            fitted: edit fitted to this source.
-            plain: whether rows are in the dtype of the computation, without transparency.
+        With ``plain`` they are in the dtype of the computation, without transparency.
         """
         passes = replace(self.plain, processes=None) if plain else self.passes  # for an edit that is being fitted
         landmarks = self.num_landmarks

@@ -23,9 +23,8 @@ from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
-from nlfilter_torch.operator.newton import LARGEST
-from nlfilter_torch.operator.operator import Columns
-from nlfilter_torch.operator.scaling import PixelScaling, scaling_from_moment
+from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.operator.scaling import LARGEST, PixelScaling, scaling_from_moment
 
 CONVERGED = {
     torch.float32: 1e-5,
@@ -197,12 +196,9 @@ class Guess:
 
 
 def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
-    """Compute the sums for the first ``order`` powers of W, in one pass.
+    """Compute the sums for the first ``order`` powers of W, in one pass over blocks of pixels.
 
-    Args:
-        blocks: the pass over blocks of pixels.
-        values: computes the planes y (1, C, n) to filter in a block, and its columns.
-        order: k, at least 1.
+    ``values`` computes the planes y (1, C, n) to filter in a block, and its columns.
     """
 
     def part(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:

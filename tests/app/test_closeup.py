@@ -15,7 +15,7 @@ from nlfilter_torch.app import closeup
 from nlfilter_torch.app.closeup import CELL, Closeup
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph

@@ -9,8 +9,7 @@ from PIL import Image
 
 from nlfilter_torch.app import controls, drawing
 from nlfilter_torch.app.panel import entries_of
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import PRESETS, Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from tests.problems import cat
@@ -51,7 +50,7 @@ def test_response_has_a_line_for_each_region_and_a_dot_for_each_eigenvalue() -> 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_those_of_the_command(name: str) -> None:
-    assert Step("detail", **entries_of(name)) == PRESETS[name].step
+    assert Recipe((Step("detail", **entries_of(name)),)) == PRESETS[name]
 
 
 @pytest.mark.parametrize(

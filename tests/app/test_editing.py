@@ -6,8 +6,7 @@ import pytest
 from playwright.sync_api import expect
 
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import find_recipe
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe, find_recipe
 from nlfilter_torch.io.photographs import read_photograph
 from tests.app.browser import Tab, difference
 from tests.problems import cat

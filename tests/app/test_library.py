@@ -8,7 +8,7 @@ import pytest
 from nlfilter_torch.app.library import Library
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import LINE, cat, difference
 

@@ -11,7 +11,7 @@ from nlfilter_torch.app.preview import PIXELS, Preview, reduce, sampled_operator
 from nlfilter_torch.app.session import Session
 from nlfilter_torch.edits.applying import apply_step, prepare, seeded
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import block_means, enlarged, resize
 from nlfilter_torch.edits.scribbles import Stroke, mask_of
 from nlfilter_torch.edits.steps import Step

@@ -14,8 +14,7 @@ import skimage.data
 import torch
 from playwright.sync_api import Browser, expect
 
-from nlfilter_torch.edits.presets import find_recipe
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe, find_recipe
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from tests.app.browser import TIMEOUT, Editor, Tab, difference

@@ -7,7 +7,7 @@ import skimage.data
 from PIL import Image
 
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.recipe import Recipe
+from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.scribbles import Stroke
 from nlfilter_torch.edits.steps import Step
 from tests.problems import LINE, difference

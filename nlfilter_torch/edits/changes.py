@@ -1,0 +1,76 @@
+"""Changes of detail: added detail and the rest, less of it in flat areas, and the changes of several regions."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.precision import per_image
+from nlfilter_torch.operator.features import blur, reduce_channels
+
+VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
+EPSILON = 1e-12
+
+
+def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:
+    """Sum added detail and the rest of the change, (B, 2 C, H, W), with less added detail where the image is flat.
+
+    Added detail is multiplied by ``v / (v + threshold^2)``, with v the activity (B, 1, H, W).
+    """
+    if not isinstance(threshold, Tensor) and threshold == 0:
+        return sum_of(changes)
+    added, rest = changes.chunk(2, dim=1)
+    least = per_image(threshold, activity, 4).square()
+    shares = torch.where(least == 0, 1.0, activity / (activity + least).clamp(min=EPSILON))
+    return added * shares + rest
+
+
+def activity(image: Tensor) -> Tensor:
+    """Local variance (B, 1, H, W) of the luminance of an image."""
+    grey = reduce_channels(image, "luminance").mean(1, keepdim=True)
+    mean, square = blur(torch.cat([grey, grey.square()], dim=1), VARIANCE_SIGMA).chunk(2, dim=1)
+    return (square - mean.square()).clamp(min=0)
+
+
+def sum_of(changes: Tensor) -> Tensor:
+    """Sum of added detail and the rest of the change, given as (B, 2 C, H, W)."""
+    added, rest = changes.chunk(2, dim=1)
+    return added + rest
+
+
+def split_sliders(sliders: Tensor) -> tuple[Tensor, Tensor]:
+    """Split sliders less 1 into those that amplify detail and the others, each with 0 in place of the rest."""
+    dim = 1 if sliders.ndim == 4 else sliders.ndim - 1
+    places = torch.arange(sliders.shape[dim], device=sliders.device)
+    is_detail = (places < sliders.shape[dim] - 1).view(-1, *[1] * (sliders.ndim - dim - 1))
+    zero = torch.zeros_like(sliders)
+    raised = (sliders > 0) & is_detail
+    return torch.where(raised, sliders, zero), torch.where(raised, zero, sliders)
+
+
+def change_of_mean(sliders: Tensor) -> Tensor | None:
+    """Relative change of the mean of a picture by sliders less 1, (K, k+1), one row for each part of the picture.
+
+    W preserves means, so only the last slider counts. Returns None, for no correction of the mean, if a part stays
+    unchanged or the last sliders differ.
+    """
+    last = sliders[:, -1]
+    return last[0] if bool((sliders != 0).any(1).all() & (last == last[0]).all()) else None
+
+
+def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
+    """Blend the changes of K regions and of the background, (B, (K + 1) S, H, W), by masks (B, K, H, W).
+
+    Where the masks sum to more than 1, they are divided by their sum.
+    """
+    shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
+    rest = (1 - shares.sum(1, keepdim=True)).clamp(min=0.0)
+    apart = changes.unflatten(1, (masks.shape[1] + 1, -1))
+    return (torch.cat([shares, rest], dim=1).unsqueeze(2) * apart).sum(1)
+
+
+def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tensor:
+    """The image (B, C, H, W), edited in K ways (B, C', H, W) where the masks (B, K, H, W) are 1."""
+    before = image.expand(-1, max(one.shape[1] for one in edited), -1, -1)
+    changes = [one - before for one in edited]
+    return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)

@@ -1,0 +1,84 @@
+"""Signals while modules are imported and while a file is written: the exit status, and no files left."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from nlfilter_torch.cli import main
+from tests.commands import small_photo
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    return small_photo(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "told"),
+    [(signal.SIGINT, 130, "nlfilter-torch: interrupted; no file is half written\n"), (signal.SIGTERM, 143, "")],
+)
+def test_signals_while_modules_are_imported(
+    photo: Path, tmp_path: Path, number: signal.Signals, status: int, told: str
+) -> None:
+    """Also if the imported module converts every exception into another one."""
+    (tmp_path / "torch.py").write_text(
+        f"import os, time\ntry:\n    os.kill(os.getpid(), {int(number)})\n    time.sleep(60)\n"
+        "except BaseException as error:\n    raise ImportError('no torch') from error\n"
+    )
+    program = (
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
+        "from nlfilter_torch.cli import main\n"
+        f"sys.path.insert(0, {str(tmp_path)!r})\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    command = [sys.executable, "-c", program, "detail", str(photo), str(tmp_path / "out.png")]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=50)
+    assert (finished.returncode, finished.stderr) == (status, told)
+
+
+@pytest.mark.parametrize("importing", [False, True])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_signals_while_a_file_is_written(
+    photo: Path,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+    status: int,
+    importing: bool,
+) -> None:
+    """Also while a module is imported that catches every exception."""
+    before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "catches_everything.py").write_text(
+        f"import os\ntry:\n    os.kill(os.getpid(), {int(number)})\nexcept BaseException:\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "catches_everything", raising=False)
+
+    def interrupted(*_: object) -> None:
+        assert len(list(tmp_path.glob(".*.part"))) == 1
+        if importing:
+            importlib.import_module("catches_everything")
+            time.sleep(60)
+            raise AssertionError("the signal was lost")
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr("nlfilter_torch.io.photographs.encode", interrupted)
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        assert main(["detail", str(photo), str(tmp_path / "out.png"), "--alpha", "1,1"]) == status
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        for name, handler in before.items():
+            signal.signal(name, handler)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.png"]
