@@ -135,7 +135,6 @@ class Training:
         self.model = new_denoiser(plain=plain, seed=seed, passes=passes).to(memory_format=torch.channels_last)
         if start is not None:
             self.model.load_state_dict(read_weights(start, shapes_of(self.model), ADDED))
-        self.model.again.requires_grad_(passes > 1)
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
         named = {name: weight for name, weight in self.model.named_parameters() if weight.requires_grad}
         bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []

@@ -86,6 +86,15 @@ def test_where_the_second_pass_diverges_the_first_result_is_kept(monkeypatch: py
         assert decibels(denoiser(image, 4 / 255), clean) < 20
 
 
+def test_every_weight_that_learns_gets_a_gradient() -> None:
+    """Without a gradient for one of them, DistributedDataParallel stops at the second step."""
+    for passes in (1, 2):
+        denoiser = NonlocalDenoiser(passes)
+        denoiser(torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(0)), 0.1).square().mean().backward()
+        assert all(w.grad is not None for w in denoiser.parameters() if w.requires_grad)
+        assert denoiser.again.weight.requires_grad == (passes > 1)
+
+
 def test_passes_are_counted() -> None:
     with pytest.raises(ValueError, match="passes must be at least 1, got 0"):
         NonlocalDenoiser(passes=0)

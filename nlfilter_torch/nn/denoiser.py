@@ -79,7 +79,7 @@ class NonlocalDenoiser(nn.Module):
         self.join = _convolution(WIDTH + 2 * PLANES, WIDTH)
         self.after = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in AFTER)
         self.last = _convolution(WIDTH, PLANES)
-        self.again = nn.Conv2d(WIDTH, WIDTH, 1)
+        self.again = nn.Conv2d(WIDTH, WIDTH, 1).requires_grad_(passes > 1)  # a single pass does not use it
         for weight in self.again.parameters():
             nn.init.zeros_(weight)  # every pass is like the first, until it is trained
 
