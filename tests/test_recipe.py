@@ -192,6 +192,13 @@ def test_files_hold_the_whole_edit() -> None:
     assert [step["edit"] for step in entries["steps"]] == ["detail", "colorize", "recolor", "defocus", "abstract"]
 
 
+def test_colours_may_be_written_in_capitals() -> None:
+    stroke = replace(BLUE, paint=BLUE.paint.upper())
+    assert torch.equal(paint([stroke], (9, 9))[0], paint([BLUE], (9, 9))[0])
+    recipe = Recipe((Step("recolor", (stroke,)),))
+    assert Recipe.from_json(recipe.to_json(), "edit.json") == recipe
+
+
 def test_files_from_before_there_was_a_list_of_steps() -> None:
     """Old files have a fixed order of steps, old names and units, and omit steps that change nothing."""
     strokes = [BLUE.entries()]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nlfilter_torch.edits.declaration import is_within, shown
 
-COLOUR = re.compile(r"#[0-9a-f]{6}")
+COLOUR = re.compile(r"#[0-9a-f]{6}", re.IGNORECASE)
 MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
 
 
