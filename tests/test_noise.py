@@ -50,6 +50,16 @@ def test_clipped_pixels_do_not_hide_noise() -> None:
     assert float(estimate_noise(noisy(clean, 0.08).clamp(0, 1))) == pytest.approx(0.08, rel=0.1)
 
 
+@pytest.mark.parametrize("level", [15, 30, 50])
+@pytest.mark.parametrize("name", ["astronaut", "coffee"])
+def test_noise_in_8_bits_is_measured_where_clipping_does_not_truncate_it(name: str, level: int) -> None:
+    """Both photographs have large dark areas; in 8 bits, 9 to 15 % of the noisy pixels are black or white."""
+    found = 255 * estimate_noise(
+        (noisy(picture(name, 160, 160, torch.float32), level / 255).clamp(0, 1) * 255).round() / 255
+    )
+    assert float(found) == pytest.approx(level, rel=0.1)
+
+
 def test_even_noise_has_one_level() -> None:
     noise = Noise.even(torch.tensor([0.1, 0.2]))
     torch.testing.assert_close(noise.level, torch.tensor([0.1, 0.2]))

@@ -18,6 +18,8 @@ NUM_WINDOWS = 6144
 FLAT_SHARE = 0.06  # share of the windows in which noise is measured: those with the smallest slopes
 BRIGHTNESS_GROUPS = 6  # groups of windows by brightness, for noise that depends on it
 MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
+CLIPPED_SHARE = 0.1  # share of clipped pixels above which the noise of a window counts as truncated
+TRUNCATED_SHARE = 0.5  # share of such windows above which a group does not count
 TEXTURE_RATIO = 1.1  # ratio to the expected variance above which a group is assumed to contain texture
 MIN_IMPROVEMENT = 0.15  # decrease of the squared relative errors that is required of a dependence on brightness
 MIN_FLOOR_RATIO = 0.02  # least ratio of the variance in the dark to the growth of variance up to white
@@ -61,8 +63,8 @@ def estimate_noise(image: Tensor) -> Tensor:
 
     Of many windows of 9x9 pixels, those whose local means have the smallest slopes are used. The estimate is their
     median response to Immerkaer's mask ("Fast Noise Variance Estimation", 1996), which is zero for anything linear in
-    rows or columns. It is robust to slopes and clipped pixels; texture that fills the whole picture biases it by one or
-    two grey levels.
+    rows or columns. It is robust to slopes, and to clipped pixels in parts of the image; texture that fills the whole
+    picture biases it by one or two grey levels.
 
     Args:
         image: (B, C, H, W).
@@ -95,11 +97,11 @@ def _measured(source: Source, channels: GuideChannels) -> Tensor:
     windows = _windows(source, channels)
     light = windows.mean((2, 3))
     response = _response(windows)
-    # Windows with clipped pixels come last, as clipping truncates their noise.
-    clipped = (windows == 0).logical_or(windows == 1).any(3).any(2)
-    slopes = torch.where(clipped, torch.inf, _slopes(windows))
+    # Clipping truncates the noise: windows with many clipped pixels come last.
+    truncated = (windows == 0).logical_or(windows == 1).to(light).mean((2, 3)) > CLIPPED_SHARE
+    slopes = torch.where(truncated, torch.inf, _slopes(windows))
     level, _ = _level(response, slopes, light)
-    brightness, variances = [], []
+    brightness, variances, counts = [], [], []
     for group in light.argsort(1).tensor_split(BRIGHTNESS_GROUPS, dim=1):
         if group.shape[1] == 0:
             continue  # fewer windows than groups
@@ -107,7 +109,10 @@ def _measured(source: Source, channels: GuideChannels) -> Tensor:
         found, mean_light = _level(response.gather(1, inside), slopes.gather(1, group), light.gather(1, group))
         brightness.append(mean_light)
         variances.append(found.square())
-    floor, gain = _fit_line(torch.stack(brightness, dim=1), torch.stack(variances, dim=1))
+        counts.append(truncated.gather(1, group).to(light).mean(1) <= TRUNCATED_SHARE)
+    counted = torch.stack(counts, dim=1)
+    counted |= ~counted.any(1, keepdim=True)
+    floor, gain = _fit_line(torch.stack(brightness, dim=1), torch.stack(variances, dim=1), counted.to(light))
     even = gain == 0
     return torch.stack([torch.where(even, level.square(), floor), gain, light.mean(1)])
 
@@ -157,14 +162,14 @@ def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Ten
     return found.flatten(1).median(1).values / MEDIAN, light.gather(1, least).mean(1)
 
 
-def _fit_line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Fit floor and gain (B,), not negative, to variances (B, K) over brightness (B, K).
+def _fit_line(light: Tensor, variance: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit floor and gain (B,), not negative, to variances (B, K) over brightness (B, K), with weights ``counted``.
 
     The gain is 0 unless it reduces the error enough. Texture only adds variance, so points above the line have less
     weight.
     """
     variance = variance.clamp(min=MIN_VARIANCE)
-    weight = torch.ones_like(variance)
+    weight = counted
     for _ in range(10):
         scale = weight / variance.square()
         ones, linear, square = scale.sum(1), (scale * light).sum(1), (scale * light.square()).sum(1)
@@ -177,7 +182,7 @@ def _fit_line(light: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
             torch.where(gain <= 0, 0.0, torch.where(floor <= 0, rising / square, gain)),
         )
         expected = floor[:, None] + gain[:, None] * light
-        weight = torch.where(variance > TEXTURE_RATIO * expected, 0.2, 1.0).to(variance)
+        weight = counted * torch.where(variance > TEXTURE_RATIO * expected, 0.2, 1.0).to(variance)
     even = (constant / ones)[:, None]
     errors = [((found - variance) / variance).square().mul(weight).sum(1) for found in (even, expected)]
     depends = errors[0] - errors[1] > MIN_IMPROVEMENT
