@@ -270,10 +270,13 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
             known = psnr(NonlocalDenoiser.trained()(noisy, deviation).detach(), image)
             line += f"{known:8.2f}{psnr(denoise(noisy), image):8.2f}"
         print(line)
-    print("\nestimated noise in grey levels, for true noise of 5, 15, 25 and 50")
+    print(
+        "\nestimated noise in grey levels, for true noise of 5, 15, 25 and 50; then of the same photographs in 8 bits"
+    )
     for number, (name, image) in enumerate(clean.items()):
-        found = [255 * float(estimate_noise(with_noise(image, level / 255, number))) for level in NOISE]
-        print(f"  {name:20}" + "".join(f"{value:8.2f}" for value in found))
+        noisy = [with_noise(image, level / 255, number) for level in NOISE]
+        rounded = [(one.clamp(0, 1) * 255).round() / 255 for one in noisy]
+        print(f"  {name:20}" + "".join(f"{255 * float(estimate_noise(one)):8.2f}" for one in noisy + rounded))
 
 
 def megapixel(level: float, *, quick: bool) -> None:
