@@ -39,18 +39,20 @@ def scribbles_of(
 
     ``colours`` and ``mask`` rasterise strokes to colours with their mask, and to a mask; by default to tensors.
     """
+
+    def painted(word: str, argument: str) -> dict[str, Any]:
+        """Return the argument for strokes that need not be there."""
+        found = mask(step.painted(word), size)
+        return {argument: found} if bool(found.any()) else {}
+
     if step.edit in ("recolor", "colorize"):
-        keep = mask(step.painted("keep"), size)
-        return colours(step.painted("colour"), size), {"keep": keep} if bool(keep.any()) else {}
+        return colours(step.painted("colour"), size), painted("keep", "keep")
     if step.edit == "defocus":
-        background = mask(step.painted("out"), size)
-        return (mask(step.painted("in"), size),), {"background": background} if bool(background.any()) else {}
+        return (mask(step.painted("in"), size),), painted("out", "background")
     if not step.has_region():
         return (), {}
-    outer = mask(step.painted("out"), size)
-    negative = {"negative": outer} if bool(outer.any()) else {}
     sliders = {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
-    return (mask(step.painted("in"), size),), sliders | negative
+    return (mask(step.painted("in"), size),), sliders | painted("out", "negative")
 
 
 def fit_step(
