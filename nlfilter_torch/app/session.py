@@ -257,21 +257,24 @@ class Session:
 
     def _fitted(self, recipe: Recipe, report: Report) -> Parts:
         """The parts of the photograph, with an edit fitted to the whole."""
-        if self.opened is None:
-            raise ValueError("open a photograph first; there is nothing to show")
-        self.opened.parts.fit(recipe.steps, self._passes(self.opened.photograph, report))
-        return self.opened.parts
+        opened = self._opened_to("show")
+        opened.parts.fit(recipe.steps, self._passes(opened.photograph, report))
+        return opened.parts
 
     def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
         """The edited pixels (1, C, H, W), as the command line computes them; None if that takes much memory."""
-        if self.opened is None:
-            raise ValueError("open a photograph first; there is nothing to edit")
-        pixels = self.opened.photograph.pixels
-        height, width = self.opened.photograph.size
+        opened = self._opened_to("edit")
+        height, width = opened.photograph.size
         if width * height * recipe.bytes_per_pixel > WHOLE:
             return None
-        check_memory(Path(self.opened.name), width, height, recipe.bytes_per_pixel)
-        return recipe.apply(pixels, partial(report, "Editing"))
+        check_memory(Path(opened.name), width, height, recipe.bytes_per_pixel)
+        return recipe.apply(opened.photograph.pixels, partial(report, "Editing"))
+
+    def _opened_to(self, purpose: str) -> Opened:
+        """The open photograph; raises ValueError, with what it was needed for, if there is none."""
+        if self.opened is None:
+            raise ValueError(f"open a photograph first; there is nothing to {purpose}")
+        return self.opened
 
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
         """Of an edit in parts at full size."""
@@ -291,15 +294,13 @@ class Session:
 
     def check_photograph(self, name: str) -> Path:
         """:meth:`target` of a name under which the photograph can be saved; raises ValueError for others."""
-        target = self.target(name)
-        if self.opened is None:
-            raise ValueError("open a photograph first; there is nothing to save")
-        if target.resolve() == self.opened.path:
+        target, opened = self.target(name), self._opened_to("save")
+        if target.resolve() == opened.path:
             raise ValueError(
                 f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
                 "applied again; choose another name"
             )
-        check_output(target, self.opened.photograph)
+        check_output(target, opened.photograph)
         return target
 
     def check_preset(self, name: str) -> Path:
@@ -327,15 +328,14 @@ class Session:
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
         """
-        target = self.check_photograph(name)
-        assert self.opened is not None  # for mypy
-        recipe, photograph = self.recipe, self.opened.photograph
+        target, opened = self.check_photograph(name), self._opened_to("save")
+        recipe, photograph = self.recipe, opened.photograph
         pixels = self._edited_at_once(recipe, report)
         if pixels is None:
             rows = photograph.pixels[0].permute(1, 2, 0).numpy()
             channels = 3 if recipe.gives_colour else rows.shape[2]
             pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-            for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, self.opened.name):
+            for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(photograph.with_pixels(pixels), target)
@@ -358,6 +358,5 @@ class Session:
 
     def load_preset(self, content: bytes, name: str) -> None:
         """Load the edit in the content of a file; raises ValueError if there is none, or no photograph is open."""
-        if self.opened is None:
-            raise ValueError("open a photograph first; there is nothing to edit")
+        self._opened_to("edit")
         self.load(Recipe.from_json(content, name))
