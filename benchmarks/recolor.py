@@ -30,13 +30,14 @@ from nlfilter_torch.edits.defocus import blur_kernel, convolve
 from nlfilter_torch.edits.matting import colours_beside
 from nlfilter_torch.edits.recolor import Recoloring
 from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.viewing import viewed_size
 
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint
 RADIUS = 0.03  # of the blur, as a share of the short side
 BESIDE = 0.06  # width of the area beside the object, as a share of the short side
 CHANGED = 2 / 255
-AREA_PIXELS = 130_000  # size to which photographs are reduced for smooth areas
+AREA_SIZE = 0.13  # megapixels to which photographs are reduced for smooth areas
 # Smooth areas: blur and distance to borders as shares of the short side, largest change of colour along that distance,
 # largest differences from the colour of the innermost pixel in lightness and in a* and b*, all in units of Lab, and
 # smallest share of the photograph.
@@ -118,12 +119,6 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     }
 
 
-def reduced(image: Tensor, pixels: int) -> Tensor:
-    """Reduce a photograph to at most that number of pixels."""
-    scale = min(1.0, (pixels / (image.shape[-2] * image.shape[-1])) ** 0.5)
-    return resize(image, (int(scale * image.shape[-2]), int(scale * image.shape[-1]))).clamp(0, 1)
-
-
 def smooth_area(image: Tensor) -> NDArray[np.bool_] | None:
     """Find the largest smooth area (H, W) of about one colour in a photograph (1, 3, H, W), if there is one."""
     lab = 100 * hundredths_of_lab(image)[0].permute(1, 2, 0).numpy()
@@ -194,8 +189,9 @@ def main(arguments: list[str] | None = None) -> None:
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})
     report("defocus, one scribble", [measure_defocus(s, 1, first + 10 * i) for i, s in scenes], {"kept": "kept"})
     report("defocus, two", [measure_defocus(s, 2, first + 10 * i) for i, s in scenes], {"kept": "kept, two"})
-    size = AREA_PIXELS // 16 if chosen.quick else AREA_PIXELS
-    images = (reduced(image, size) for _, image in sorted(chosen.images.items()))
+    size = AREA_SIZE / 16 if chosen.quick else AREA_SIZE
+    photographs = [image for _, image in sorted(chosen.images.items())]
+    images = (resize(image, viewed_size(image.shape[-2:], size)).clamp(0, 1) for image in photographs)
     smooth = [(image, area) for image in images if (area := smooth_area(image)) is not None]
     report("recolor, smooth areas", [measure_smooth(*s, i, first + i) for i, s in enumerate(smooth)], {})
 
