@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.edits.declaration import parse_json, shown
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, acting_steps
 
 if TYPE_CHECKING:
     import torch
@@ -46,7 +46,7 @@ class Recipe:
     @property
     def acting(self) -> tuple[Step, ...]:
         """The steps that have an effect."""
-        return tuple(step for step in self.steps if step.changes())
+        return acting_steps(self.steps)
 
     @property
     def drawn(self) -> "Recipe":

@@ -5,7 +5,7 @@ original. Does not import torch.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -174,6 +174,11 @@ class Step:
         if edit == "detail" and len(step.sliders_inside) != len(step["alpha"]):
             raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
         return step
+
+
+def acting_steps(steps: Iterable[Step]) -> tuple[Step, ...]:
+    """The steps that have an effect."""
+    return tuple(step for step in steps if step.changes())
 
 
 def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:

@@ -18,7 +18,7 @@ from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step, seeded
 from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, acting_steps
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.scaling import PixelScaling
@@ -228,8 +228,7 @@ def film_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
         )
         if step["spatial_bandwidth"] is None
         else step
-        for step in steps
-        if step.changes()
+        for step in acting_steps(steps)
     )
 
 

@@ -16,7 +16,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.edits.resizing import resized
 from nlfilter_torch.edits.source import Fitted
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, acting_steps
 from nlfilter_torch.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.tiled.pictures import LazyRows, Picture, RowSource
 from nlfilter_torch.tiled.sampling import ColumnCache, GuidePicture, Report, in_silence
@@ -168,7 +168,7 @@ class Parts:
         Raises:
             ValueError, MemoryError, OSError: as :func:`~nlfilter_torch.tiled.recipe.edit_rows`.
         """
-        steps, (statistics, known) = tuple(step for step in edit if step.changes()), self._known
+        steps, (statistics, known) = acting_steps(edit), self._known
         self._last = None
         same = 0
         while statistics == passes.statistics and steps[same : same + 1] == known[same : same + 1] != ():

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.edits.changes import blend_edited
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.steps import Step, acting_steps
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
 from nlfilter_torch.tiled.scribbles import colour_rows, mask_rows
@@ -34,7 +34,7 @@ def edit_tiling(passes: Passes, source: RowSource, steps: Sequence[Step], name: 
         ValueError: if a step needs the whole picture at once, or does not suit the picture.
         OSError: if a temporary file does not fit.
     """
-    steps = [step for step in steps if step.changes()]
+    steps = acting_steps(steps)
     with ExitStack() as stack:
         for step in steps[:-1]:
             with step_tiling(step, replace(passes, kind="float32"), source, name) as tiling:
