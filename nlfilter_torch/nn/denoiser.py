@@ -30,7 +30,7 @@ WIDTH, FEATURES, ORDER = 48, 20, 3  # channels of the network and of the guide; 
 BEFORE, AFTER = (1, 2, 3, 4), (3,)  # dilations before and after the filter; the receptive field of a pass is 33x33
 PASSES = 2
 PLANES, LEVELS = 3, 2  # colour planes, and noise levels for them
-PIXELS, ROUGH_PIXELS = 85, 170  # pixels per landmark, in the last pass and in those before it
+PIXELS, ROUGH_PIXELS = 85, 256  # pixels per landmark, in the last pass and in those before it
 BANDWIDTHS = (0.15, 12.0)  # initial bandwidths: of the guide, and in pixels
 FAINT = 1 / 255  # noise level below which filtering is reduced in proportion
 LARGEST, AROUND = 3.0, 8  # largest plausible correction, in noise levels, and the radius around others, in pixels
@@ -39,7 +39,7 @@ BRIGHTEST = 2.0  # images of larger magnitude, which do not occur in training, a
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
 BORDER = 8  # width in pixels of the border added to images, so that their own border does not affect results
-TILE_BATCH = 6  # tiles processed at once; more leave the cache of the processor
+TILE_BATCH = 4  # tiles processed at once; more leave the cache of the processor
 
 
 class NonlocalDenoiser(nn.Module):
@@ -127,8 +127,8 @@ class NonlocalDenoiser(nn.Module):
             return self(noisy.unsqueeze(0), each, turns=turns).squeeze(0)
         check_photograph(noisy, "noisy")
         dtype = self.log_bandwidths.dtype
-        levels = noise_map(noise, noisy).to(dtype)
         image = noisy.to(dtype)
+        levels = noise_map(noise, image)
         return as_given(image - self.estimate_in_tiles(image, levels, turns), noisy)
 
     def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Inner = EVERYWHERE) -> Tensor:
