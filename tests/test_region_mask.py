@@ -12,7 +12,8 @@ from nlfilter_torch.edits import mask as masks
 from nlfilter_torch.edits import matting
 from nlfilter_torch.edits.in_memory import InMemory, InMemoryOperator
 from nlfilter_torch.edits.resizing import enlarged
-from nlfilter_torch.edits.scribbled_colours import density, every_nth
+from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, every_nth
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import Picture
 from nlfilter_torch.tiled.source import Tiled
@@ -296,24 +297,39 @@ def test_thin_parts_of_the_same_colour_belong_to_an_object() -> None:
 
 def test_densities_are_sums_of_gaussians() -> None:
     places, points = noise(2, 3, 1, 700).squeeze(2), noise(2, 3, 1, 5, seed=1).squeeze(2)
-    weights = torch.tensor([[1.0, 0.0, 0.5, 2.0, 0.0], [0.0] * 5], dtype=torch.float64)
+    weights = torch.tensor([[[1.0, 0.0, 0.5, 2.0, 0.0]], [[0.0] * 5]], dtype=torch.float64)
     found = density(places, points, weights, torch.full((1, 1, 1), 0.3, dtype=torch.float64))
     squares = (places[:, :, :, None] - points[:, :, None]).square().mean(1)
-    wanted = (torch.exp(-squares[0] / 0.09) * weights[0]).sum(1) / weights[0].sum()
+    wanted = (torch.exp(-squares[0] / 0.09) * weights[0]).sum(1)
     torch.testing.assert_close(found[0, 0], wanted, atol=1e-12, rtol=0)
     assert (found[1] == 0).all()  # without weights there is nothing
 
 
+def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
+    sky, far, ground = torch.tensor([[0.3, 0.5, 0.8], [0.5, 0.65, 0.85], [0.3, 0.25, 0.1]]).double()
+    image = torch.stack([sky, far, ground]).mT.view(1, 3, 1, 3)
+    scribbles = Scribbles(torch.tensor([0]), torch.tensor([[[1.0], [0.0]]]).double(), image[..., 0])
+    frame, unlike = image.squeeze(2), torch.tensor([[[0.0, 1.0, 1.0]]]).double()
+
+    def likelihoods(likely: float) -> torch.Tensor:
+        by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
+        return colour_likelihood(image, scribbles, frame, unlike, by_regression, 0.08).flatten()
+
+    assert likelihoods(0.9)[:2].min() > 0.95
+    assert likelihoods(0.1)[1] < 0.05
+    assert likelihoods(0.9)[2] < 0.05
+
+
 def test_pixels_to_compare_do_not_depend_on_other_images() -> None:
     colours = noise(2, 3, 1, 50).squeeze(2)
-    weights = torch.zeros(2, 50, dtype=torch.float64)
-    weights[0, ::2], weights[1, 7:40] = 1.0, 0.5
+    weights = torch.zeros(2, 1, 50, dtype=torch.float64)
+    weights[0, :, ::2], weights[1, :, 7:40] = 1.0, 0.5
     together, kept = every_nth(colours, weights, 8)
     for k in range(2):
         alone, own = every_nth(colours[k : k + 1], weights[k : k + 1], 8)
-        assert 8 <= own.shape[1] <= 16
-        assert torch.equal(together[k][:, kept[k] > 0], alone[0])
-        assert torch.equal(kept[k][kept[k] > 0], own[0])
+        assert 8 <= own.shape[2] <= 16
+        assert torch.equal(together[k][:, kept[k, 0] > 0], alone[0])
+        assert torch.equal(kept[k][kept[k] > 0], own[0, 0])
 
 
 @pytest.mark.parametrize("step", [4, 2.5])

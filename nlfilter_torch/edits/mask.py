@@ -241,12 +241,13 @@ def fit_regions(
     frame, colours = operator.at(places), small.colours(places)
     rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
     for number, marked in enumerate(marks):
-        unlike = 1 - likeness(marked.image, marked.weights[:, 0], colours, bandwidth)
+        unlike = 1 - likeness(marked.image, marked.weights[:, :1], colours, bandwidth)
         likely = sharpened(_regression(small, operator, marked, frame, unlike, reach)(small))
+        compared = [unlike, likely.flatten(2)[:, :, places], bandwidth]
         by_colour = small.kept(
             ("likelihood", number),
-            [marked.image, marked.weights, unlike, bandwidth],
-            partial(colour_likelihood, small.image, marked, colours, unlike, bandwidth),
+            [marked.image, marked.weights, *compared],
+            partial(colour_likelihood, small.image, marked, colours, *compared),
         )
         rough.append(likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0))
     front, back = (torch.cat([marked.planes(small)[:, k : k + 1] for marked in marks], dim=1) for k in (0, 1))

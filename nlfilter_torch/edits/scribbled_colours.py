@@ -38,8 +38,8 @@ def frame_places(size: tuple[int, int]) -> Tensor:
 def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
     """Similarity (B, 1, k), in [0, 1], of other colours (B, C, k) to those of scribbled pixels, (B, C, n).
 
-    Position does not matter: the far end of a sky still counts as the same sky. Pixels of weight 0, of (B, n), do not
-    count. The bandwidth is that of the regression.
+    Position does not matter: the far end of a sky still counts as the same sky. Pixels whose weight, of (B, 1, n), is 0
+    do not count. The bandwidth is that of the regression.
     """
     some, counted = every_nth(scribbled, (weights.detach() > 0).to(others), NUM_COMPARED)
     scale = per_image(bandwidth, others, 3)
@@ -47,7 +47,7 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
 
 
 def colour_likelihood(
-    image: Tensor, marked: Scribbles, frame: Tensor, unlike: Tensor, bandwidth: float | Tensor
+    image: Tensor, marked: Scribbles, frame: Tensor, unlike: Tensor, likely: Tensor, bandwidth: float | Tensor
 ) -> Tensor:
     """Likelihood (B, 1, h, w), in [0, 1], that a pixel belongs to a region, by its own colour alone.
 
@@ -59,13 +59,18 @@ def colour_likelihood(
         marked: scribbles on the region and on its background.
         frame: colours (B, C, n) of the pixels along the borders of the picture.
         unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
+        likely: likelihood of these pixels by the regression, (B, 1, n). Where a region reaches the border of the
+            picture, they show which colours it has far from its scribbles, such as the other end of a sky.
         bandwidth: photometric bandwidth of the regression.
     """
     places = hundredths_of_lab(image).flatten(2)
-    scribbled = (every_nth(marked.image, weights, NUM_COLOURS) for weights in marked.weights.unbind(1))
-    chosen = [*scribbled, (frame, unlike.squeeze(1))]
     scale = BANDWIDTH_SHARE * per_image(bandwidth, image, 3)
-    inside, outside, around = (density(places, colours_in_lab(some), counted, scale) for some, counted in chosen)
+    scribbled = (every_nth(marked.image, weights, NUM_COLOURS) for weights in marked.weights.split(1, dim=1))
+    inside, outside = (density(places, colours_in_lab(some), shares, scale) for some, shares in scribbled)
+    shares = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
+    shares = shares / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
+    within, around = density(places, colours_in_lab(frame), shares, scale).split(1, dim=1)
+    inside = inside + within
     opposed = (marked.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
     outside = torch.where(opposed, (outside + around) / 2, around)
     return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
@@ -74,31 +79,31 @@ def colour_likelihood(
 def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
     """Every n-th pixel of positive weight, about ``number`` for each image, whatever the others in the batch have.
 
-    Takes colours (B, C, n) and weights (B, n). Returns colours (B, C, m) of the pixels chosen for any image, and their
-    weights (B, m), 0 for those of other images.
+    Takes colours (B, C, n) and weights (B, 1, n). Returns colours (B, C, m) of the pixels chosen for any image, and
+    their weights (B, 1, m), divided by their sum, and 0 for those of other images.
     """
     counted = weights.detach() > 0
-    place = counted.cumsum(1) - 1
-    counted = counted & (place % (counted.sum(1, keepdim=True) // number).clamp(min=1) == 0)
-    chosen = counted.any(0)
-    return colours[:, :, chosen], weights[:, chosen] * counted[:, chosen]
+    place = counted.cumsum(2) - 1
+    counted = counted & (place % (counted.sum(2, keepdim=True) // number).clamp(min=1) == 0)
+    chosen = counted.any(0).squeeze(0)
+    kept = weights[:, :, chosen] * counted[:, :, chosen]
+    return colours[:, :, chosen], kept / kept.sum(2, keepdim=True).clamp(min=EPSILON)
 
 
 def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) -> Tensor:
-    """Weighted mean (B, 1, k) of Gaussians around points (B, C, m), at places (B, C, k); 0 if all weights (B, m) are 0.
+    """Sums (B, J, k), at places (B, C, k), of Gaussians around points (B, C, m) with each of J weights (B, J, m).
 
     The Gaussian is ``exp(-d / bandwidth^2)``, with d the mean square over the channels.
     """
     places, points = (t / (bandwidth * math.sqrt(t.shape[1])) for t in (places, points))
     squares = points.square().sum(1, keepdim=True)
     left = torch.cat([2 * points, -torch.ones_like(squares), -squares], dim=1)  # (B, C+2, m)
-    shares = (weights / weights.sum(1, keepdim=True).clamp(min=EPSILON)).unsqueeze(2)
     found = []
     for block in pixel_blocks(places.shape[2], len(places), places.device):
         some = places[:, :, block]
         right = torch.cat([some, some.square().sum(1, keepdim=True), torch.ones_like(some[:, :1])], dim=1)
         exponents = right.mT @ left  # (B, k, m), minus the squared distances
-        found.append(exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ shares)
+        found.append(exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ weights.mT)
     return torch.cat(found, dim=1).mT
 
 
