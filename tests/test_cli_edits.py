@@ -317,3 +317,20 @@ def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         "recolor", "grey.png", "--region", "1,1,5,5:red"
     )
     assert not out.exists()
+
+
+@pytest.mark.usefixtures("tiled")
+def test_an_empty_picture_of_scribbles_is_refused_beside_rectangles(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, clear, black = (tmp_path / name for name in ("out.png", "clear.png", "black.png"))
+    Image.new("RGBA", (WIDTH, HEIGHT)).save(clear)
+    Image.new("L", (WIDTH, HEIGHT)).save(black)
+    for verb, *options in (
+        ("defocus", "--mask", black, "--region", "5,5,9,9"),
+        ("detail", "--mask", black, "--region", "5,5,9,9"),
+        ("mask", "--mask", black, "--region", "5,5,9,9"),
+        ("recolor", "--strokes", clear, "--region", "5,5,9,9:red"),
+    ):
+        said = refused(capsys, str(verb), photo, out, *options)
+        assert f"{options[1]} is {'black' if options[1] == black else 'transparent'} everywhere" in said

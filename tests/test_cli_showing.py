@@ -56,6 +56,18 @@ def test_points_outside(text: str) -> None:
         Rectangle.parse(text, "--region", (64, 96))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [["defocus", "--region", "20,20,20,20", "--background"], ["recolor", "--region", "20,20,20,20:blue", "--keep"]],
+)
+def test_background_under_the_scribbles_is_shown_as_absent(options: list[str], photo: Path, tmp_path: Path) -> None:
+    verb, *rest = options
+    out, shown = tmp_path / "out.png", [tmp_path / "covered.png", tmp_path / "alone.png"]
+    assert main([verb, str(photo), str(out), *rest, "24,24,5,5", "--show", str(shown[0])]) == 0
+    assert main([verb, str(photo), str(out), *rest[:-1], "--show", str(shown[1])]) == 0
+    assert (rgb(shown[0]) == rgb(shown[1])).all()
+
+
 def test_a_share_does_what_pixels_do(photo: Path, tmp_path: Path) -> None:
     one, other = tmp_path / "one.png", tmp_path / "other.png"
     assert main(["recolor", str(photo), str(one), "--region", "25%,50%,9,16:blue"]) == 0

@@ -40,6 +40,13 @@ def test_no_noise_changes_nothing() -> None:
     assert torch.equal(denoise(CAT, strength=0.0), CAT)
 
 
+def test_the_level_is_not_rounded_to_the_precision_of_the_image() -> None:
+    image = noisy(CAT[..., :64, :64], 0.0123).bfloat16()
+    wanted = TRAINED_ONE(image.float(), 0.0123).bfloat16()
+    assert torch.equal(TRAINED_ONE(image, 0.0123), wanted)
+    assert torch.equal(TRAINED_ONE(image, torch.full((1, 1, 64, 64), 0.0123)), wanted)
+
+
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 200), (97, 95), (98, 96), (150, 131)])
 def test_every_size(size: tuple[int, int]) -> None:
     image = noisy(torch.full((1, 1, *size), 0.5), 0.1)

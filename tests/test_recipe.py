@@ -110,6 +110,13 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
     assert torch.allclose(same, Recipe((whole,)).apply(pixels), atol=1e-5)
 
 
+@pytest.mark.parametrize("step", [DETAIL, COLORIZE, Step("defocus", (IN,))])
+def test_strokes_outside_the_picture_are_refused(step: Step, pixels: torch.Tensor) -> None:
+    beside = tuple(Stroke(((1.5, 1.5),), stroke.radius, stroke.paint) for stroke in step.strokes)
+    with pytest.raises(ValueError, match=f"strokes of {step.edit} must cover a pixel of the photograph, got none"):
+        Recipe((step.changed(strokes=beside),)).apply(pixels)
+
+
 def test_colours(pixels: torch.Tensor) -> None:
     strokes, painted = paint([BLUE], SIZE)
     grey = reduce_channels(pixels, "luminance")

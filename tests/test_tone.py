@@ -87,12 +87,17 @@ def test_detail_reaches_the_likes_of_a_region_only() -> None:
 
 def test_numbers_do_not_take_the_default_dtype() -> None:
     image = colour("coffee", 30, 40)
-    edits = (lambda: adjust_tone(image, contrast=1.4, num_landmarks=40), lambda: abstract(image, num_landmarks=40))
+    edits = (
+        lambda: adjust_tone(image, contrast=1.4, num_landmarks=40),
+        lambda: abstract(image, num_landmarks=40),
+        lambda: nonlocal_operator(image, num_landmarks=40) @ image,
+    )
     expected = [edit() for edit in edits]
-    torch.set_default_dtype(torch.bfloat16)
-    try:
-        found = [edit() for edit in edits]
-    finally:
-        torch.set_default_dtype(torch.float32)
-    for a, b in zip(found, expected, strict=True):
-        assert torch.equal(a, b)
+    for dtype in (torch.bfloat16, torch.float64):
+        torch.set_default_dtype(dtype)
+        try:
+            found = [edit() for edit in edits]
+        finally:
+            torch.set_default_dtype(torch.float32)
+        for a, b in zip(found, expected, strict=True):
+            assert torch.equal(a, b)

@@ -1,7 +1,7 @@
 """Where the edit of an open photograph is kept: a file beside it, in the form that ``apply`` takes.
 
-In ``photo.jpg.edit.json`` beside ``photo.jpg``; in a folder of this user's if that one is read-only, or if the browser
-sent the photograph and no file in the editor's folder is the same.
+In ``photo.jpg.edit.json`` beside ``photo.jpg``; in a folder of this user's if that one is read-only, if the name would
+be too long, or if the browser sent the photograph and no file in the editor's folder is the same.
 """
 
 import os
@@ -15,6 +15,7 @@ from nlfilter_torch.io.writing import open_beside
 
 ENDING = ".edit.json"
 UNREADABLE = ".unreadable"
+LONGEST_NAME = 255 - len(UNREADABLE)  # bytes; file systems allow 255
 
 
 def state_folder() -> Path:
@@ -43,9 +44,10 @@ class Sidecar:
         """That of a photograph: a file, or None for one whose content alone is known, by its digest."""
         if photograph is not None:
             beside = photograph.with_name(photograph.name + ENDING)
-            if beside.exists() or os.access(photograph.parent, os.W_OK):
+            short = len(os.fsencode(beside.name)) <= LONGEST_NAME
+            if short and (beside.exists() or os.access(photograph.parent, os.W_OK)):
                 return Sidecar(beside)
-        return Sidecar(state_folder() / f"{digest[:16]}-{name[-80:]}{ENDING}")
+        return Sidecar(state_folder() / f"{digest[:16]}-{os.fsencode(name)[-80:].decode(errors='ignore')}{ENDING}")
 
     def read(self) -> Recipe | None:
         """The edit that is kept, or None; a file that cannot be read is renamed, so that nothing in it is lost."""

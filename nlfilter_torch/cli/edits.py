@@ -250,7 +250,7 @@ def edit_photograph(
     from nlfilter_torch.edits.source import Source
     from nlfilter_torch.io.photographs import Photograph, check_type
     from nlfilter_torch.io.rows import StoredPicture, open_picture
-    from nlfilter_torch.tiled.pictures import Picture
+    from nlfilter_torch.tiled.pictures import Picture, stored_as
     from nlfilter_torch.tiled.source import Tiled
     from nlfilter_torch.tiled.tiles import Tiling
     from nlfilter_torch.tiled.workers import single_threaded
@@ -292,9 +292,8 @@ def edit_photograph(
                 showing.note_colours(source, photograph.size, rows_of)
             edited = apply_to(step, photograph.pixels, *marked, generator=seeded(seed))
             if noise is not None:
-                noise.add(
-                    squared_difference(*(pixels[0].permute(1, 2, 0).numpy() for pixels in (photograph.pixels, edited)))
-                )
+                kind = options.DEPTHS[depth] if depth else photograph.depth  # the difference of the files is reported
+                noise.add(squared_difference(stored_as(photograph.pixels, photograph.depth), stored_as(edited, kind)))
                 noise.tell()
             return edited
 

@@ -4,8 +4,9 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import check_depth
 from nlfilter_torch.io.rows import StoredPicture
-from nlfilter_torch.tiled.pictures import Picture, transparency
+from nlfilter_torch.tiled.pictures import LazyRows, Picture, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
 Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask
@@ -122,16 +123,21 @@ class Overlay(ABC):
             found[top:bottom, rectangle.columns, channels] = values
         return found
 
-    def at_once(self) -> Tensor:
-        """All rows, as planes (1, S, H, W).
-
-        Raises:
-            ValueError: if nothing is marked in the picture.
-        """
-        rows = slice(0, self.shape[0])
-        if self.picture is not None and not self._of_picture(rows, self.picture)[..., self.marked].any():
+    def checked(self) -> Self:
+        """Return this overlay; raise ValueError if nothing is marked in its picture."""
+        if self.picture is None:
+            return self
+        marks = LazyRows(self.shape[:2], partial(self._marks, picture=self.picture))
+        if not marks.any():
             raise ValueError(f"{self.picture.name} is {self.empty}")
-        return torch.from_numpy(self[rows]).permute(2, 0, 1)[None].contiguous()
+        return self
+
+    def _marks(self, rows: slice, picture: Picture) -> Floats:
+        return self._of_picture(rows, picture)[..., self.marked]
+
+    def at_once(self) -> Tensor:
+        """All rows, as planes (1, S, H, W)."""
+        return torch.from_numpy(self[slice(0, self.shape[0])]).permute(2, 0, 1)[None].contiguous()
 
 
 class Regions(Overlay):
@@ -210,7 +216,7 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
                 f"--region must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
             )
         rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
-    return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles)
+    return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles).checked()
 
 
 def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
@@ -221,7 +227,9 @@ def selection(size: Size, path: Path | None, texts: list[str] | None, option: st
         if rectangle.note is not None:
             raise ValueError(f"{option} must be X,Y,W,H only, got {text!r}; drop the colon and what follows it")
         rectangles.append((rectangle, slice(None), [1.0]))
-    return None if path is None and not rectangles else Regions((*size, 1), _picture(size, path, read), rectangles)
+    if path is None and not rectangles:
+        return None
+    return Regions((*size, 1), _picture(size, path, read), rectangles).checked()
 
 
 def _slider_regions(
@@ -242,7 +250,7 @@ def _slider_regions(
             )
         rectangles.append((rectangle, slice(len(sliders), len(sliders) + 1), [1.0]))
         sliders.append(own)
-    return Regions((*size, len(sliders)), _picture(size, path, read), rectangles), torch.stack(sliders)
+    return Regions((*size, len(sliders)), _picture(size, path, read), rectangles).checked(), torch.stack(sliders)
 
 
 def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = False) -> Picture | None:

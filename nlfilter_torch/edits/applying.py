@@ -33,26 +33,37 @@ def scribbles_of(
     step: Step,
     size: tuple[int, int],
     colours: Callable[[Sequence[Stroke], tuple[int, int]], tuple[Any, ...]] = paint,
-    mask: Callable[[Sequence[Stroke], tuple[int, int]], Any] = mask_of,
+    mask: Callable[..., Any] = mask_of,
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Convert the strokes of a step to the function's arguments after an image (H, W), positional and by keyword.
 
     ``colours`` and ``mask`` rasterise strokes to colours with their mask, and to a mask; by default to tensors.
+
+    Raises:
+        ValueError: if no pixel is under the strokes that mark the objects.
     """
 
-    def painted(word: str, argument: str) -> dict[str, Any]:
-        """Return the argument for strokes that need not be there."""
-        found = mask(step.painted(word), size)
+    def seen(planes: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Return the planes of strokes, the last of which, apart from None, is a mask."""
+        if not bool([plane for plane in planes if plane is not None][-1].any()):
+            raise ValueError(
+                f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them"
+            )
+        return planes
+
+    def others(word: str, argument: str) -> dict[str, Any]:
+        """Return the argument for strokes that need not be there, and that those on objects may cover."""
+        found = mask(step.painted(word), size, above=step.painted(step.declared.words[0]))
         return {argument: found} if bool(found.any()) else {}
 
     if step.edit in ("recolor", "colorize"):
-        return colours(step.painted("colour"), size), painted("keep", "keep")
+        return seen(colours(step.painted("colour"), size)), others("keep", "keep")
     if step.edit == "defocus":
-        return (mask(step.painted("in"), size),), painted("out", "background")
+        return seen((mask(step.painted("in"), size),)), others("out", "background")
     if not step.has_region():
         return (), {}
     sliders = {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
-    return (mask(step.painted("in"), size),), sliders | painted("out", "negative")
+    return seen((mask(step.painted("in"), size),)), sliders | others("out", "negative")
 
 
 def fit_step(

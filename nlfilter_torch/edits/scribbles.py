@@ -104,12 +104,18 @@ def _span(a: float, b: float, radius: float, first: int, last: int) -> tuple[int
     return max(first, int(min(a, b) - radius)), min(last, int(max(a, b) + radius) + 2)
 
 
-def mask_of(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> Tensor:
-    """Rasterise strokes to a mask (1, 1, H, W), float32, of zeros and ones; ``rows`` as in :func:`cover`."""
-    covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
-    for stroke in strokes:
-        covered |= cover(stroke, size, rows)
-    return covered[None, None].float()
+def mask_of(
+    strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None, *, above: Iterable[Stroke] = ()
+) -> Tensor:
+    """Rasterise strokes to a mask (1, 1, H, W), float32, of zeros and ones; ``rows`` as in :func:`cover`.
+
+    It is 0 where the strokes ``above`` cover them.
+    """
+    visible, hidden = torch.zeros(2, *_shape(size, rows), dtype=torch.bool)
+    for covered, some in ((visible, strokes), (hidden, above)):
+        for stroke in some:
+            covered |= cover(stroke, size, rows)
+    return (visible & ~hidden)[None, None].float()
 
 
 def paint(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> tuple[Tensor, Tensor]:

@@ -13,9 +13,9 @@ from nlfilter_torch.tiled.pictures import LazyRows, Picture, RowSource, stored_a
 ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
-def mask_rows(strokes: Sequence[Stroke], size: tuple[int, int]) -> LazyRows:
-    """The mask of strokes over a picture (H, W), rasterised as it is read: rows (H, W, 1) of zeros and ones."""
-    return LazyRows((*size, 1), lambda rows: stored_as(mask_of(strokes, size, rows), "float32"))
+def mask_rows(strokes: Sequence[Stroke], size: tuple[int, int], *, above: Sequence[Stroke] = ()) -> LazyRows:
+    """The mask of strokes over a picture (H, W), rasterised as it is read: rows (H, W, 1), see :func:`mask_of`."""
+    return LazyRows((*size, 1), lambda rows: stored_as(mask_of(strokes, size, rows, above=above), "float32"))
 
 
 def colour_rows(strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[LazyRows, None]:

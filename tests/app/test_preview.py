@@ -167,7 +167,7 @@ def test_the_filter_held_is_that_of_the_step_at_work(session: Session, monkeypat
 
 def test_strokes_beside_the_photograph_are_refused(session: Session) -> None:
     session.set("recolor", strokes=(Stroke(((1.8, 1.8),), 0.04, "#2040e0"),))
-    with pytest.raises(ValueError, match="stroke_mask must hold a painted pixel"):
+    with pytest.raises(ValueError, match="strokes of recolor must cover a pixel of the photograph"):
         session.render()
 
 

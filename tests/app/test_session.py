@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import skimage.data
+import torch
 from PIL import Image
 
 from nlfilter_torch.app.session import Session
@@ -72,6 +73,21 @@ def test_strokes(session: Session) -> None:
         session.add_stroke("abstract", LINE, 0.03, "in")
     with pytest.raises(ValueError, match="must be one of in, out, got 'red'"):
         session.add_stroke("defocus", LINE, 0.03, "red")
+
+
+def test_strokes_under_others_count_as_absent(session: Session) -> None:
+    session.add_stroke("detail", LINE, 0.06, "in")
+    session.set("detail", inside=(3.0, 3.0, 2.0, 1.0))
+    session.commit()
+    without, alone = session.render(), session.preview.mask(session.recipe.last("detail"))
+    session.add_stroke("detail", LINE, 0.03, "out")
+    mask = session.preview.mask(session.recipe.last("detail"))
+    assert mask is not None
+    assert alone is not None
+    assert torch.equal(mask, alone)
+    assert torch.equal(session.render(), without)
+    session.add_stroke("detail", LINE, 0.1, "out")  # reaches beyond the others
+    assert not torch.equal(session.render(), without)
 
 
 def test_the_first_region_begins_with_the_sliders_of_the_rest(session: Session) -> None:
