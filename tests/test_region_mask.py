@@ -12,7 +12,7 @@ from nlfilter_torch.edits import mask as masks
 from nlfilter_torch.edits import matting
 from nlfilter_torch.edits.in_memory import InMemory, InMemoryOperator
 from nlfilter_torch.edits.resizing import enlarged
-from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, every_nth
+from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, evenness, every_nth
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import Picture
@@ -303,6 +303,14 @@ def test_densities_are_sums_of_gaussians() -> None:
     wanted = (torch.exp(-squares[0] / 0.09) * weights[0]).sum(1)
     torch.testing.assert_close(found[0, 0], wanted, atol=1e-12, rtol=0)
     assert (found[1] == 0).all()  # without weights there is nothing
+
+
+def test_evenness() -> None:
+    flat = torch.full((1, 3, 40, 40), 0.4, dtype=torch.float64)
+    assert evenness(flat).min() > 0.99
+    slope = flat + 0.002 * torch.arange(40).double()  # half a grey level per pixel
+    assert evenness(slope)[..., 8:32].min() > 0.5
+    assert evenness(flat + 0.3 * noise(1, 1, 40, 40)).max() < 0.1
 
 
 def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:

@@ -373,7 +373,7 @@ def test_what_cannot_be_done_by_rows_leaves_nothing(photo: Path, capsys: pytest.
         ("recolor", "in.tif", (), "give --strokes FILE or --region"),
         ("recolor", "in.tif", ("--strokes", folder / "small.png"), "small.png must be as large as the photograph"),
         ("recolor", "in.tif", ("--strokes", folder / "opaque.png"), "opaque.png has no transparency"),
-        ("colorize", "in.tif", ("--strokes", folder / "clear.png"), "clear.png must hold a painted pixel, got none"),
+        ("colorize", "in.tif", ("--strokes", folder / "clear.png"), "clear.png is transparent everywhere"),
         ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H only"),
         ("colorize", "in.tif", ("--region", "1,2,5,4"), "--region must end in a colour"),
     ):

@@ -85,6 +85,18 @@ def test_detail_reaches_the_likes_of_a_region_only() -> None:
         enhance(image, torch.ones(2, 4), box(1, 1))
 
 
+@pytest.mark.parametrize("name", ["astronaut", "coffee"])
+def test_saturated_highlights_keep_their_chroma(name: str) -> None:
+    """Also if chroma gained elsewhere could make up for the loss."""
+    image = colour(name, 64, 96)
+    before = split_luminance(image)[1].norm(dim=1)
+    edits = ((adjust_tone(image, contrast=1.4), 0.03), (enhance(image, torch.tensor([3.0, 3.0, 3.0, 1.0])), 0.015))
+    for edited, limit in edits:
+        after = split_luminance(edited)[1].norm(dim=1)
+        assert (before - after).clamp(min=0).mean() < limit * before.mean()
+        assert after.mean() == pytest.approx(float(before.mean()), rel=0.01)
+
+
 def test_numbers_do_not_take_the_default_dtype() -> None:
     image = colour("coffee", 30, 40)
     edits = (

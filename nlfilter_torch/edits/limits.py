@@ -20,7 +20,7 @@ LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that r
 CHANNEL_WEIGHT = 0.25  # weight of the channel with the least headroom
 MAX_SATURATION_GAIN = 2.0  # limit of the relative growth of saturation, as a multiple of that of luminance
 MIN_LUMINANCE = 0.02  # lower limit of the luminance that the change of luminance is divided by
-MAX_CHROMA_LOSS = 0.01  # relative decrease of the mean chroma that is left when changes of luminance are restrained
+MAX_CHROMA_LOSS = 0.01  # share of the mean chroma that may be lost in some pixels and made up for in others
 MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
 EPSILON = 1e-9
 Limits = Literal["soft", "none"]
@@ -145,9 +145,9 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
     restraint: float | Tensor = 0.0
     curve = curve_of(restraint)
     lost, gained, chroma = chroma_of(restraint, curve)
-    allowed = gained + MAX_CHROMA_LOSS * chroma
+    allowed = MAX_CHROMA_LOSS * chroma
     if is_hidden(lost) or bool((lost > allowed).any()):
-        # With a constant curve, the loss is proportional to 1 - restraint, and the gain constant.
+        # With a constant curve, the loss is proportional to 1 - restraint.
         restraint = (1 - allowed / lost.clamp(min=EPSILON)).clamp(min=0.0)
         curve = curve_of(restraint)
         lost, gained, _ = chroma_of(restraint, curve)

@@ -23,7 +23,7 @@ from nlfilter_torch.edits.matting import LinearMasks, linear_mask, linear_models
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import block_means, enlarged
-from nlfilter_torch.edits.scribbled_colours import colour_likelihood, frame_places, likeness
+from nlfilter_torch.edits.scribbled_colours import colour_likelihood, evenness, frame_places, likeness
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source
@@ -239,11 +239,12 @@ def fit_regions(
     operator = small.operator(Guide(options, region_guide, MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
     frame, colours = operator.at(places), small.colours(places)
+    even = small.kept("evenness", [], lambda: evenness(small.image).flatten(2)[:, :, places])
     rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
     for number, marked in enumerate(marks):
         unlike = 1 - likeness(marked.image, marked.weights[:, :1], colours, bandwidth)
         likely = sharpened(_regression(small, operator, marked, frame, unlike, reach)(small))
-        compared = [unlike, likely.flatten(2)[:, :, places], bandwidth]
+        compared = [unlike, likely.flatten(2)[:, :, places] * even, bandwidth]
         by_colour = small.kept(
             ("likelihood", number),
             [marked.image, marked.weights, *compared],

@@ -13,12 +13,15 @@ from nlfilter_torch.core.blocks import pixel_blocks
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.edits.colour import hundredths_of_lab
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
+from nlfilter_torch.operator.features import blur
 
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
 SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
 NUM_COLOURS = 32  # approximate number of scribbled pixels on each side that the colours of all pixels are compared with
 BANDWIDTH_SHARE = 0.4  # bandwidth of that comparison as a share of the photometric bandwidth
+EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
+HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
 MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
 SMALLEST_EXPONENT = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
 EPSILON = 1e-6
@@ -46,6 +49,14 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
     return (density(colours_in_lab(others), colours_in_lab(some), counted, scale) / SIMILAR_SHARE).clamp(max=1.0)
 
 
+def evenness(image: Tensor) -> Tensor:
+    """Evenness of the colours around each pixel, (B, 1, H, W) in (0, 1]: 1 if all are equal, near 0 in texture."""
+    colours = hundredths_of_lab(image)
+    mean, squares = blur(torch.cat([colours, colours.square()], dim=1), EVEN_SIGMA).chunk(2, dim=1)
+    variance = (squares - mean.square()).clamp(min=0.0).mean(1, keepdim=True)
+    return 1 / (1 + variance / HALF_EVEN_DEVIATION**2)
+
+
 def colour_likelihood(
     image: Tensor, marked: Scribbles, frame: Tensor, unlike: Tensor, likely: Tensor, bandwidth: float | Tensor
 ) -> Tensor:
@@ -59,8 +70,9 @@ def colour_likelihood(
         marked: scribbles on the region and on its background.
         frame: colours (B, C, n) of the pixels along the borders of the picture.
         unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
-        likely: likelihood of these pixels by the regression, (B, 1, n). Where a region reaches the border of the
-            picture, they show which colours it has far from its scribbles, such as the other end of a sky.
+        likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
+            region, such as a sky, reaches the border of the picture, they show its colours far from its scribbles; in
+            textures, the regression is too often wrong for that.
         bandwidth: photometric bandwidth of the regression.
     """
     places = hundredths_of_lab(image).flatten(2)
