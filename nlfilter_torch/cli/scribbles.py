@@ -4,7 +4,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -125,15 +124,12 @@ class Overlay(ABC):
 
     def checked(self) -> Self:
         """Return this overlay; raise ValueError if nothing is marked in its picture."""
-        if self.picture is None:
+        picture = self.picture
+        if picture is None:
             return self
-        marks = LazyRows(self.shape[:2], partial(self._marks, picture=self.picture))
-        if not marks.any():
-            raise ValueError(f"{self.picture.name} is {self.empty}")
+        if not LazyRows(self.shape[:2], lambda rows: self._of_picture(rows, picture)[..., self.marked]).any():
+            raise ValueError(f"{picture.name} is {self.empty}")
         return self
-
-    def _marks(self, rows: slice, picture: Picture) -> Floats:
-        return self._of_picture(rows, picture)[..., self.marked]
 
     def at_once(self) -> Tensor:
         """All rows, as planes (1, S, H, W)."""

@@ -44,8 +44,8 @@ def scribbles_of(
     """
 
     def seen(planes: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the planes of strokes, the last of which, apart from None, is a mask."""
-        if not bool([plane for plane in planes if plane is not None][-1].any()):
+        """Return the planes of strokes, one of which is or has their mask."""
+        if not any(bool(plane.any()) for plane in planes if plane is not None):
             raise ValueError(
                 f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them"
             )
@@ -53,7 +53,10 @@ def scribbles_of(
 
     def others(word: str, argument: str) -> dict[str, Any]:
         """Return the argument for strokes that need not be there, and that those on objects may cover."""
-        found = mask(step.painted(word), size, above=step.painted(step.declared.words[0]))
+        strokes = step.painted(word)
+        if not strokes:
+            return {}
+        found = mask(strokes, size, above=step.painted(step.declared.words[0]))
         return {argument: found} if bool(found.any()) else {}
 
     if step.edit in ("recolor", "colorize"):

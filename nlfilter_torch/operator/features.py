@@ -115,9 +115,8 @@ class GuideFeatures:
         batch, channels, height, width = guide.shape
         weights = self.patch_weights.to(guide).div(channels)
         # The derivative of the root is infinite at 0, but that of squared distances is not.
-        scale = (weights + FAINT_WEIGHT * (weights == 0).to(weights)).sqrt() / per_image(
-            self.photometric_bandwidth, guide, 3
-        )
+        weights = weights + FAINT_WEIGHT * (weights == 0).to(weights)
+        scale = weights.sqrt() / per_image(self.photometric_bandwidth, guide, 3)
         padded = pad_border(guide, weights.shape[0] // 2)
         # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
         padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
