@@ -1,10 +1,10 @@
 """Colouring of a grey photograph from a few strokes of colour. Paper: Sec. V-B, Fig. 16.
 
-Three estimates of the chroma are averaged: the regression on the strokes relates similar pixels, however far apart; two
-:class:`LocalValues` relate pixels that are connected without an edge between them, with two notions of an edge. Their
-errors are in different places, so that the mean is better than each. An estimate counts less the farther it is from the
-other two, the more saturated it is, and the more its hue differs from that of the estimate by relative differences,
-whose worst errors are smaller than those of the others and which therefore counts a little more. The regression extends
+Three estimates of the chroma are averaged: the regression on the strokes relates pixels of similar brightness and
+texture, however far apart; two :class:`LocalValues` relate pixels that are connected without an edge between them, with
+two notions of an edge. Their errors are in different places, so that the mean is better than each. An estimate counts
+less the farther it is from the other two and the more saturated it is. The regression also counts less, the less the
+strokes nearby determine a pixel, since its errors are large where no stroke is on similar pixels nearby. It extends
 chroma relative to :func:`usual_chroma`, since shadows and highlights of an object have less than its midtones;
 propagation between neighbours, relative to its square root.
 """
@@ -28,6 +28,7 @@ from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
+from nlfilter_torch.edits.texture import TEXTURE_MARGIN, with_texture
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
 from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
@@ -44,27 +45,34 @@ class Stage:
     Attributes:
         spatial: factor of the spatial bandwidth.
         photometric: factor of the photometric bandwidth.
-        patch_size: largest width of the patches.
         reach: that of :func:`propagate_strokes`.
         smoothness: that of :func:`propagate_strokes`.
     """
 
     spatial: float
     photometric: float
-    patch_size: float
     reach: float
     smoothness: float
 
 
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on 64 more, with 6 to 60 random strokes.
-FAR, NEAR = Stage(1.0, 1.0, math.inf, 0.95, 0.7), Stage(2 / 9, 3.0, 3, 0.9, 0.7)
+FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
+# With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
+# channels of texture are then 0.
+GUIDE_SCALE = math.sqrt(5 / 2)
+TEXTURE_WEIGHT = 3.0
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 SAME_CHROMA = 0.003  # difference of estimates that hardly counts
-FAINT, GREY = 0.05, 0.02  # chroma below which estimates differ little in weight, and in hue
-OTHER_HUE = 0.1  # weight of an estimate of the opposite hue
-OUTLIER_POWER = 3  # of the distance from the other estimates, by which a weight is divided
-AROUND_FACTOR = 1.25  # of the weight of the estimate by relative differences
+FAINT = 0.12  # chroma below which estimates differ little in weight
+ALIKE_FACTOR = 1.65  # of the weight of the regression
+LEAST_SUPPORT = 0.02  # of a pixel by the strokes nearby
+
+
+def colorize_guide(image: Tensor) -> Tensor:
+    """Guide of the regression, (B, 5, H, W): brightness, that of the surroundings, and strength of the texture."""
+    brightness = reduce_channels(image, "luminance")
+    return GUIDE_SCALE * with_texture(brightness, brightness, TEXTURE_WEIGHT)
 
 
 @edit_of("grey", channels=1)
@@ -99,7 +107,8 @@ def colorize(
         strength: for the regression, in [0, 1]: at 1 every pixel is coloured, at 0 pixels similar to no stroke stay
             grey.
         time: for k-means, diffusion time t > 0 of the segments.
-        photometric_bandwidth: in units of the image; how much grey levels of one colour may differ.
+        photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
+            surroundings and texture, if they differ, count as further differences.
         spatial_bandwidth: in pixels; None is 0.5625 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
@@ -148,16 +157,15 @@ def colorize(
         viewed = source.resized(small)
         scribbles = blocks_of(scribbles, viewed, source.size, source.size[1] / small[1])
     pixels = small[0] * small[1]
-    options = {"num_landmarks": min(num_landmarks, pixels), "generator": generator}
+    options = {"patch_size": patch_size, "num_landmarks": min(num_landmarks, pixels), "generator": generator}
     nearness = COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small)
 
     def operator_of(stage: Stage) -> Operator:
         scaled = {
-            "patch_size": int(min(patch_size, stage.patch_size)),
             "photometric_bandwidth": stage.photometric * photometric_bandwidth,
             "spatial_bandwidth": stage.spatial * nearness,
         }
-        return viewed.operator(Guide(options | scaled, spectral=True))
+        return viewed.operator(Guide(options | scaled, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
 
     assert scribbles.colours is not None  # for mypy
     wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
@@ -170,9 +178,9 @@ def colorize(
     wanted = wanted[:, ::2]  # green follows from red and blue
 
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
-    # Squared, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
+    # Cubed, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
     # size of the picture.
-    marks = [scribbles.places, scribbles.weights.square(), wanted / usual_there.sqrt()]
+    marks = [scribbles.places, scribbles.weights**3, wanted / usual_there.sqrt()]
 
     def propagated(links: Links) -> Callable[[Any, Tensor], Tensor]:
         step = links.step(small)
@@ -186,7 +194,8 @@ def colorize(
         return interpolated
 
     absolute, relative = propagated(ABSOLUTE), propagated(RELATIVE)
-    wanted = wanted / usual_there
+    # Ones are extended along with the chroma, and tell how far the strokes determine a pixel.
+    wanted = torch.cat([wanted / usual_there, torch.ones_like(wanted[:, :1])], dim=1)
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
@@ -199,7 +208,8 @@ def colorize(
             reach=stage.reach,
             smoothness=stage.smoothness,
         )
-        wanted = wanted - torch.cat([fitted(block) for block in columns()], dim=2)
+        explained = torch.cat([fitted(block) for block in columns()], dim=2)
+        wanted = torch.cat([wanted[:, :2] - explained[:, :2], wanted[:, 2:]], dim=1)
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
         del operator  # frees its factor before the next one is computed
     far, near = parts
@@ -210,10 +220,12 @@ def colorize(
         usual = usual_chroma(own)
         connected, influence = absolute(some, own).tensor_split([2], dim=1)
         around = relative(some, own)[:, :2]
-        alike = (far(some) + near(some)) * usual
+        residual, support = near(some).tensor_split([2], dim=1)
+        alike = (far(some)[:, :2] + residual) * usual
         around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
-        return weighted_mean(alike, connected, around, influence)
+        factors = ALIKE_FACTOR * (support.clamp(min=0.0) + LEAST_SUPPORT).square(), influence.square(), 1.0
+        return weighted_mean((alike, connected, around), factors)
 
     return _coloured(source, viewed, chroma_of)
 
@@ -224,31 +236,22 @@ def usual_chroma(image: Tensor) -> Tensor:
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
 
 
-def weighted_mean(alike: Tensor, connected: Tensor, around: Tensor, influence: Tensor) -> Tensor:
+def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float | Tensor, ...]) -> Tensor:
     """Average three estimates (B, 2, H, W).
 
-    The weight of each falls with its distance from the other two, with its saturation, and with the difference of its
-    hue from that of ``around``.
-
-    Args:
-        alike: estimate by similarity.
-        connected: estimate by absolute differences of neighbours.
-        around: estimate by relative differences of neighbours.
-        influence: of the scribbles on ``connected``, (B, 1, H, W).
+    The weight of each is its factor, (B, 1, H, W) or a number, divided by its saturation and by the sum of its squared
+    distances from the other two.
     """
+    alike, connected, around = estimates
     first, second, third = (
         (one - other).square().sum(1, keepdim=True)
         for one, other in ((alike, connected), (connected, around), (around, alike))
     )
-    distances = (first + third, first + second, second + third)  # squared, from both others
-    own = around.square().sum(1, keepdim=True) + GREY**2
-    factors: tuple[float | Tensor, ...] = (1.0, influence, AROUND_FACTOR)
+    distances = (first + third, first + second, second + third)
     total, weights = around.new_zeros(()), around.new_zeros(())
-    for estimate, factor, distance in zip((alike, connected, around), factors, distances, strict=True):
+    for estimate, factor, distance in zip(estimates, factors, distances, strict=True):
         squared = estimate.square().sum(1, keepdim=True)
-        cosine = ((estimate * around).sum(1, keepdim=True) + GREY**2) * ((squared + GREY**2) * own).rsqrt()
-        hue = (1 + cosine) / 2 + OTHER_HUE
-        share = factor * hue * (squared + FAINT**2).rsqrt() * (distance + SAME_CHROMA**2).rsqrt() ** OUTLIER_POWER
+        share = factor * (squared + FAINT**2).rsqrt() / (distance + SAME_CHROMA**2)
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 

@@ -27,15 +27,14 @@ from nlfilter_torch.edits.scribbled_colours import colour_likelihood, evenness, 
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source
+from nlfilter_torch.edits.texture import TEXTURE_MARGIN, with_texture
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.scribbles import fit_strokes
-from nlfilter_torch.operator.features import blur, blur_margin, pad_border
+from nlfilter_torch.operator.features import blur
 
 SOLVED = 1 << 17  # pixels
 VIEWED = VIEWING_SIZE.default  # megapixels; larger pictures are first reduced to this size
 CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
-# Gaussians, in pixels: surrounding colour, grain, average of its strength.
-SURROUND_SIGMA, GRAIN_SIGMA, TEXTURE_SIGMA = 2.0, 1.5, 3.0
 TEXTURE_WEIGHT = 1.5
 NUM_CHANNELS = 9  # channels of the guide
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
@@ -50,19 +49,11 @@ ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too 
 EPSILON = 1e-6
 
 
-MARGIN = max(blur_margin(SURROUND_SIGMA), blur_margin(GRAIN_SIGMA) + blur_margin(TEXTURE_SIGMA))
-
-
 def region_guide(image: Tensor) -> Tensor:
-    """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of grain and of both gradients."""
+    """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of the texture."""
     lab = hundredths_of_lab(image)
-    lightness = lab[:, :1]
     colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
-    padded = pad_border(lightness, 1)
-    rows, columns = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    grain = torch.cat([lightness - blur(lightness, GRAIN_SIGMA), rows / 2, columns / 2], dim=1)
-    strength = (blur(grain.square(), TEXTURE_SIGMA) + 1e-8).sqrt()  # the derivative of the root is finite
-    return torch.cat([colours, blur(colours, SURROUND_SIGMA), TEXTURE_WEIGHT * strength], dim=1)
+    return with_texture(colours, lab[:, :1], TEXTURE_WEIGHT)
 
 
 @edit_of("image")
@@ -236,7 +227,7 @@ def fit_regions(
             check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
             spatial_bandwidth = spatial_bandwidth / step
         options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
-    operator = small.operator(Guide(options, region_guide, MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
+    operator = small.operator(Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
     frame, colours = operator.at(places), small.colours(places)
     even = small.kept("evenness", [], lambda: evenness(small.image).flatten(2)[:, :, places])
