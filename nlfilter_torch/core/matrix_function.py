@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
-from nlfilter_torch.core.autograd import once_differentiable
-from nlfilter_torch.core.precision import uncompiled
+from nlfilter_torch.core.precision import once_differentiable, uncompiled
 from nlfilter_torch.core.values import are_derived
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
