@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import large_empty
 from nlfilter_torch.core.checks import (
     LARGEST_PATCH,
     check_choice,
@@ -22,6 +21,7 @@ from nlfilter_torch.core.checks import (
     check_tensor,
 )
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
+from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.values import is_hidden
 
