@@ -11,9 +11,9 @@ from nlfilter_torch.core.checks import check_image, check_order, check_photograp
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.alignment import inside_frame
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.look_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.look_pixels import EditedPhotograph, SomePixels
 from nlfilter_torch.edits.presets import Recipe
+from nlfilter_torch.edits.shared_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.filtering.fit import fit_layers
 from nlfilter_torch.filtering.look import NAMES
