@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.affinity import SMALLEST_EXPONENT
+from nlfilter_torch.core.kernels.columns import SMALLEST_EXPONENT
 from nlfilter_torch.operator.features import GuideFeatures, patch_window
 from nlfilter_torch.operator.landmarks import choose_landmarks
 from nlfilter_torch.operator.nystrom import JITTER

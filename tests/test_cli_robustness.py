@@ -144,7 +144,7 @@ def test_values_in_messages_are_short() -> None:
 def test_commands_that_need_no_filter_import_none(arguments: list[str]) -> None:
     program = (
         "import sys\n"
-        "from nlfilter_torch.cli import main\n"
+        "from nlfilter_torch.__main__ import main\n"
         "main(sys.argv[1:])\n"
         f"print('imported:', *sorted(set(sys.modules) & set({HEAVY})))\n"
     )

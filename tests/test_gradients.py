@@ -18,8 +18,8 @@ from nlfilter_torch import (
     polynomial_response,
     spectral_filter,
 )
-from nlfilter_torch.core.autograd import OuterProduct
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.core.precision import OuterProduct
 from nlfilter_torch.filtering.scribbles import propagate_strokes
 from nlfilter_torch.operator.features import patch_window
 from tests.images import hard_images

@@ -9,8 +9,8 @@ from PIL import Image
 
 from nlfilter_torch import region_mask
 from nlfilter_torch.cli import main
-from nlfilter_torch.edits.applying import seeded
 from nlfilter_torch.edits.parameters import MASK
+from nlfilter_torch.edits.source import seeded
 from tests.problems import box, colour
 
 SIZE = (64, 80)

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core import instruction_sets
-from nlfilter_torch.core.autograd import OuterProduct
 from nlfilter_torch.core.communicator import ALONE
 from nlfilter_torch.core.kernels import definitions_only, library
 from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.precision import OuterProduct
 from nlfilter_torch.operator import landmarks
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from nlfilter_torch.operator.scaling import KernelMatrix, _sweep, weighted_moment

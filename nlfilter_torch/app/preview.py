@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of, seeded
+from nlfilter_torch.edits.applying import filter_key, prepare, scribbles_of
 from nlfilter_torch.edits.changes import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.edits.declaration import Edit
 from nlfilter_torch.edits.in_memory import InMemory
@@ -29,6 +29,7 @@ from nlfilter_torch.edits.pixels import Fitted, Pixels, part_of
 from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
+from nlfilter_torch.edits.source import seeded
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import MEGAPIXEL, viewed_size, within_limits
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers

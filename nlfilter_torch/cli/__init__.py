@@ -4,17 +4,23 @@ Invalid input of any kind is reported in one sentence on standard error, with ex
 """
 
 import sys
+from collections.abc import Callable, Iterable
 
 from nlfilter_torch.cli import interrupts
 
+Commands = Callable[[], Iterable[Callable[..., None]]]
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status."""
+
+def main(arguments: list[str] | None = None, others: Commands = tuple) -> int:
+    """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status.
+
+    ``others`` imports and returns commands besides those of this package.
+    """
     try:
         with interrupts.handled():
             from nlfilter_torch.cli.application import run
 
-            return run(arguments)
+            return run(arguments, others())
     except KeyboardInterrupt:
         return interrupts.tell()
     except interrupts.Ended as ended:

@@ -5,13 +5,13 @@ import math
 import reprlib
 import sys
 import warnings
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
 from nlfilter_torch import __version__
-from nlfilter_torch.cli.app import app as app_verb
 from nlfilter_torch.cli.apply import apply
 from nlfilter_torch.cli.batch import batch
 from nlfilter_torch.cli.demo import demo
@@ -56,22 +56,12 @@ def _check_finite(option: str, value: Any) -> None:
         raise ValueError(f"{option} must be a finite number, such as 1, got {value}")
 
 
-app = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
-app.command(name="app", cls=Verb)(app_verb)
-for _edit in EDITS.values():
-    app.command(name=_edit.name, cls=Verb)(command(_edit))
-app.command(name="mask", cls=Verb)(mask)
-for _verb in (apply, fit, presets, batch, frames, inspect, demo):
-    app.command(cls=Verb)(_verb)
-
-
 def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"{NAME} {__version__}, kernels in C: {NAMES[level(load_library())]}")
         raise typer.Exit
 
 
-@app.callback()
 def _common(
     version: Annotated[
         bool,
@@ -90,13 +80,26 @@ def _common(
     """
 
 
-def run(arguments: list[str] | None = None) -> int:
+def assembled(others: Iterable[Callable[..., None]]) -> typer.Typer:
+    """The command line, with other commands before its own."""
+    whole = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+    whole.callback()(_common)
+    for verb in others:
+        whole.command(cls=Verb)(verb)
+    for edit in EDITS.values():
+        whole.command(name=edit.name, cls=Verb)(command(edit))
+    for verb in (mask, apply, fit, presets, batch, frames, inspect, demo):
+        whole.command(cls=Verb)(verb)
+    return whole
+
+
+def run(arguments: list[str] | None, others: Iterable[Callable[..., None]]) -> int:
     """Run the command line and return its exit status: 2 after one sentence for invalid input, 130 for Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         try:
-            status = app(args=arguments or ["--help"], prog_name=NAME, standalone_mode=False)
+            status = assembled(others)(args=arguments or ["--help"], prog_name=NAME, standalone_mode=False)
         except typer.TyperException as error:  # a wrong option or argument
             message = error.format_message()
             if message.startswith("No such option: --preset"):

@@ -244,10 +244,10 @@ def edit_photograph(
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.editing import Job
     from nlfilter_torch.cli.noise import MAP_DEPTH, NoiseReport, squared_difference, write_map
-    from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step, seeded
+    from nlfilter_torch.edits.applying import apply_to, check_channels, fit_step
     from nlfilter_torch.edits.in_memory import InMemory
     from nlfilter_torch.edits.noise import Noise, noise_of
-    from nlfilter_torch.edits.source import Source
+    from nlfilter_torch.edits.source import Source, seeded
     from nlfilter_torch.io.photographs import Photograph, check_type
     from nlfilter_torch.io.rows import StoredPicture, open_picture
     from nlfilter_torch.tiled.pictures import Picture, stored_as

@@ -85,7 +85,7 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 
 def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
     """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
-    from nlfilter_torch.edits.applying import seeded
+    from nlfilter_torch.edits.source import seeded
     from nlfilter_torch.operator.build import nonlocal_operator
 
     parameters = step.filter_options((guide.shape[-2], guide.shape[-1]))

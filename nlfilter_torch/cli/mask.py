@@ -49,8 +49,8 @@ def mask(
     """See :data:`MASK`."""
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.progress import stages, steps
-    from nlfilter_torch.edits.applying import seeded
     from nlfilter_torch.edits.mask import region_mask
+    from nlfilter_torch.edits.source import seeded
     from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from nlfilter_torch.cli.options import note
 from nlfilter_torch.cli.scribbles import Overlay, Strokes
-from nlfilter_torch.edits.applying import seeded
 from nlfilter_torch.edits.colour import hundredths_of_lab
 from nlfilter_torch.edits.defocus import REACH
 from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.presets import Recipe
+from nlfilter_torch.edits.source import seeded
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]

@@ -1,13 +1,9 @@
 """Planes of pixels: blocks that fit the cache, batches folded into channels, weights, and a stratified sample."""
 
-import math
 from collections.abc import Iterator
 
-import numpy as np
 import torch
 from torch import Tensor
-
-from nlfilter_torch.core.values import is_hidden
 
 # Pixels in a block, per core. A block of affinities is M x CACHED floats, 0.8 MB for M = 100, and stays in the cache of
 # its core until it is multiplied by the inverse Cholesky factor. Rows of 2048 floats would map to the same few cache
@@ -17,20 +13,6 @@ CACHED = 2032
 SWEPT = 16400
 # Accelerators need long blocks; this length limits intermediate results to about 1 GB for M = 100.
 ACCELERATED = 1 << 21
-LINE = 16  # numbers: one cache line in float32, two in float64
-
-
-def large_empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
-    """Uninitialised tensor in the dtype and on the device of ``like``, in memory whose first write is fast.
-
-    On Linux, numpy requests huge pages and torch does not: the first write of 400 MB takes 50 ms instead of 200. The
-    tensor is aligned to a cache line, so that whole lines can be written without being read first.
-    """
-    if is_hidden(like) or like.dtype not in (torch.float32, torch.float64):
-        return like.new_empty(shape)
-    numbers = np.empty(math.prod(shape) + LINE, np.float64 if like.dtype == torch.float64 else np.float32)
-    start = -(numbers.ctypes.data // numbers.itemsize) % LINE
-    return torch.from_numpy(numbers[start : start + math.prod(shape)].reshape(shape))
 
 
 def cores() -> int:

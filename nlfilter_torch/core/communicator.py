@@ -21,7 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from nlfilter_torch.core.autograd import Gradients, once_differentiable
+from nlfilter_torch.core.precision import Gradients, once_differentiable
 
 ANSWERING = timedelta(seconds=10)  # for the remaining ranks to say that they are alive
 

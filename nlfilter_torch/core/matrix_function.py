@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
-from nlfilter_torch.core.autograd import once_differentiable
-from nlfilter_torch.core.precision import uncompiled
-from nlfilter_torch.core.values import are_derived
+from nlfilter_torch.core.kernels.library import are_derived
+from nlfilter_torch.core.precision import once_differentiable, uncompiled
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
 # and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,

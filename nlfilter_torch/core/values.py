@@ -5,9 +5,9 @@ without data: on the device "meta", as fake tensors, under ``torch.compile`` and
 of values are skipped, and iterations run a fixed number of steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache, wraps
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -54,17 +54,6 @@ def is_fake(tensor: Tensor) -> bool:
 def _fakes() -> bool:
     """Whether fake tensor mode is active."""
     return torch._C._get_dispatch_mode(_FAKE) is not None
-
-
-def are_derived(arguments: Sequence[Any]) -> bool:
-    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
-    if torch.is_grad_enabled():
-        for argument in arguments:  # before every product; a loop takes half the time of a generator
-            if isinstance(argument, Tensor) and argument.requires_grad:
-                return True
-    if forward_ad._current_level < 0:
-        return False
-    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
 
 def refuse_transforms(name: str, *values: object) -> None:

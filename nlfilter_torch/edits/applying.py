@@ -13,14 +13,9 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.edits.in_memory import InMemory, edited
 from nlfilter_torch.edits.scribbles import Stroke, mask_of, paint
 from nlfilter_torch.edits.shared_parameters import FILTER
-from nlfilter_torch.edits.source import Fitted, Source
+from nlfilter_torch.edits.source import Fitted, Source, seeded
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    """Return a generator with the seed; 0 is the seed of the command line."""
-    return torch.Generator().manual_seed(seed)
 
 
 def check_channels(edit: str, channels: int) -> None:

@@ -11,10 +11,9 @@ from nlfilter_torch.core.checks import check_image, check_order, check_photograp
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.edits.alignment import inside_frame
 from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.look_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.edits.look_pixels import EditedPhotograph, SomePixels
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.edits.shared_parameters import KNOTS, SATURATIONS, STRAIGHT
+from nlfilter_torch.edits.steps import Step, json_of
 from nlfilter_torch.filtering.fit import fit_layers
 from nlfilter_torch.filtering.look import NAMES
 from nlfilter_torch.filtering.look_fit import (
@@ -78,7 +77,7 @@ class FittedLook:
 
     def to_json(self) -> str:
         """A file for ``nlfilter-torch apply``: a recipe of one step."""
-        return Recipe((self.step,)).to_json(complete=True)
+        return json_of([self.step], complete=True)
 
 
 @torch.no_grad()

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.edits.in_memory import edit_of
-from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.pixels import corner
+from nlfilter_torch.edits.shared_parameters import LOOK
 from nlfilter_torch.edits.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.edits.synthesis import polynomial
 from nlfilter_torch.edits.viewing import fit_change

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.edits.alignment import inside_frame
-from nlfilter_torch.edits.applying import seeded
 from nlfilter_torch.edits.resizing import resize
+from nlfilter_torch.edits.source import seeded
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import viewed_size
 from nlfilter_torch.filtering.filters import detail_layers

@@ -6,9 +6,9 @@
 from dataclasses import replace
 
 from nlfilter_torch.edits.declaration import FILTER_PANEL, GAINS, Edit, Parameter, Slider
-from nlfilter_torch.edits.look_parameters import LOOK
 from nlfilter_torch.edits.shared_parameters import (
     LIMITS,
+    LOOK,
     REACH,
     REACH_SLIDER,
     TOLERANCE,

@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.edits.declaration import parse_json, shown
 from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.steps import Step, acting_steps
+from nlfilter_torch.edits.steps import VERSION, Step, acting_steps, json_of
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-VERSION = 1
 ORDER = tuple(EDITS)  # order in which the editor adds steps
 FORMER_ORDER = ("detail", "colorize", "recolor", "defocus", "abstract")  # order in files without a list of steps
 REMEDY = "save one in the editor"
@@ -137,10 +136,7 @@ class Recipe:
             }
             <BLANKLINE>
         """
-        steps = self.steps if complete else self.drawn.steps if drawn else self.acting
-        text = ",\n".join(step.to_json("    ", complete=complete) for step in steps)
-        listed = f"[\n{text}\n  ]" if text else "[]"
-        return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
+        return json_of(self.steps if complete else self.drawn.steps if drawn else self.acting, complete=complete)
 
     @staticmethod
     def from_json(text: str | bytes, name: str, remedy: str = REMEDY) -> "Recipe":

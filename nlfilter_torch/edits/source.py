@@ -183,9 +183,14 @@ class Reduced(Source, Pixels, Protocol):
     """A picture in memory: a source, and the set of all its pixels."""
 
 
+def seeded(seed: int = 0) -> torch.Generator:
+    """Return a generator with the seed; 0 is the seed of the command line."""
+    return torch.Generator().manual_seed(seed)
+
+
 def sampled_places(count: int) -> Tensor:
     """Indices, ascending, of :data:`SAMPLE` of ``count`` pixels; the same sample in memory and in tiles."""
-    return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:SAMPLE].sort().values
+    return torch.randperm(count, generator=seeded())[:SAMPLE].sort().values
 
 
 def sampled_pairs(blocks: Iterable[Columns], count: int, dtype: torch.dtype) -> RitzPairs:

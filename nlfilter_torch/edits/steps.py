@@ -16,6 +16,7 @@ from nlfilter_torch.edits.shared_parameters import FILTER
 if TYPE_CHECKING:
     from nlfilter_torch.edits.scribbles import Stroke
 
+VERSION = 1  # of files of steps
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
 # Defaults in files of the format without a list of steps, which left out values that change nothing.
 FORMER_DEFAULTS: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
@@ -179,6 +180,13 @@ class Step:
 def acting_steps(steps: Iterable[Step]) -> tuple[Step, ...]:
     """The steps that have an effect."""
     return tuple(step for step in steps if step.changes())
+
+
+def json_of(steps: Iterable[Step], *, complete: bool = False) -> str:
+    """Format steps as JSON, see :meth:`~nlfilter_torch.edits.presets.Recipe.to_json`."""
+    text = ",\n".join(step.to_json("    ", complete=complete) for step in steps)
+    listed = f"[\n{text}\n  ]" if text else "[]"
+    return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
 
 
 def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:

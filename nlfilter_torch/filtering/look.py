@@ -4,7 +4,7 @@ Each part gives a change of the image, and the result is the image plus all chan
 parameter but the image: looks are fitted to edits by least squares.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_dtype, check_finite, check_tensor
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.filtering.histogram import (
     DARKEST,
     KINDS,
@@ -24,7 +23,6 @@ from nlfilter_torch.filtering.histogram import (
     tones,
 )
 from nlfilter_torch.operator.features import pad_border, reduce_channels
-from nlfilter_torch.operator.operator import NonlocalOperator
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
@@ -46,10 +44,13 @@ IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0
 
 
 @full_precision
-def filter_look(image: Tensor, parts: Mapping[str, Tensor], operator: NonlocalOperator | None) -> Tensor:
+def filter_look(
+    image: Tensor, parts: Mapping[str, Tensor], detail: Callable[[Tensor, Tensor], Tensor] | None
+) -> Tensor:
     """An image (B, 3, H, W) under a look of all :data:`NAMES`, whose parts may differ between the images.
 
-    Differentiable in everything. W is needed only if ``alpha`` :func:`acts`. ``apply_look`` says what the parts are.
+    Differentiable in everything. ``apply_look`` says what the parts are. ``detail`` is :func:`polynomial_filter` with
+    W, a function of luminance and sliders, and needed only if ``alpha`` :func:`acts`.
     """
     acting = {name: value for name, value in parts.items() if name not in IDLE or acts(value, IDLE[name])}
     for name, value in acting.items():
@@ -66,8 +67,8 @@ def filter_look(image: Tensor, parts: Mapping[str, Tensor], operator: NonlocalOp
         curves = local_curves(image, range_of(image)).weighed(parts["local"])
         result = result + curves.rectangle(image, (0, 0)).sum(1)
     if "alpha" in acting:
-        assert operator is not None  # for mypy
-        result = result + polynomial_filter(operator, reduce_channels(image, "luminance"), parts["alpha"] - 1)
+        assert detail is not None  # for mypy
+        result = result + detail(reduce_channels(image, "luminance"), parts["alpha"] - 1)
     return result
 
 

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Collection, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_count, check_image
 from nlfilter_torch.core.precision import as_given, working_dtype
+from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.filtering.histogram import KINDS, STRENGTHS
 from nlfilter_torch.filtering.look import BLURS, NAMES, acts, check_part, filter_look
 from nlfilter_torch.filtering.shading import LANDMARKS, LEVELS, NEAR
@@ -100,4 +102,5 @@ class Look(nn.Module):
         if operator is None and acts(used["alpha"]):
             near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
             operator = nonlocal_operator(reduce_channels(exact, "luminance"), **near | self.options)
-        return as_given(filter_look(exact, used, operator), image)
+        detail = None if operator is None else partial(polynomial_filter, operator)
+        return as_given(filter_look(exact, used, detail), image)

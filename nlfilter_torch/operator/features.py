@@ -12,8 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.autograd import Gradients, once_differentiable
-from nlfilter_torch.core.blocks import large_empty
 from nlfilter_torch.core.checks import (
     LARGEST_PATCH,
     check_choice,
@@ -23,7 +21,8 @@ from nlfilter_torch.core.checks import (
     check_tensor,
 )
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
-from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
+from nlfilter_torch.core.kernels.columns import large_empty
+from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.values import is_hidden
 
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0

@@ -14,9 +14,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.autograd import factors_of, once_differentiable
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
 from nlfilter_torch.core.kernels.library import register
+from nlfilter_torch.core.precision import factors_of, once_differentiable
 from nlfilter_torch.core.values import is_hidden
 
 Completion = Literal["diagonal", "none"]

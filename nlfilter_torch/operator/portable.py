@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import _disable_current_modes
 
-from nlfilter_torch.core.kernels.affinity import PLAIN_EXPONENT, SMALLEST_EXPONENT
 from nlfilter_torch.core.kernels.clusters import chance, pick
+from nlfilter_torch.core.kernels.columns import PLAIN_EXPONENT, SMALLEST_EXPONENT
 from nlfilter_torch.operator.balancing import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
 from nlfilter_torch.operator.landmarks import (
     CAPTURED,

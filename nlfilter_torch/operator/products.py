@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.autograd import once_differentiable, outer_product
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.precision import once_differentiable, outer_product
 
 
 @dataclass(frozen=True, eq=False)

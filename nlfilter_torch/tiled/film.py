@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.edits.applying import fit_step, seeded
-from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source
+from nlfilter_torch.edits.applying import fit_step
+from nlfilter_torch.edits.source import Fitted, Guide, Planes, Source, seeded
 from nlfilter_torch.edits.steps import Step, acting_steps
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window

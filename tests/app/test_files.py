@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 import nlfilter_torch.io.photographs
+from nlfilter_torch.__main__ import main
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.cli import main
 from nlfilter_torch.edits.presets import find_recipe
 from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels

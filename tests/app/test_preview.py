@@ -9,11 +9,12 @@ import torch.nn.functional as F
 from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_filter, region_mask
 from nlfilter_torch.app.preview import PIXELS, Preview, reduce, sampled_operator
 from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.applying import apply_step, prepare, seeded
+from nlfilter_torch.edits.applying import apply_step, prepare
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.resizing import block_means, enlarged, resize
 from nlfilter_torch.edits.scribbles import Stroke, mask_of
+from nlfilter_torch.edits.source import seeded
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.edits.viewing import enlarged_and_reduced, viewed_size
 from nlfilter_torch.operator.features import reduce_channels

@@ -5,9 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.autograd import once_differentiable
 from nlfilter_torch.core.blocks import SWEPT, buffered_blocks, pixel_blocks, strip_count, strips
 from nlfilter_torch.core.kernels.library import by_rows, register, run_on_factor
+from nlfilter_torch.core.precision import once_differentiable
 
 NEGLIGIBLE = 1e-15  # entries of F in float32 that count as zero: their products would be denormal, which is slow
 

@@ -13,22 +13,21 @@ from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
-
-from nlfilter_torch.core import instruction_sets
-from nlfilter_torch.core.values import are_derived
+from torch.autograd import forward_ad
 
 SMALL = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
 OPERATORS = torch.library.Library("nlfilter", "DEF")
 Definition = TypeVar("Definition", bound=Callable[..., Any])
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
+_library: ctypes.CDLL | None = None
+level = 0  # index of instruction_sets.NAMES; 0 without a library
 
 
-def _load() -> ctypes.CDLL | None:
-    """Load the compiled library, if the installation has one, and declare its functions."""
-    library = instruction_sets.load_library()
-    if library is None:
-        return None
+def use(library: ctypes.CDLL, best: int) -> None:
+    """Run the kernels of a compiled library, with instruction sets up to ``best``."""
+    global _library, level
+    _library, level = library, best
     shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
     share_threads(library, _openmp())
     planes: list[Any] = [_POINTER, _LONG, _LONG]  # (B, R, N) and their strides
@@ -42,7 +41,6 @@ def _load() -> ctypes.CDLL | None:
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
-    return library
 
 
 def _openmp() -> Any:
@@ -58,10 +56,6 @@ def _openmp() -> Any:
 def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
     """Let kernels run on the threads of an OpenMP library, by its ``GOMP_parallel``; with None they use their own."""
     library.nlfilter_share_threads(ctypes.cast(openmp, _POINTER) if openmp is not None else None)
-
-
-_library = _load()
-level = instruction_sets.level(_library)  # index of instruction_sets.NAMES supported by this CPU and installation
 
 
 @contextmanager
@@ -114,6 +108,17 @@ def register(
         return cast(Definition, operator)
 
     return decorate
+
+
+def are_derived(arguments: Sequence[Any]) -> bool:
+    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
+    if torch.is_grad_enabled():
+        for argument in arguments:  # before every product; a loop takes half the time of a generator
+            if isinstance(argument, Tensor) and argument.requires_grad:
+                return True
+    if forward_ad._current_level < 0:
+        return False
+    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
 
 def _suit(arguments: Sequence[Any]) -> bool:
