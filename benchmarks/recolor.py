@@ -28,7 +28,7 @@ from nlfilter_torch import defocus, recolor
 from nlfilter_torch.edits.colour import hundredths_of_lab, merge_luminance, split_luminance
 from nlfilter_torch.edits.defocus import blur_kernel, convolve
 from nlfilter_torch.edits.matting import colours_beside
-from nlfilter_torch.edits.recolor import Recoloring
+from nlfilter_torch.edits.recolor import Recoloring, with_room
 from nlfilter_torch.edits.resizing import resize
 from nlfilter_torch.edits.viewing import viewed_size
 
@@ -58,8 +58,9 @@ def tinted(composite: Composite, number: int) -> Composite:
 def recoloured(composite: Composite, colour: Tensor, under: Tensor) -> Tensor:
     """The expected result: the composite of the object in its new colour."""
     chroma = split_luminance(colour.expand_as(composite.image))[1]
-    old = (split_luminance(composite.image)[1] * under).sum((2, 3)) / under.sum()
-    change = Recoloring(chroma[:, None, :, 0, 0], old[:, None], torch.ones(1, 1, dtype=torch.bool))
+    brightness, old = (((part * under).sum((2, 3)) / under.sum())[:, None] for part in split_luminance(composite.image))
+    new = with_room(chroma[:, None, :, 0, 0], brightness)
+    change = Recoloring(new, old, torch.ones(1, 1, dtype=torch.bool))
     within = torch.ones_like(composite.alpha)
     thing = change(composite.object, within, [colours_beside(split_luminance(composite.object)[1], within)])
     mixed = composite.alpha * thing + (1 - composite.alpha) * composite.background

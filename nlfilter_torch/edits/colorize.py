@@ -64,9 +64,8 @@ GUIDE_SCALE = math.sqrt(5 / 2)
 TEXTURE_WEIGHT = 3.0
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 SAME_CHROMA = 0.003  # difference of estimates that hardly counts
-FAINT = 0.12  # chroma below which estimates differ little in weight
-ALIKE_FACTOR = 1.65  # of the weight of the regression
-LEAST_SUPPORT = 0.02  # of a pixel by the strokes nearby
+FAINT = 0.2  # chroma below which estimates differ little in weight
+LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
 
 
 def colorize_guide(image: Tensor) -> Tensor:
@@ -224,7 +223,7 @@ def colorize(
         alike = (far(some)[:, :2] + residual) * usual
         around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
-        factors = ALIKE_FACTOR * (support.clamp(min=0.0) + LEAST_SUPPORT).square(), influence.square(), 1.0
+        factors = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5, influence**3, 1.0
         return weighted_mean((alike, connected, around), factors)
 
     return _coloured(source, viewed, chroma_of)
@@ -239,8 +238,8 @@ def usual_chroma(image: Tensor) -> Tensor:
 def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float | Tensor, ...]) -> Tensor:
     """Average three estimates (B, 2, H, W).
 
-    The weight of each is its factor, (B, 1, H, W) or a number, divided by its saturation and by the sum of its squared
-    distances from the other two.
+    The weight of each is its factor, (B, 1, H, W) or a number, divided by the square of its saturation and by its
+    distance from the other two.
     """
     alike, connected, around = estimates
     first, second, third = (
@@ -251,7 +250,7 @@ def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float
     total, weights = around.new_zeros(()), around.new_zeros(())
     for estimate, factor, distance in zip(estimates, factors, distances, strict=True):
         squared = estimate.square().sum(1, keepdim=True)
-        share = factor * (squared + FAINT**2).rsqrt() / (distance + SAME_CHROMA**2)
+        share = factor * (distance + SAME_CHROMA**2).rsqrt() / (squared + FAINT**2)
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 

@@ -65,7 +65,7 @@ def _relative(difference: Tensor, inside: Tensor) -> Tensor:
     return 8 * alike / alike.sum(1, keepdim=True).clamp(min=MIN_RELATIVE)
 
 
-ABSOLUTE, RELATIVE = Links(_absolute, 1 << 14), Links(_relative, 1 << 15)
+ABSOLUTE, RELATIVE = Links(_absolute, 3 << 12), Links(_relative, 1 << 15)
 
 
 @dataclass(frozen=True, eq=False)

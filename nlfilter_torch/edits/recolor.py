@@ -7,7 +7,14 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_tensor
-from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, region_means, split_luminance
+from nlfilter_torch.edits.colour import (
+    chroma_limit,
+    dot,
+    group_colours,
+    merge_luminance,
+    region_means,
+    split_luminance,
+)
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
@@ -17,6 +24,7 @@ from nlfilter_torch.edits.source import Fitted, Source
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
+ROOM = 0.8  # share of the strongest possible chroma that the mean of an object may have
 GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to keep
 
 
@@ -75,7 +83,10 @@ def recolor(
     kept = None if keep is None else source.scribbles(keep, None, "keep", needed=False)
 
     colours, regions, valid = _grouped(scribbles)
-    old = region_means(split_luminance(scribbles.image.unsqueeze(2))[1], regions.unsqueeze(2))
+    brightness, old = (
+        region_means(part, regions.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
+    )
+    colours = with_room(colours, brightness)
     inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
     found = fit_regions(
         source,
@@ -98,6 +109,16 @@ def recolor(
         return change(pixels.image, found.masks(pixels), sides)
 
     return Fitted(recoloured)
+
+
+def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
+    """Scale down chroma (B, K, 3) that a pixel of the given brightness (B, K, 1) could hardly have.
+
+    If the pixels of an object had the strongest chroma possible, each for its own brightness, the object would look
+    flat: lighter pixels, which need more chroma, would have less.
+    """
+    limit = chroma_limit(brightness, chroma, dim=2)
+    return chroma * (ROOM * limit).clamp(max=1.0)
 
 
 def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
