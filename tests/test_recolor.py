@@ -89,6 +89,18 @@ def test_overlapping_strokes_are_decided_by_the_colour_on_top() -> None:
     assert colours.shape == (1, 2, 3)
 
 
+def test_the_shading_of_an_object_stays_in_a_colour_that_is_too_strong_for_it() -> None:
+    image = torch.tensor([1.0, 0.2, 0.1]).view(1, 3, 1, 1) * torch.linspace(0.4, 0.9, 40).view(1, 1, 1, 40).expand(
+        1, 3, 40, 40
+    )
+    dot = box(10, 10, 20, 20, size=(40, 40))
+    found = recolor(image, paint(0.0, 0.0, 1.0, dot), dot, num_landmarks=40)
+    brightness, chroma = split_luminance(found)
+    assert (brightness - split_luminance(image)[0]).abs().max() < 1e-5
+    saturation = chroma[0, 2, 20] / brightness[0, 0, 20]
+    assert saturation[5:35].min() > 0.8 * saturation[5:35].max() > 1
+
+
 def test_a_grey_stroke_takes_colour_away() -> None:
     stroke = box(37, 8)
     edited = recolor(colour("astronaut"), paint(0.5, 0.5, 0.5, stroke), stroke)

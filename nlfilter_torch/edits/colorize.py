@@ -238,8 +238,8 @@ def usual_chroma(image: Tensor) -> Tensor:
 def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float | Tensor, ...]) -> Tensor:
     """Average three estimates (B, 2, H, W).
 
-    The weight of each is its factor, (B, 1, H, W) or a number, divided by the square of its saturation and by its
-    distance from the other two.
+    The weight of each is its factor, (B, 1, H, W) or a number, divided by its saturation and by its distance from the
+    other two.
     """
     alike, connected, around = estimates
     first, second, third = (
@@ -250,7 +250,7 @@ def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float
     total, weights = around.new_zeros(()), around.new_zeros(())
     for estimate, factor, distance in zip(estimates, factors, distances, strict=True):
         squared = estimate.square().sum(1, keepdim=True)
-        share = factor * (distance + SAME_CHROMA**2).rsqrt() / (squared + FAINT**2)
+        share = factor * ((squared + FAINT**2) * (distance + SAME_CHROMA**2)).rsqrt()
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 

@@ -48,8 +48,9 @@ def recolor(
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
-        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used. Up to 16 colours are distinguished, each
-            with its own region.
+        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used; a saturation that the pixels under a
+            stroke could hardly have at their luminance is reduced, so that shading remains. Up to 16 colours are
+            distinguished, each with its own region.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
         keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
             ones. Strokes take precedence over it.
