@@ -197,6 +197,7 @@ def test_precisions() -> None:
     assert half.dtype == torch.bfloat16
     assert cast.dtype == torch.float32
     assert (cast - wanted).abs().mean() < 0.005
+    assert decibels(cast, CAT) == pytest.approx(decibels(wanted, CAT), abs=0.02)  # the guide is not rounded
     double = denoise(image.double(), noise_level=0.1)
     assert double.dtype == torch.float64
     # Rounding may assign a pixel to another landmark.

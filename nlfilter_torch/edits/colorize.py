@@ -56,7 +56,7 @@ class Stage:
 
 
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
-# names for that and on 64 more, with 6 to 60 random strokes.
+# names for that and on others, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
 # With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
 # channels of texture are then 0.

