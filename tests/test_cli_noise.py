@@ -66,3 +66,14 @@ def test_little_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "which is barely visible; --strength 2 removes more" in capsys.readouterr().out
     with Image.open(tmp_path / "out.png") as opened:
         assert opened.size == (96, 64)
+
+
+def test_options_without_effect_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo, out = write(tmp_path / "in.tif", 10.0), tmp_path / "out.tif"
+    assert main(["denoise", str(photo), str(out), "--patch-size", "3"]) == 0
+    assert capsys.readouterr().err == (
+        "nlfilter-torch: note: --patch-size has no effect on the network; add --method rule to denoise by the filter "
+        "alone\n"
+    )
+    assert main(["denoise", str(photo), str(out), "--patch-size", "3", "--landmarks", "40", "--method", "rule"]) == 0
+    assert not capsys.readouterr().err

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from nlfilter_torch.cli import options
-from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
+from nlfilter_torch.edits.declaration import FILTER_PANEL, UNITS, Edit, Parameter
 from nlfilter_torch.edits.parameters import EDITS
 from nlfilter_torch.edits.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.edits.steps import Step
@@ -323,6 +323,11 @@ def edit_photograph(
     selected = given.get("region") or given.get("mask")
     if not (edit.requires_strokes or selected or step.changes()):
         options.note(f"{name} changes nothing with these options: the photograph is written as it is")
+    if name == "denoise" and step["method"] == "network":
+        for parameter in edit:
+            if parameter.panel == FILTER_PANEL and parameter.name in typed:
+                option = f"--{parameter.name.replace('_', '-')}"
+                options.note(f"{option} has no effect on the network; add --method rule to denoise by the filter alone")
     read = {what: given.get(what) for what in ("mask", "strokes", "preset")}
     editing.check_apart("OUT", target, **read)
     for which in ("show", "map"):
