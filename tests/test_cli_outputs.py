@@ -11,7 +11,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from nlfilter_torch.cli import main
+from nlfilter_torch.__main__ import main
 from nlfilter_torch.io.photographs import Photograph, check_output, read_photograph, write_photograph
 
 

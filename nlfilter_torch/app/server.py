@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from fastapi import Response
-from nicegui import app, ui
+from nicegui import app, binding, ui
 
 from nlfilter_torch.app.access import Guard
 from nlfilter_torch.app.library import Library
@@ -29,6 +29,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
         ValueError: if it cannot listen on that address; port 0 is a free one.
     """
     port = _check_address(host, port)
+    binding.MAX_PROPAGATION_TIME = 1.0  # otherwise NiceGUI warns, on standard error, whenever the machine is busy
     app.add_middleware(Guard, host=host)
     library = Library(folder, None if image is None else image.parent)
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
