@@ -193,22 +193,21 @@ def colorize(
         return interpolated
 
     absolute, relative = propagated(ABSOLUTE), propagated(RELATIVE)
-    # Ones are extended along with the chroma, and tell how far the strokes determine a pixel.
-    wanted = torch.cat([wanted / usual_there, torch.ones_like(wanted[:, :1])], dim=1)
+    wanted = wanted / usual_there
+    ones = torch.ones_like(wanted[:, :1])  # extended along with the chroma: how far the strokes determine a pixel
     parts = []
     for stage in (FAR, NEAR):
         operator = operator_of(stage)
         columns = operator.at(scribbles.places)
         fitted = fit_strokes(
-            partial(scribbled_blocks, [(columns, scribbles.weights, wanted)]),
+            partial(scribbled_blocks, [(columns, scribbles.weights, torch.cat([wanted, ones], dim=1))]),
             operator.pairs,
             pixels,
             strength=strength if stage is FAR else 0.0,
             reach=stage.reach,
             smoothness=stage.smoothness,
         )
-        explained = torch.cat([fitted(block) for block in columns()], dim=2)
-        wanted = torch.cat([wanted[:, :2] - explained[:, :2], wanted[:, 2:]], dim=1)
+        wanted = wanted - torch.cat([fitted(block)[:, :2] for block in columns()], dim=2)
         parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
         del operator  # frees its factor before the next one is computed
     far, near = parts

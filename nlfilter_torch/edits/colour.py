@@ -61,14 +61,10 @@ def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:
 
     Clipping the channels would change luminance instead, which is more visible.
     """
-    return torch.addcmul(luminance, chroma_limit(luminance, chroma).clamp(max=1.0), chroma)
-
-
-def chroma_limit(luminance: Tensor, chroma: Tensor, dim: int = 1) -> Tensor:
-    """Factor by which chroma can be multiplied before a channel, along ``dim``, leaves [0, 1]."""
     # Headroom towards white for the largest chroma, towards black for the smallest.
-    up, down = chroma.amax(dim, keepdim=True).clamp(min=1e-6), -chroma.amin(dim, keepdim=True).clamp(max=-1e-6)
-    return torch.minimum((1 - luminance).clamp(min=0.0) / up, luminance.clamp(min=0.0) / down)
+    up, down = chroma.amax(1, keepdim=True).clamp(min=1e-6), -chroma.amin(1, keepdim=True).clamp(max=-1e-6)
+    scale = torch.minimum((1 - luminance).clamp(min=0.0) / up, luminance.clamp(min=0.0) / down).clamp(max=1.0)
+    return torch.addcmul(luminance, scale, chroma)
 
 
 def dot(one: Tensor, other: Tensor, dim: int = 1) -> Tensor:

@@ -7,14 +7,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_tensor
-from nlfilter_torch.edits.colour import (
-    chroma_limit,
-    dot,
-    group_colours,
-    merge_luminance,
-    region_means,
-    split_luminance,
-)
+from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.mask import fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
@@ -24,7 +17,7 @@ from nlfilter_torch.edits.source import Fitted, Source
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
-ROOM = 0.8  # share of the strongest possible chroma that the mean of an object may have
+ROOM = 0.8  # share of the chroma at which a channel reaches 1 that the mean of an object may have
 GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to keep
 
 
@@ -48,8 +41,8 @@ def recolor(
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
-        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used; a saturation that the pixels under a
-            stroke could hardly have at their luminance is reduced, so that shading remains. Up to 16 colours are
+        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used. A saturation too strong for the
+            luminance under a stroke is reduced for the whole region, so that its shading remains. Up to 16 colours are
             distinguished, each with its own region.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
         keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
@@ -113,12 +106,12 @@ def recolor(
 
 
 def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
-    """Scale down chroma (B, K, 3) that a pixel of the given brightness (B, K, 1) could hardly have.
+    """Scale down chroma (B, K, 3) with which a pixel of the given brightness (B, K, 1) would hardly have room to white.
 
-    If the pixels of an object had the strongest chroma possible, each for its own brightness, the object would look
-    flat: lighter pixels, which need more chroma, would have less.
+    If every pixel of an object had the strongest chroma that white allows, the object would look flat: lighter pixels,
+    which need more chroma, would have less. The strongest chroma that black allows grows with the brightness.
     """
-    limit = chroma_limit(brightness, chroma, dim=2)
+    limit = (1 - brightness).clamp(min=0.0) / chroma.amax(2, keepdim=True).clamp(min=EPSILON)
     return chroma * (ROOM * limit).clamp(max=1.0)
 
 
