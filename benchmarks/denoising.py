@@ -4,7 +4,6 @@ On photographs that were not used in training, with white noise of 5, 15, 25 and
 PSNR, SSIM and CPU seconds of
 
 ours             ``nlfilter_torch.denoise``, given the noise level; the mean over four rotations; with estimated noise;
-                 with convolutions in bfloat16, by autocast;
 rule             ``denoise(method="rule")``: sliders by rule, nothing learned;
 BM3D, CBM3D      package ``bm3d``;
 scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` with the best of five weights
@@ -16,8 +15,7 @@ plain            the network without the filter, with ``--plain FILE`` of ``benc
 ``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` evaluates other weights than those of the
 package, and may be given several times. Without ``--pictures``, the photographs are camera, coffee, chelsea and the
 left halves of retina and page. ``--wrong`` adds noise levels misstated by a fifth, noise that depends on brightness,
-and clean photographs. ``--megapixel`` measures only the CPU time and memory of ours, also in bfloat16, and of BM3D at a
-megapixel.
+and clean photographs. ``--megapixel`` measures only the CPU time and memory of ours and of BM3D at a megapixel.
 """
 
 import argparse
@@ -209,19 +207,12 @@ def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method
     return run
 
 
-def in_bfloat16(case: Case) -> Tensor:
-    """The network of the package with convolutions in bfloat16."""
-    with torch.autocast("cpu", torch.bfloat16):
-        return network(None)(case)
-
-
 #: Choices of ``--methods``.
 METHODS: dict[str, Method] = {
     "noisy": lambda case: case.noisy,
     "ours": lambda case: network(None)(case),
     "ours, 4 turns": lambda case: network(None, turns=4)(case),
     "ours, measured": lambda case: denoise(case.noisy),
-    "ours, bfloat16": in_bfloat16,
     "rule": lambda case: denoise(case.noisy, method="rule", noise_level=case.noise),
     "BM3D": bm3d,
     "scikit-image NLM": nlm,
@@ -295,15 +286,14 @@ def megapixel(level: float, *, quick: bool) -> None:
     case = Case("retina", clean, with_noise(clean, level / 255, 0), level / 255)
     print(f"\nretina, {clean.shape[-1]}x{clean.shape[-2]} pixels, grey, noise {level:g}")
     seconds = {}
-    for name in ("ours", "ours, bfloat16", "BM3D"):
+    for name in ("ours", "BM3D"):
         before = resident("VmRSS")
         forget_peak()
         figures = judge(METHODS[name], case)
         seconds[name] = figures.seconds
         peak = resident("VmHWM") - before
         print(f"{name:22}{figures.psnr:8.2f} dB{figures.seconds:8.2f} s{peak:8.0f} MiB", flush=True)
-    ratios = [seconds[name] / seconds["BM3D"] for name in ("ours", "ours, bfloat16")]
-    print(f"ours takes {ratios[0]:.3f} of the CPU time of BM3D, in bfloat16 {ratios[1]:.3f}")
+    print(f"ours takes {seconds['ours'] / seconds['BM3D']:.3f} of the CPU time of BM3D")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

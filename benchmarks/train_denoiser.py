@@ -34,7 +34,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import CONTRASTS, MISSTATED, Crops
 from nlfilter_torch.io.writing import open_beside
-from nlfilter_torch.nn.denoiser import ADDED, PASSES, PLANES, WIDTH, NonlocalDenoiser, shapes_of
+from nlfilter_torch.nn.denoiser import ADDED, PASSES, PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.plotting import save_figure
 
@@ -58,13 +58,13 @@ class PlainDenoiser(NonlocalDenoiser):
     def __init__(self, passes: int = PASSES) -> None:
         super().__init__(passes)
         del self.log_bandwidths
-        self.guide = nn.Conv2d(WIDTH, WIDTH, 3, padding=1)
+        self.guide = Layer(WIDTH, WIDTH)
         self.picture = nn.Conv2d(WIDTH, PLANES, 1)
         self.register_buffer("log_bandwidths", torch.zeros(2), persistent=False)
 
     def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
         """Estimate the smoothed planes by convolutions."""
-        found: Tensor = self.picture(F.leaky_relu(self.guide(F.leaky_relu(features, 0.1)), 0.1))
+        found: Tensor = self.picture(F.leaky_relu(self.guide(features), SLOPE))
         return planes + found.to(planes)
 
 

@@ -22,6 +22,8 @@ int nlfilter_sweep(int, int, long, long, long, const float *, long, long, const 
 int nlfilter_grams(int, int, long, long, long, const float *, long, long, long, const float *, const float *, double *);
 int nlfilter_lloyd(int, int, long, long, long, long, long, float, const float *, const float *, int *);
 int nlfilter_pivots(int, int, long, long, long, long, float, const float *, const float *, long *);
+int nlfilter_convolution(int, int, long, long, long, long, long, long, long, float, const float *, const float *,
+                         const float *, const float *, float *);
 
 static float x[B][D][N], z[B][D][M], centre[B][D], rows[B][M][D + 2], inverse[B][M][M], factor[B][M][N], norms[B][N];
 static float right[B][M][N], left[B][M][R], scale[B][N], diagonal[B][N], points[B][D + 1][M], moved[B][D][N];
@@ -240,6 +242,41 @@ static void check_landmarks(int level, int threads)
     judge("pivots", status, 1e-4);
 }
 
+static void check_convolution(int level, int threads, int apart, int adds)
+{
+    enum { H = 13, W = 10, C = 16, O = 21, PADDED = 32 };
+    static float features[B][H][W][C], kernel[O][C][3][3], weights[6][6][C][PADDED], bias[PADDED], added[B][H][W][O];
+    static float results[B][H][W][O];
+    const double values[6][3] = {{1 / 4.0, 0, 0},           {-1 / 6.0, -1 / 6.0, -1 / 6.0}, {-1 / 6.0, 1 / 6.0, -1 / 6.0},
+                                 {1 / 24.0, 1 / 12.0, 1 / 6.0}, {1 / 24.0, -1 / 12.0, 1 / 6.0}, {0, 0, 1}};
+    fill(features[0][0][0], sizeof features, -1, 1);
+    fill(kernel[0][0][0], sizeof kernel, -1, 1);
+    fill(bias, O * sizeof(float), -1, 1);
+    fill(added[0][0][0], sizeof added, -1, 1);
+    for (int k = 0; k < 36 * C * O; k++) {
+        const int i = k / (6 * C * O), j = k / (C * O) % 6, c = k / O % C, o = k % O;
+        double sum = 0;
+        for (int l = 0; l < 9; l++)
+            sum += values[i][l / 3] * values[j][l % 3] * kernel[o][c][l / 3][l % 3];
+        weights[i][j][c][o] = sum;
+    }
+    const int status = nlfilter_convolution(level, threads, B, H, W, C, O, PADDED, apart, 0.1f, features[0][0][0],
+                                            weights[0][0][0], bias, adds ? added[0][0][0] : NULL, results[0][0][0]);
+    for (int k = 0; k < B * H * W * O; k++) {
+        const int b = k / (H * W * O), y = k / (W * O) % H, x_ = k / O % W, o = k % O;
+        double sum = bias[o] + (adds ? added[b][y][x_][o] : 0);
+        for (int l = 0; l < 9 * C; l++) {
+            const int row = y + (l / 3 % 3 - 1) * apart, column = x_ + (l % 3 - 1) * apart;
+            if (row < 0 || row >= H || column < 0 || column >= W)
+                continue;
+            const double value = features[b][row][column][l / 9];
+            sum += kernel[o][l / 9][l / 3 % 3][l % 3] * (value < 0 ? 0.1f * value : value);
+        }
+        compare(results[b][y][x_][o], sum);
+    }
+    judge("convolution", status, 1e-5);
+}
+
 int main(void)
 {
     fill(x[0][0], sizeof x, -1, 1);
@@ -279,6 +316,8 @@ int main(void)
             }
             check_products(level, threads);
             check_landmarks(level, threads);
+            for (int apart = 1; apart <= 5; apart++)
+                check_convolution(level, threads, apart, apart % 2);
         }
     return failures != 0;
 }

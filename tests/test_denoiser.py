@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nlfilter_torch import NonlocalDenoiser, denoise
 from nlfilter_torch.nn import denoiser as module
-from nlfilter_torch.nn.denoiser import SIDE, STEP, in_tiles, join_colours, noise_map, split_colours
+from nlfilter_torch.nn.denoiser import PIXELS, SIDE, STEP, WIDTH, in_tiles, join_colours, noise_map, split_colours
 from tests.problems import colour, decibels, noisy, seeded
 
 TRAINED_ONE = NonlocalDenoiser.trained()
@@ -117,7 +117,8 @@ def test_images_of_a_batch_are_denoised_as_alone() -> None:
         both = TRAINED_ONE(images, levels)
         for i in range(2):
             alone = TRAINED_ONE(images[i : i + 1], levels[i])
-            torch.testing.assert_close(both[i : i + 1], alone, rtol=0, atol=1e-4)
+            # Rounding may assign a pixel to another landmark.
+            torch.testing.assert_close(both[i : i + 1], alone, rtol=0, atol=1e-3)
             torch.testing.assert_close(TRAINED_ONE(images[i], levels[i].view(1, 1, 1).expand(1, 96, 128)), alone[0])
 
 
@@ -187,6 +188,14 @@ def test_gradients_of_float64_are_those_of_differences() -> None:
     assert float((point.grad * direction).sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-5)
 
 
+def test_autocast_rounds_neither_guide_nor_filter() -> None:
+    features, planes = torch.randn(1, WIDTH, 24, 32, generator=seeded(5)), noisy(CAT[..., :24, :32], 0.1)
+    with torch.no_grad():
+        wanted = TRAINED_ONE.smooth(features, planes, PIXELS)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert torch.equal(TRAINED_ONE.smooth(features, planes, PIXELS), wanted)
+
+
 def test_precisions() -> None:
     image = noisy(CAT, 0.1)
     with torch.no_grad():
@@ -197,7 +206,7 @@ def test_precisions() -> None:
     assert half.dtype == torch.bfloat16
     assert cast.dtype == torch.float32
     assert (cast - wanted).abs().mean() < 0.005
-    assert decibels(cast, CAT) == pytest.approx(decibels(wanted, CAT), abs=0.02)  # the guide is not rounded
+    assert decibels(cast, CAT) == pytest.approx(decibels(wanted, CAT), abs=0.1)
     double = denoise(image.double(), noise_level=0.1)
     assert double.dtype == torch.float64
     # Rounding may assign a pixel to another landmark.

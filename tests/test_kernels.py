@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels import columns, definitions_only, grams, tall_skinny
+from nlfilter_torch.core.kernels import columns, convolution, definitions_only, grams, tall_skinny
 from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
 from nlfilter_torch.operator import build  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
-DERIVED = ("spread", "moment", "invert")
+DERIVED = ("spread", "moment", "invert", "convolve")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -28,6 +28,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
     vector, rows = random(BATCH, LANDMARKS, seed=2).to(dtype), random(BATCH, ROWS, LANDMARKS, seed=3).to(dtype)
     images = random(BATCH, ROWS, PIXELS, seed=4).to(dtype)
     weights = images[:, 0].exp()
+    images16, weight = random(BATCH, 16, 7, 9, seed=5).to(dtype), random(5, 16, 3, 3, seed=6).to(dtype)
     backward = (*inputs, True, factor, norms.clamp(min=1.0).rsqrt())
     return {
         "columns": (*inputs, True),
@@ -43,6 +44,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "invert": (factor @ factor.mT + torch.eye(LANDMARKS, dtype=dtype),),
         "choose": (features, 1, PIXELS, LANDMARKS, "kmeans"),
         "without": (factor, norms > norms.median()),
+        "convolve": (images16, weight, random(5, seed=7).to(dtype), 2, random(BATCH, 5, 7, 9, seed=8).to(dtype)),
         "settle": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
 
@@ -66,7 +68,9 @@ def test_opcheck(name: str, dtype: torch.dtype, in_c: bool) -> None:
     with nullcontext() if in_c else definitions_only():
         torch.library.opcheck(operator, given)
         if name in DERIVED:
-            torch.library.opcheck(operator, tuple(part.clone().requires_grad_() for part in given))
+            torch.library.opcheck(
+                operator, tuple(t.clone().requires_grad_() if isinstance(t, Tensor) else t for t in given)
+            )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -92,3 +96,23 @@ def test_a_gram_matrix_of_weighted_columns() -> None:
     torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)
     with definitions_only():
         torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 4), (4, 5), (13, 40), (37, 65)])
+@pytest.mark.parametrize("dilation", [1, 2, 3, 5])
+@pytest.mark.parametrize(("channels", "outputs"), [(16, 16), (48, 48), (32, 28), (16, 1), (6, 48)])
+def test_convolution(size: tuple[int, int], dilation: int, channels: int, outputs: int) -> None:
+    given = (
+        random(2, channels, *size),
+        random(outputs, channels, 3, 3, seed=1) / (3 * channels**0.5),
+        random(outputs, seed=2),
+        dilation,
+        random(2, outputs, *size, seed=3),
+    )
+    features, weight, bias, _, added = (t.double() if isinstance(t, Tensor) else t for t in given)
+    rectified = torch.where(features < 0, 0.1 * features, features)
+    exact = torch.nn.functional.conv2d(rectified, weight, bias, padding=dilation, dilation=dilation)
+    for context in (nullcontext(), definitions_only()):
+        with context:
+            torch.testing.assert_close(convolution.convolve(*given).double(), exact + added, atol=3e-5, rtol=0)
+            torch.testing.assert_close(convolution.convolve(*given[:4]).double(), exact, atol=3e-5, rtol=0)

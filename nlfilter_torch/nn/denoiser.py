@@ -18,6 +18,7 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
+from nlfilter_torch.core.kernels.convolution import SLOPE, convolve
 from nlfilter_torch.core.precision import as_given, full_precision, per_image, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
@@ -42,6 +43,17 @@ BORDER = 8  # width in pixels of the border added to images, so that their own b
 TILE_BATCH = 4  # tiles processed at once; more leave the cache of the processor
 
 
+class Layer(nn.Conv2d):
+    """Convolution with 3x3 weights of features that first pass through a leaky rectifier."""
+
+    def __init__(self, inputs: int, outputs: int, dilation: int = 1) -> None:
+        super().__init__(inputs, outputs, 3, padding=dilation, dilation=dilation)
+
+    def forward(self, features: Tensor, added: Tensor | None = None) -> Tensor:
+        """Convolve features (B, C, H, W), and add others (B, O, H, W)."""
+        return convolve(features, self.weight, self.bias, self.dilation[0], added)
+
+
 class NonlocalDenoiser(nn.Module):
     """Denoiser for grey or colour images with noise of known strength, which may vary from pixel to pixel.
 
@@ -54,9 +66,6 @@ class NonlocalDenoiser(nn.Module):
     the size of the image.
 
     A new instance is untrained; :meth:`trained` loads the weights of the package.
-
-    On processors that multiply numbers in bfloat16, inference under ``torch.autocast("cpu", torch.bfloat16)`` takes two
-    thirds of the time: only convolutions are rounded, not guide and filter, so that the PSNR is the same to 0.01 dB.
 
     Args:
         passes: how often the network and its filter are applied. The weights of the package are trained for two; one
@@ -75,13 +84,13 @@ class NonlocalDenoiser(nn.Module):
         super().__init__()
         check_count(passes, "passes")
         self.passes = passes
-        self.first = _convolution(PLANES + LEVELS, WIDTH)
-        self.before = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in BEFORE)
-        self.guide = _convolution(WIDTH, FEATURES + LEVELS * (ORDER + 1))
+        self.first = nn.Conv2d(PLANES + LEVELS, WIDTH, 3, padding=1)
+        self.before = nn.ModuleList(Layer(WIDTH, WIDTH, dilation) for dilation in BEFORE)
+        self.guide = Layer(WIDTH, FEATURES + LEVELS * (ORDER + 1))
         self.log_bandwidths = nn.Parameter(torch.tensor([math.log(bandwidth) for bandwidth in BANDWIDTHS]))
-        self.join = _convolution(WIDTH + 2 * PLANES, WIDTH)
-        self.after = nn.ModuleList(_convolution(WIDTH, WIDTH, dilation) for dilation in AFTER)
-        self.last = _convolution(WIDTH, PLANES)
+        self.join = nn.Conv2d(WIDTH + 2 * PLANES, WIDTH, 3, padding=1)
+        self.after = nn.ModuleList(Layer(WIDTH, WIDTH, dilation) for dilation in AFTER)
+        self.last = Layer(WIDTH, PLANES)
         self.again = nn.Conv2d(WIDTH, WIDTH, 1).requires_grad_(passes > 1)  # a single pass does not use it
         for weight in self.again.parameters():
             nn.init.zeros_(weight)  # every pass is like the first, until it is trained
@@ -170,7 +179,7 @@ class NonlocalDenoiser(nn.Module):
         pixels, *others = [ROUGH_PIXELS] * (self.passes - 1) + [PIXELS]
         features, estimate, _ = self._pass(first, planes, levels, pixels)
         for pixels in others:
-            again = first + self.again(_activated(features))
+            again = first + self.again(F.leaky_relu(features, SLOPE))
             features, found, corrections = self._pass(again, planes, levels, pixels)
             estimate = torch.lerp(estimate, found, _trust(corrections[:, : noisy.shape[1]]).to(found))
         return join_colours(estimate, noisy.shape[1]) * scale
@@ -188,12 +197,15 @@ class NonlocalDenoiser(nn.Module):
             Features, the estimated noise of each plane, and the last corrections of it in noise levels.
         """
         for layer in self.before:
-            features = features + layer(_activated(features))
+            features = layer(features, features)
         found = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
-        features = self.join(torch.cat([_activated(features), _centred(planes - found), 2 * found], dim=1))
+        both = torch.cat([_centred(planes - found), 2 * found], dim=1).contiguous(memory_format=torch.channels_last)
+        weights = self.join.weight.split([WIDTH, 2 * PLANES], dim=1)
+        rest = F.conv2d(both, weights[1], self.join.bias, padding=1)
+        features = convolve(features, weights[0], added=rest)
         for layer in self.after:
-            features = features + layer(_activated(features))
-        corrections = self.last(_activated(features)).to(planes)
+            features = layer(features, features)
+        corrections = self.last(features).to(planes)
         return features, found + levels * corrections.clamp(-LARGEST, LARGEST), corrections
 
     def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
@@ -202,7 +214,7 @@ class NonlocalDenoiser(nn.Module):
         The filter has a landmark for every so many ``pixels``.
         """
         height, width = planes.shape[-2:]
-        found = full_precision(self.guide)(_activated(features).to(planes))
+        found = full_precision(self.guide)(features.to(planes))
         guide, logits = found.split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
         alike, near = self.log_bandwidths.exp()
@@ -352,12 +364,3 @@ def _trust(corrections: Tensor) -> Tensor:
     for size, padding in (((2 * AROUND + 1, 1), (AROUND, 0)), ((1, 2 * AROUND + 1), (0, AROUND))):
         largest = F.max_pool2d(largest, size, stride=1, padding=padding)
     return (1 + LARGEST - largest).clamp(0.0, 1.0)
-
-
-def _activated(features: Tensor) -> Tensor:
-    """Activation before a convolution; leaky, so that units do not die."""
-    return F.leaky_relu(features, 0.1)
-
-
-def _convolution(inputs: int, outputs: int, dilation: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, 3, padding=dilation, dilation=dilation)

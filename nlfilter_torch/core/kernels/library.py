@@ -41,6 +41,7 @@ def use(library: ctypes.CDLL, best: int) -> None:
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
+    library.nlfilter_convolution.argtypes = [*shared, *[_LONG] * 6, _FLOAT, *[_POINTER] * 5]
 
 
 def _openmp() -> Any:

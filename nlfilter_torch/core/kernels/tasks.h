@@ -16,6 +16,7 @@
 #define NEAR 196608  /* number of floats of the factor that fit the second-level cache */
 #define MOST_ROWS 6
 #define MOST_PIXELS 64
+#define TILES 24     /* of a convolution, processed together; a multiple of all ROWS */
 
 static inline long padded(long count, long step) { return (count + step - 1) / step * step; }
 
@@ -79,6 +80,15 @@ struct lloyd {
     float margin; /* scores closer than this, relative to their terms, are ties */
 };
 
+struct convolution {
+    const float *features, *added; /* (H, W, C), and (H, W, O) or NULL */
+    const float *weights, *bias;   /* transformed, (36, C, padded O), and (padded O) */
+    float *out;                    /* (H, W, O) */
+    long height, width, channels, outputs, padded_outputs, dilation;
+    long tiles_down, tiles_across; /* of one phase of the dilation */
+    float slope;                   /* of negative features */
+};
+
 /* The kernels of an instruction set, on pixels first to last; documented in the headers. */
 struct set {
     long rows; /* rows in a block of a packed matrix */
@@ -91,6 +101,7 @@ struct set {
     void (*assign)(const struct lloyd *, const float *points, const float *centres, float *tile, int *nearest,
                    float *sums);
     void (*pivots)(const struct pivots *, const float *points, long *pivots, float *scratch);
+    void (*convolution)(const struct convolution *, long first, long last, float *scratch);
 };
 
 #pragma GCC visibility push(hidden) /* avoid clashes with other libraries */
