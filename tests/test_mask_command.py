@@ -1,5 +1,6 @@
 """The command ``mask``: files of masks, in memory and in tiles, and its errors."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,24 @@ def floats(path: Path) -> np.ndarray:
     head, size, scale, values = path.read_bytes().split(b"\n", 3)
     assert (head, size, scale) == (b"Pf", b"80 64", b"-1.0")
     return np.frombuffer(values, "<f4").reshape(SIZE)[::-1]
+
+
+@pytest.mark.parametrize("memory", [[], ["--memory", "0.05"]], ids=["in memory", "in tiles"])
+def test_it_prints_how_much_is_selected(
+    photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], memory: list[str]
+) -> None:
+    assert run(photograph, tmp_path / "out.pfm", *memory) == 0
+    printed = capsys.readouterr()
+    told = re.search(r"selected: (\d+) % of the picture", printed.out)
+    assert told is not None
+    assert int(told[1]) == pytest.approx(100 * floats(tmp_path / "out.pfm").mean(), abs=1)
+    assert "nearly all" not in printed.err
+    even = tmp_path / "even.tif"
+    tifffile.imwrite(even, np.full((*SIZE, 3), 120, np.uint8), photometric="rgb")
+    assert main(["mask", str(even), str(tmp_path / "all.png"), "--region", REGION, *memory]) == 0
+    printed = capsys.readouterr()
+    assert "selected: 100 % of the picture" in printed.out
+    assert "nearly all of the picture's borders are selected" in printed.err
 
 
 def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,8 +49,9 @@ def mask(
     """See :data:`MASK`."""
     from nlfilter_torch.cli import editing, scribbles, showing
     from nlfilter_torch.cli.progress import stages, steps
-    from nlfilter_torch.edits.mask import region_mask
-    from nlfilter_torch.edits.source import seeded
+    from nlfilter_torch.edits.in_memory import InMemory
+    from nlfilter_torch.edits.mask import Regions, select_regions
+    from nlfilter_torch.edits.source import Fitted, seeded
     from nlfilter_torch.edits.steps import working_bytes
     from nlfilter_torch.io.extras import NO_EXTRAS
     from nlfilter_torch.io.pfm import PFM, write_pfm
@@ -93,6 +94,11 @@ def mask(
         if show is not None:
             showing.show(show, "mask", values, size, read, scribbled)
 
+    def told(regions: Regions) -> Fitted:
+        """Print how much is selected."""
+        showing.tell_selected(regions.reduced_masks(), background)
+        return Fitted(regions.masks)
+
     with steps(3) as begin:
         begin("Reading")
         photograph = editing.read_if_it_fits(source, target, working_bytes(given["landmarks"], 3), memory)
@@ -105,7 +111,8 @@ def mask(
                 tell(drawn, photograph.size, lambda rows: photograph.pixels[..., rows, :])
                 inside, outside = (None if rows is None else rows.at_once() for rows in drawn)
             assert inside is not None  # for mypy
-            found = region_mask(photograph.pixels, inside, outside, **arguments(photograph.size))
+            whole = InMemory(photograph.pixels)
+            found = whole.all(told(select_regions(whole, inside, outside, **arguments(photograph.size))))
             begin("Writing")
             if floats:
                 write_pfm(place, found[0, 0].float().numpy())
@@ -129,7 +136,7 @@ def mask(
             drawn = selected_by(job.size, job.open)
             tell(drawn, job.size, lambda rows: tiled.picture.tile(rows.start, rows.stop, 0).pixels)
             with single_threaded(tiled.passes.workers(1)):
-                fitted = region_mask.fit(tiled, *drawn, **arguments(job.size))
+                fitted = told(select_regions(tiled, *drawn, **arguments(job.size)))
             if floats:
                 write_pfm(place, tiled.all(fitted)[0, 0].float().numpy())
                 return

@@ -26,6 +26,7 @@ from nlfilter_torch.io.photographs import Photograph, write_photograph
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
 MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
 LARGE_DISTANCE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
+BORDER_SHARE = 0.9  # selected share of the picture's borders above which a note is printed
 NOTE_SHARE = 0.15  # share of such pixels above which a note is printed
 CHUNK_ROWS = 64
 COLOUR_ROWS = 16  # rows of a photograph that are read to see whether it is in colour
@@ -58,6 +59,14 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
                     f"the median; mark each part separately, with a smaller {option} on each, and check them with "
                     "--show FILE"
                 )
+
+
+def tell_selected(mask: Tensor, background: list[str] | None) -> None:
+    """Print the share of a picture that a mask (1, 1, H, W) selects, and a note if its borders belong to it too."""
+    typer.echo(f"selected: {100 * float(mask.mean()):.0f} % of the picture")
+    borders = torch.cat([mask[..., edge] for edge in (0, -1)] + [mask[..., edge, :] for edge in (0, -1)], dim=2)
+    if float(borders.mean()) > BORDER_SHARE and not background:
+        note("nearly all of the picture's borders are selected; mark what is not part of the object with --background")
 
 
 def note_colours(name: str, size: tuple[int, int], read: Read) -> None:
