@@ -308,7 +308,7 @@ def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "in.png has no transparency, so every pixel would count as a scribble" in sentence(
         "colorize", "in.png", "--strokes", photo
     )
-    assert "black.png is black everywhere; paint the selected area white" in sentence(
+    assert "black.png is darker than middle grey everywhere; paint the selected area white" in sentence(
         "defocus", "in.png", "--mask", tmp_path / "black.png"
     )
     assert "text.png is not a PNG" in sentence("recolor", "in.png", "--strokes", tmp_path / "text.png")

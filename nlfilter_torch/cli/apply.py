@@ -63,7 +63,11 @@ def apply(
         showing.note_idle(recipe, name)
     colorizes = any(step.edit == "colorize" for recipe in recipes for step in recipe.acting)
 
+    looks = [step for recipe in recipes for step in recipe.acting if step.edit == "look"]
+
     def work(photograph: Photograph) -> Tensor:
+        if photograph.pixels.shape[1] == 1:
+            showing.note_grey(looks, source)
         if colorizes:
             showing.note_colours(source, photograph.size, lambda rows: photograph.pixels[..., rows, :])
         if not masks:
@@ -73,6 +77,8 @@ def apply(
 
     def by_rows(job: Job) -> AbstractContextManager[Tiling]:
         passes = job.passes(full, Path(target).parent)
+        if job.picture.shape[2] < 3:
+            showing.note_grey(looks, source)
         if colorizes:
             picture = Picture(job.picture.rows, source)
             showing.note_colours(source, job.size, lambda rows: picture.tile(rows.start, rows.stop, 0).pixels)

@@ -256,8 +256,11 @@ def edit_photograph(
     from nlfilter_torch.tiled.workers import single_threaded
 
     def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
-        """Print the colours that scribbles cover, and write the picture of ``--show``."""
-        check_channels(name, read(slice(0, 1)).shape[1])
+        """Print what scribbles cover and what is left out, and write the picture of ``--show``."""
+        channels = read(slice(0, 1)).shape[1]
+        check_channels(name, channels)
+        if channels == 1:
+            showing.note_grey([step], source)
         if given.get("show") is not None and not any(True for _ in showing.overlays(drawn)):
             raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
         showing.tell_colours(showing.overlays(drawn), read)
@@ -272,7 +275,7 @@ def edit_photograph(
         found = named.get("noise_level") or Noise.even(torch.as_tensor([level]))
         if given.get("map") is not None:
             write_map(found, picture.size, read, given["map"])
-        return NoiseReport(found, given=level is not None)
+        return NoiseReport(found, given=level is not None, strength=step["strength"])
 
     def work(photograph: Photograph) -> Tensor:
         free = editing.allowed_memory(memory)

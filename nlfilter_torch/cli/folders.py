@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from nlfilter_torch.cli.options import NOTE
 from nlfilter_torch.cli.workers import DEATHS, Workers, is_death, worker_pool
 from nlfilter_torch.io.photographs import SUFFIXES
 from nlfilter_torch.io.writing import check_file, check_folder, open_beside, remove_stale
@@ -177,7 +178,7 @@ def edit_folder(
             if isinstance(outcome, list):
                 tally.done += 1
                 for note in outcome:
-                    tell(f"note: {path.name}: {note}")
+                    tell(f"note: {note}" if path.name in note else f"note: {path.name}: {note}")
                 continue
             tally.failures[path.name] = outcome
             tell(outcome if path.name in outcome else f"{path.name}: {outcome}")
@@ -229,14 +230,16 @@ def _outcomes(
 
 
 def _work(edit: Edit, source: Path, target: Path) -> tuple[Path, list[str] | str]:
-    """Edit one file in a worker; return its name, and its warnings or why it failed."""
-    with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(io.StringIO()):
+    """Edit one file in a worker; return its name, and its notes and warnings or why it failed."""
+    printed = io.StringIO()
+    with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(printed):
         warnings.simplefilter("always", UserWarning)
         try:
             edit(str(source), str(target))
         except Exception as error:
             return source, _sentence(error)
-    return source, [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+    notes = [line.removeprefix(NOTE) for line in printed.getvalue().splitlines() if line.startswith(NOTE)]
+    return source, notes + [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
 
 
 def _sentence(error: Exception) -> str:

@@ -87,12 +87,14 @@ def frames(
     recipe = chosen_recipe(context, edit, preset, given)
 
     from nlfilter_torch.cli.editing import allowed_memory
+    from nlfilter_torch.cli.showing import note_idle
     from nlfilter_torch.io.films import is_film
     from nlfilter_torch.io.rows import TILED
     from nlfilter_torch.tiled.film import FilmEdit, film_steps
     from nlfilter_torch.tiled.tiles import Passes
 
     film_steps(recipe.steps)
+    note_idle(recipe, preset or f"--edit {edit}")
     passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
     def fit(samples: list[Any]) -> FilmEdit:

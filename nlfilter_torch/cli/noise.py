@@ -26,8 +26,8 @@ ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and addit
 class NoiseReport:
     """Noise of a photograph, measured or ``given`` by the user, and how much denoising changed it, in grey levels."""
 
-    def __init__(self, noise: Noise, *, given: bool) -> None:
-        self._level, self._given = float(noise.level), given
+    def __init__(self, noise: Noise, *, given: bool, strength: float) -> None:
+        self._level, self._given, self._strength = float(noise.level), given, strength
         ends = [float((noise.floor + light * noise.gain).sqrt()) for light in (0.0, 1.0)]
         self._ends = f" ({LEVELS * ends[0]:.2f} in black, {LEVELS * ends[1]:.2f} in white)" if noise.gain > 0 else ""
         self._squares, self._count = 0.0, 0
@@ -49,7 +49,7 @@ class NoiseReport:
             typer.echo(f"{found}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed")
             return
         weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
-        remedy = "" if self._given or not weak else "; --strength 2 removes more"
+        remedy = "; --strength 2 removes more" if weak and not self._given and 0 < self._strength < 2 else ""
         typer.echo(f"{found}; pixels changed by {change:.2f} grey levels (RMS){weak}{remedy}")
 
 

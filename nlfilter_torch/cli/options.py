@@ -23,9 +23,12 @@ FileDepth = Literal["8", "16", "float"]  # what a channel of the output file hol
 DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
 
 
+NOTE = "nlfilter-torch: note: "  # begins every note on standard error
+
+
 def note(sentence: str) -> None:
     """Print a note on standard error."""
-    typer.echo(f"nlfilter-torch: note: {sentence}", err=True)
+    typer.echo(f"{NOTE}{sentence}", err=True)
 
 
 def parse_sliders(text: str, option: str) -> tuple[float, ...]:
@@ -185,7 +188,11 @@ SliderRegions = _rectangles(
     "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its own "
     "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be repeated.",
 )
-MaskFile = _file("--mask", "A picture of the same size as the photograph, white where selected and black elsewhere.")
+MaskFile = _file(
+    "--mask",
+    "A picture of the same size as the photograph, white where selected and "
+    "black elsewhere. Pixels darker than middle grey are not selected.",
+)
 _LOOK_MASK = "A grey picture of the size of the photograph, white in the region of one look. May be repeated."
 Masks = Annotated[list[Path] | None, typer.Option("--mask", metavar="FILE", help=_LOOK_MASK)]
 MasksOfPairs = Annotated[

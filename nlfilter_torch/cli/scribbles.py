@@ -17,11 +17,12 @@ from nlfilter_torch.cli.options import parse_sliders
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import check_depth
 from nlfilter_torch.io.rows import StoredPicture
-from nlfilter_torch.tiled.pictures import LazyRows, Picture, transparency
+from nlfilter_torch.tiled.pictures import LazyRows, Picture, mask_of, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
 Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask
 Floats = NDArray[np.float32]
+SELECTED = 0.5  # brightness from which a mask selects a pixel: the borders of soft masks fade to 0 far outside
 DOT_SIZE = 0.03  # side of the square around a point, as a share of the short side
 
 
@@ -139,13 +140,13 @@ class Overlay(ABC):
 class Regions(Overlay):
     """Masks of regions; the picture is the first of them."""
 
-    marked, empty = 0, "black everywhere; paint the selected area white"
+    marked, empty = 0, "darker than middle grey everywhere; paint the selected area white"
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
         tile = picture.tile(rows.start, rows.stop, 0)
-        painted = tile.pixels.float().mean(1)[0].clamp(0, 1).numpy()
-        weights[..., 0] = painted * transparency(tile, "float32").prod(2)  # transparent pixels may be stored as white
+        painted = mask_of(tile)[0, 0].float().numpy()
+        weights[..., 0] = np.where(painted < SELECTED, 0, painted)
         return weights
 
 
@@ -212,7 +213,12 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
                 f"--region must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
             )
         rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
-    return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles).checked()
+    picture = _picture(size, path, read, transparent=True)
+    if picture is not None:
+        gaps = LazyRows(size, lambda rows: Strokes((*size, 4), picture, [])[rows][..., Strokes.marked] == 0)
+        if not gaps.any():
+            raise ValueError(_opaque(path))
+    return Strokes((*size, 4), picture, rectangles).checked()
 
 
 def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
@@ -261,8 +267,13 @@ def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = F
             f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize it"
         )
     if transparent and not stored.alpha:
-        raise ValueError(
-            f"{path} has no transparency, so every pixel would count as a scribble; "
-            "draw on a transparent layer and save only that layer"
-        )
+        raise ValueError(_opaque(path))
     return Picture(stored.rows, str(path))
+
+
+def _opaque(path: Path | None) -> str:
+    """Error for scribbles that cover the whole photograph."""
+    return (
+        f"{path} has no transparency, so every pixel would count as a scribble; "
+        "draw on a transparent layer and save only that layer"
+    )

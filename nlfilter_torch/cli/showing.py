@@ -4,7 +4,7 @@ Also other notes on what an edit does to a photograph.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,20 @@ from torch import Tensor
 
 from nlfilter_torch.cli.options import note
 from nlfilter_torch.cli.scribbles import Overlay, Strokes
+from nlfilter_torch.edits.applying import apply_step
 from nlfilter_torch.edits.colour import hundredths_of_lab
 from nlfilter_torch.edits.defocus import REACH
 from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.presets import Recipe
 from nlfilter_torch.edits.source import seeded
+from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, write_photograph
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
 MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
 LARGE_DISTANCE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
+TINT = 1 / 255  # difference of channels of a grey pixel under a look
 BORDER_SHARE = 0.9  # selected share of the picture's borders above which a note is printed
 NOTE_SHARE = 0.15  # share of such pixels above which a note is printed
 CHUNK_ROWS = 64
@@ -84,6 +87,16 @@ def note_idle(recipe: Recipe, name: str) -> None:
     """Print a note if an edit changes nothing."""
     if not recipe.acting:
         note(f"{name} holds no step that changes anything: the photograph is written as it is")
+
+
+def note_grey(steps: Iterable[Step], name: str) -> None:
+    """Print a note if one of the steps of an edit of a grey photograph gives colours to greys."""
+    ramp = torch.linspace(0, 1, 64).view(1, 1, 8, 8).expand(-1, 3, -1, -1)
+    for step in steps:
+        if step.edit == "look":
+            found = apply_step(step, ramp)
+            if bool((found.amax(1) - found.amin(1)).amax() > TINT):
+                note(f"{name} is grey and stays grey, without the colours of the look; convert it to RGB first")
 
 
 def unlike(pixels: Tensor, middle: Tensor) -> float:
@@ -151,8 +164,8 @@ def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
     return _reduced(rows, size, stride, F.max_pool2d)
 
 
-def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[[Tensor, int], Tensor]) -> Tensor:
-    """Pool blocks of ``stride`` pixels along each axis, with only some rows in memory at once."""
-    height = size[0] // stride * stride
-    starts = range(0, height, CHUNK_ROWS * stride)
-    return torch.cat([pool(read(slice(a, min(a + CHUNK_ROWS * stride, height))), stride) for a in starts], dim=2)
+def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[..., Tensor]) -> Tensor:
+    """Pool blocks of ``stride`` pixels along each axis, with only some rows in memory at once; the last are smaller."""
+    starts = range(0, size[0], CHUNK_ROWS * stride)
+    parts = (read(slice(start, min(start + CHUNK_ROWS * stride, size[0]))) for start in starts)
+    return torch.cat([pool(part, stride, ceil_mode=True) for part in parts], dim=2)

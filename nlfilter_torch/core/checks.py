@@ -106,19 +106,22 @@ def check_photograph(image: Tensor, name: str, *, channels: int | None = None, b
     warn_of_scale(image, name)
 
 
-def warn_of_scale(image: Tensor, name: str) -> None:
+def warn_of_scale(image: Tensor, name: str) -> bool:
     """Warn if an image of 1 or 3 channels has values above 16: probably 8-bit pixels converted to floats.
+
+    Returns whether it warned.
 
     Skipped if :func:`~nlfilter_torch.core.values.is_hidden`. Images with other numbers of channels are feature maps,
     which may have any values; HDR pictures stay below 16.
     """
     if is_hidden(image) or image.shape[1] not in (1, 3) or len(image) == 0:
-        return
+        return False
     largest = float(image.detach().max())
     if largest > FAR_OUTSIDE:
         warn(
             f"{name} must be in or near [0, 1], got values up to {largest:g}; divide by the value of white, such as 255"
         )
+    return largest > FAR_OUTSIDE
 
 
 def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str, part: Tensor | None = None) -> None:

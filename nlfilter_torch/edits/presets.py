@@ -91,7 +91,8 @@ class Recipe:
 
         Returns:
             (B, C, H, W), with C = 3 if a step added colour; the image itself if no step has an effect. Values may leave
-            [0, 1]. Differentiable in the image.
+            [0, 1]; between steps they are limited to it, or to the range of the image if that is larger.
+            Differentiable in the image.
 
         Raises:
             ValueError: if a step cannot be applied to such an image.
@@ -109,7 +110,7 @@ class Recipe:
         for done, step in enumerate(steps):
             if report is not None:
                 report(done, len(steps))
-            result = apply_step(step, image if result is image else result.clamp(0, 1), generator=generator)
+            result = apply_step(step, image if result is image else _limited(result, image), generator=generator)
         return result
 
     def to_json(self, *, drawn: bool = False, complete: bool = False) -> str:
@@ -157,6 +158,13 @@ class Recipe:
         return Recipe(
             tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", former_format=True) for edit in former)
         )
+
+
+def _limited(result: "Tensor", image: "Tensor") -> "Tensor":
+    """Limit the result of a step to [0, 1], or to the range of the image (B, C, H, W) if that is larger."""
+    values = image.detach()
+    least, most = values.amin((1, 2, 3), keepdim=True), values.amax((1, 2, 3), keepdim=True)
+    return result.clamp(least.clamp(max=0), most.clamp(min=1))
 
 
 def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:

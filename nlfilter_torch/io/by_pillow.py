@@ -47,6 +47,9 @@ def read_by_pillow(
                 channels = imagecodecs.avif_decode(path.read_bytes())
                 channels = np.rint(channels * (65535 / (2**bits - 1))).astype(np.uint16)
             else:
+                if image.format == "PNG":  # load() ignores wrong checksums
+                    with Image.open(path) as again:
+                        again.verify()
                 channels = np.asarray(_plain_mode(image, path))
             return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
 

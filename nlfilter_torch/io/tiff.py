@@ -59,6 +59,9 @@ def read(
     """
     with decoding(path), TiffRows(path) as rows:
         check_size((rows.shape[1], rows.shape[0]), rows.dtype == np.float64)
+        ends = (at + count for at, count in zip(rows.page.dataoffsets, rows.page.databytecounts, strict=True) if count)
+        if max(ends, default=0) > path.stat().st_size:  # decoders of JPEG fill what is missing
+            raise EOFError("it ends too early")
         channels = np.asarray(rows.page.asarray())
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)

@@ -116,10 +116,13 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
 
 
 class Stage:
-    """A picture between two steps of an edit, and the step last fitted to it; ``stack`` closes its temporary file."""
+    """A picture between two steps of an edit, and the step last fitted to it.
 
-    def __init__(self, picture: Picture, stack: ExitStack) -> None:
-        self.picture, self._stack = picture, stack
+    ``stack`` closes its temporary file; ``limits`` are :attr:`Picture.limits` of the picture before the first step.
+    """
+
+    def __init__(self, picture: Picture, stack: ExitStack, limits: tuple[float, float] | None = None) -> None:
+        self.picture, self._stack, self._limits = picture, stack, limits
         self._fitted: tuple[Step, Tiled, Fitted] | None = None
 
     def fit(self, step: Step, passes: Passes) -> tuple[Tiled, Fitted]:
@@ -137,10 +140,11 @@ class Stage:
         """Apply a step to the whole picture; the result is in a temporary file."""
         tiled, fitted = self.fit(step, replace(passes, kind="float32"))
         stack = ExitStack()
-        clipped = ((rows, values.clip(0, 1)) for rows, values in tiled.rows(fitted))
+        limits = self._limits or self.picture.limits
+        clipped = ((rows, values.clip(*limits)) for rows, values in tiled.rows(fitted))
         source = stack.enter_context(intermediate(clipped, tiled.size, passes.folder))
         self.forget_columns()
-        return Stage(Picture(source, self.picture.name), stack)
+        return Stage(Picture(source, self.picture.name), stack, limits)
 
     def forget_columns(self) -> None:
         """Free the columns cached between passes."""

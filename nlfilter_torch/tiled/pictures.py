@@ -10,6 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.core.checks import warn_of_scale
+from nlfilter_torch.operator.features import reduce_channels
+
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
@@ -133,7 +136,7 @@ class Picture:
         self.size = (int(shape[0]), int(shape[1]))
         self.samples = int(shape[2]) if len(shape) == 3 else 1
         self.colours = channels or (3 if self.samples >= 3 else 1)
-        self.kind = kind
+        self.kind, self._scale_is_checked = kind, channels is None and kind not in WHITE
         self.dtype = torch.float64 if kind == "float64" else torch.float32
 
     @property
@@ -166,14 +169,26 @@ class Picture:
         )
         if self.kind in WHITE:
             values = values / np.float32(WHITE[self.kind])
-        elif not np.isfinite(values).all():
+        elif not np.isfinite(stored).all():
             raise ValueError(f"{self.name} holds NaN or infinite pixels; replace them first")
-        return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
+        image = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
+        if self._scale_is_checked:
+            self._scale_is_checked = not warn_of_scale(image, self.name)  # warns once
+        return image
 
     def tiles(self, margin: int, rows: int) -> Iterator[Tile]:
         """Yield all rows, in tiles of ``rows``."""
         for start in range(0, self.size[0], rows):
             yield self.tile(start, min(start + rows, self.size[0]), margin)
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """Limits of the values between steps of an edit: 0 and 1, or the range of a picture of floats if larger."""
+        if self.kind in WHITE:
+            return 0.0, 1.0
+        ends = [(float(tile.pixels.min()), float(tile.pixels.max())) for tile in self.tiles(0, self.statistics_rows)]
+        least, most = zip(*ends, strict=True)
+        return min(0.0, *least), max(1.0, *most)
 
     @property
     def statistics_rows(self) -> int:
@@ -196,3 +211,9 @@ def transparency(tile: Tile, kind: str) -> NDArray[Any]:
         return extra
     values = torch.from_numpy(np.ascontiguousarray(extra.astype(np.float64)).transpose(2, 0, 1))[None]
     return stored_as(values / WHITE.get(extra.dtype.name, 1), kind)
+
+
+def mask_of(tile: Tile) -> Tensor:
+    """Luminance (1, 1, h, W) of a tile of a mask, in [0, 1]; transparent pixels, which may have any colour, are 0."""
+    opacity = torch.from_numpy(transparency(tile, "float32")).prod(2).expand(tile.inner.shape[-2:])
+    return reduce_channels(tile.inner, "luminance").clamp(0, 1) * opacity

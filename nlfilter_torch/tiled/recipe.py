@@ -10,8 +10,7 @@ from torch import Tensor
 from nlfilter_torch.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.edits.changes import blend_edited
 from nlfilter_torch.edits.steps import Step, acting_steps
-from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile
+from nlfilter_torch.tiled.pictures import Picture, Rows, RowSource, Tile, mask_of
 from nlfilter_torch.tiled.scribbles import colour_rows, mask_rows
 from nlfilter_torch.tiled.source import Tiled
 from nlfilter_torch.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
@@ -35,10 +34,11 @@ def edit_tiling(passes: Passes, source: RowSource, steps: Sequence[Step], name: 
         OSError: if a temporary file does not fit.
     """
     steps = acting_steps(steps)
+    limits = Picture(source, name).limits if len(steps) > 1 else (0.0, 1.0)
     with ExitStack() as stack:
         for step in steps[:-1]:
             with step_tiling(step, replace(passes, kind="float32"), source, name) as tiling:
-                source = stack.enter_context(passes.stored(clipped(tiling)))
+                source = stack.enter_context(passes.stored(clipped(tiling, limits)))
         if steps:
             yield stack.enter_context(step_tiling(steps[-1], passes, source, name))
         else:
@@ -64,7 +64,7 @@ def edit_regions(
         def blended(tile: Tile) -> Tensor:
             image, stop = tile.inner, tile.start + tile.inner.shape[2]
             found = [one.tile(tile.start, stop, 0).inner.to(image) for one in edited]
-            grey = [reduce_channels(one.tile(tile.start, stop, 0).inner, "luminance").to(image) for one in shares]
+            grey = [mask_of(one.tile(tile.start, stop, 0)).to(image) for one in shares]
             return blend_edited(image, found, torch.cat(grey, dim=1))
 
         yield tile_by_tile(passes, Picture(source, name), blended)
@@ -90,6 +90,6 @@ def inner(tile: Tile) -> Tensor:
     return tile.inner
 
 
-def clipped(tiling: Tiling) -> Tiling:
-    """The same rows, in [0, 1]."""
-    return replace(tiling, edit=lambda tile: tiling.edit(tile).clamp(0, 1))
+def clipped(tiling: Tiling, limits: tuple[float, float]) -> Tiling:
+    """The same rows, with values in a range."""
+    return replace(tiling, edit=lambda tile: tiling.edit(tile).clamp(*limits))
