@@ -282,3 +282,22 @@ def test_half_precision_has_a_finite_gradient_by_the_noise() -> None:
     network(image, level.requires_grad_()).sum().backward()
     assert level.grad is not None
     assert level.grad.isfinite().all()
+
+
+def test_compiled() -> None:
+    torch.compiler.reset()
+    image = noisy(CAT[..., :20, :24], 0.1)
+    with torch.no_grad():
+        found = torch.compile(TRAINED_ONE, backend="eager")(image, 0.1)
+        torch.testing.assert_close(found, TRAINED_ONE(image, 0.1), atol=1e-5, rtol=0)
+
+
+def test_transforms_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"noisy must not be transformed by torch\.func"):
+        torch.vmap(lambda one: TRAINED_ONE(one, 0.1))(noisy(CAT, 0.1)[None])
+
+
+@pytest.mark.parametrize("turns", [2.0, True])
+def test_turns_are_whole_numbers(turns: object) -> None:
+    with pytest.raises(TypeError, match="turns must be an int"):
+        TRAINED_ONE(noisy(CAT, 0.1), 0.1, turns=turns)

@@ -278,3 +278,31 @@ def test_forward_mode_of_fitted_sliders_is_their_slope() -> None:
     step = 1e-6
     slope = (fitted(image + step * tangent) - fitted(image - step * tangent)) / (2 * step)
     torch.testing.assert_close(torch.func.jvp(fitted, (image,), (tangent,))[1], slope, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("bandwidth", [0.1, 1.0, 100.0])
+@pytest.mark.parametrize("name", ["spike", "checkerboard", "noise"])
+def test_sliders_of_nearly_proportional_layers_stay_near_the_true_ones(name: str, bandwidth: float) -> None:
+    guide = torch.zeros(1, 1, 24, 30).double()
+    if name == "spike":
+        guide[..., 5, 7] = 1
+    else:
+        guide[:] = (torch.arange(24)[:, None] + torch.arange(30)) % 2 if name == "checkerboard" else noise(1, 24, 30)
+    image = torch.rand(1, 2, 24, 30, generator=seeded(9)).double()
+    operator = nonlocal_operator(guide, num_landmarks=10, photometric_bandwidth=bandwidth)
+    target = polynomial_filter(operator, image, torch.tensor([3.0, 2.0, 0.5, 1.0]).double())
+    found = fit_alpha(operator, image, target)
+    assert found.abs().max() < 4
+    torch.testing.assert_close(polynomial_filter(operator, image, found), target, atol=1e-9, rtol=0)
+
+
+def test_only_the_proportions_of_a_mask_count_for_a_loss() -> None:
+    image = picture("coffee", 24, 30)
+    operator = nonlocal_operator(image, num_landmarks=20)
+    target = polynomial_filter(operator, image, torch.tensor([2.0, 1.5, 1.0])).clamp(min=0) ** 1.1
+    mask = torch.linspace(0.1, 1, 30).expand(1, 1, 24, 30)
+    one, many = (
+        fit_alpha(operator, image, target, order=2, mask=scale * mask, loss=torch.nn.functional.smooth_l1_loss)
+        for scale in (1, 255)
+    )
+    torch.testing.assert_close(one, many, atol=1e-4, rtol=0)

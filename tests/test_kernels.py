@@ -116,3 +116,30 @@ def test_convolution(size: tuple[int, int], dilation: int, channels: int, output
         with context:
             torch.testing.assert_close(convolution.convolve(*given).double(), exact + added, atol=3e-5, rtol=0)
             torch.testing.assert_close(convolution.convolve(*given[:4]).double(), exact, atol=3e-5, rtol=0)
+
+
+def test_convolution_under_autocast_and_vmap() -> None:
+    features, weight = random(2, 16, 9, 7), random(16, 16, 3, 3, seed=1) / 12
+    wanted = convolution.convolve(features, weight)
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(convolution.convolve(features, weight).float(), wanted, atol=0.05, rtol=0)
+    each = torch.vmap(lambda one: convolution.convolve(one[None], weight)[0])(features)
+    torch.testing.assert_close(each, wanted)
+
+
+def test_convolution_of_other_shapes_is_left_to_the_definition() -> None:
+    features, weight = random(1, 16, 9, 7), random(16, 16, 3, 3, seed=1) / 12
+    wanted = convolution.convolve(features, weight)
+    torch.testing.assert_close(convolution.convolve(features, weight, added=torch.ones(1, 16, 1, 1)), wanted + 1)
+    with pytest.raises(RuntimeError, match="bias"):
+        convolution.convolve(features, weight, torch.ones(3))
+    with pytest.raises(RuntimeError, match="channels"):
+        convolution.convolve(features[:, :8], weight)
+
+
+def test_negligible_entries_count_as_zero_in_gram_matrices() -> None:
+    factor = torch.tensor([[[1e-16, 1.0, 0.0], [2e-16, 0.0, 1.0]]])
+    for context in (nullcontext(), definitions_only()):
+        with context:
+            found = grams.sum_grams(factor, torch.ones(1, 3), None, 1)
+            assert torch.equal(found[0, 0], torch.eye(2).double())

@@ -360,3 +360,10 @@ def test_gradient_of_a_tiny_width_is_finite(opposed: bool) -> None:
     assert mask.isfinite().all()
     assert logarithm.grad is not None
     assert logarithm.grad.isfinite()
+
+
+def test_the_scale_of_a_region_does_not_count(spectrum) -> None:
+    region = regions().double()
+    wanted = diffusion_mask(spectrum, region)
+    torch.testing.assert_close(diffusion_mask(spectrum, region * 1e60), wanted)
+    torch.testing.assert_close(diffusion_mask(spectrum, region.float() * 3e38).double(), wanted, atol=1e-5, rtol=0)

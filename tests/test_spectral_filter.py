@@ -114,3 +114,12 @@ def test_captured_energy_of_large_and_small_images() -> None:
     expected = captured_energy(spectrum, image)
     for scale in (1e18, 1e-25):
         torch.testing.assert_close(captured_energy(spectrum, scale * image), expected, rtol=1e-5, atol=0)
+
+
+def test_a_response_may_be_a_condition() -> None:
+    image = picture("coffee", 20, 24)
+    spectrum = nonlocal_operator(image, num_landmarks=15).spectrum()
+    for residual in (0.0, 1.0):
+        found = spectral_filter(spectrum, image, lambda values: values > 0.5, residual=residual)
+        wanted = spectral_filter(spectrum, image, lambda values: (values > 0.5).float(), residual=residual)
+        assert torch.equal(found, wanted)

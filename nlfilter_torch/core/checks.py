@@ -302,7 +302,7 @@ def checked_response(response: Response, support: Tensor) -> Response:
             )
         if eigenvalues.shape == support.shape:
             check_finite(torch.where(support, gains.detach(), 0), "response")
-        return gains
+        return gains if gains.is_floating_point() else gains.to(eigenvalues)
 
     return checked
 

@@ -32,11 +32,14 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 Loss = Callable[[Tensor, Tensor], Tensor]
 
 # Combinations of unit-norm layers with a squared norm below this are rounding of the operator's dtype.
-CUT = {torch.float32: 1e-10, torch.float64: 1e-14}
+CUT = {torch.float32: 1e-10, torch.float64: 1e-11}
 ROUNDING = {torch.float32: 1e-13, torch.float64: 1e-30}  # power of a layer's rounding error, relative to the image's
-IDLE = 1e-20  # squared length of a slider direction that is rounding error, relative to the longest
+# Squared lengths of slider directions that are rounding error, relative to the longest and to the largest scale.
+SHORT, IDLE = 1e-14, 1e-20
 # A layer of less power than this, relative to the image, is the balancing error on a constant image.
 VANISHED = {torch.float32: 1e-9, torch.float64: 1e-22}
+# Least-squares steps: a nearly undetermined combination of sliders multiplies the rounding errors of the first step.
+REFINEMENTS = 3
 DESCENT_STEPS = 200
 HALF_LEVEL = 0.5 / 255
 OFF_LEVEL = 1e-3  # of a level: tolerance for 8-bit values stored as floats
@@ -74,7 +77,8 @@ def fit_alpha(
             ignored, and so are values beyond a target of 0 or 1, which a file clips. None is 0.5 / 255 for each target
             that, where it counts, holds only multiples of 1 / 255, and 0.0, ordinary least squares, for others.
         loss: ``loss(filtered, target)``, a number to be minimised by L-BFGS from the least-squares solution; None
-            returns that solution. Where ``mask`` is 0 both arguments are the target, and in between they are blended.
+            returns that solution. Where ``mask`` is 0 both arguments are the target, and between that and its
+            largest value they are blended.
 
     Returns:
         alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype, with the smallest mean squared error or
@@ -216,7 +220,10 @@ class _Problem:
         batch = 1 if self.shared else self.layers.shape[0]
         start = self.layers.new_zeros(batch, self.layers.shape[1])
         if self.dead_zone is None:
-            return self._least(self._step(start))
+            change = start
+            for _ in range(REFINEMENTS):
+                change = change + self._step(change)
+            return self._least(change)
         with torch.no_grad():
             change = replace(self, dead_zone=None)._step(start)
             for _ in range(NEWTON_STEPS):
@@ -236,7 +243,7 @@ class _Problem:
         moves = scale.unsqueeze(2) * idle  # combinations of sliders without effect
         inner = SymmetricMatrix.of(moves.mT @ moves)
         # Shorter directions are rounding error.
-        least = torch.maximum(CUT[torch.float64] * inner.eigenvalues[:, :1], IDLE * scale.amax(1, True).square())
+        least = torch.maximum(SHORT * inner.eigenvalues[:, :1], IDLE * scale.amax(1, True).square())
         real = inner.eigenvalues > least
         inverse = inner.apply(torch.reciprocal, real)
         return change - (moves @ (inverse @ (moves.mT @ change.unsqueeze(2)))).squeeze(2)
@@ -319,7 +326,7 @@ class _Problem:
             change = change_of(coefficients)
             filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
             if mask is not None:
-                filtered = torch.lerp(target, filtered, mask.to(filtered))
+                filtered = torch.lerp(target, filtered, mask.to(filtered) / mask.amax((1, 2, 3), keepdim=True))
             found = loss(filtered, target)
             check_tensor(found, "loss", "return a number that depends on the first image")
             if found.numel() != 1 or not found.requires_grad:

@@ -150,7 +150,8 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     """Check regions (B, K, H, W) and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
     check_image(region, name, batch=spectrum.factor.shape[0], empty=len(spectrum.factor) == 0)
     check_same_size(region, spectrum.size, name, "spectrum", spectrum.factor)
-    flat = region.to(spectrum.factor).flatten(2)
+    largest = spectrum.among.max(region.detach().abs().amax((2, 3), keepdim=True))  # sums of huge values overflow
+    flat = (region / torch.where(largest > 0, largest, 1.0)).to(spectrum.factor).flatten(2)
     if not is_hidden(flat) and bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
     total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))

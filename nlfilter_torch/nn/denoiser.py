@@ -18,8 +18,9 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.core.kernels.convolution import SLOPE, convolve
+from nlfilter_torch.core.kernels.convolution import SLOPE, channels_last, convolve
 from nlfilter_torch.core.precision import as_given, full_precision, per_image, working_dtype
+from nlfilter_torch.core.values import refuse_transforms
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
@@ -133,6 +134,7 @@ class NonlocalDenoiser(nn.Module):
         Raises:
             TypeError, ValueError: if an argument has the wrong shape or is not finite, or noise is negative.
         """
+        refuse_transforms("noisy", noisy, noise)
         if isinstance(noisy, Tensor) and noisy.ndim == 3:
             one = isinstance(noise, Tensor) and noise.ndim == 3
             each = noise.unsqueeze(0) if one else noise  # type: ignore[union-attr]
@@ -148,6 +150,7 @@ class NonlocalDenoiser(nn.Module):
 
         Values outside ``inner`` are unspecified.
         """
+        check_count(turns, "turns")
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
         quarters = range(0, 4, 4 // turns)
@@ -174,7 +177,7 @@ class NonlocalDenoiser(nn.Module):
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
         planes, levels = split_colours(noisy / scale, noise / scale)
         seen = torch.cat([_centred(planes), 10 * levels], dim=1)
-        first = self.first(seen.contiguous(memory_format=torch.channels_last))
+        first = self.first(channels_last(seen))
         levels = levels[:, (0, 1, 1)]
         pixels, *others = [ROUGH_PIXELS] * (self.passes - 1) + [PIXELS]
         features, estimate, _ = self._pass(first, planes, levels, pixels)
@@ -199,7 +202,7 @@ class NonlocalDenoiser(nn.Module):
         for layer in self.before:
             features = layer(features, features)
         found = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
-        both = torch.cat([_centred(planes - found), 2 * found], dim=1).contiguous(memory_format=torch.channels_last)
+        both = channels_last(torch.cat([_centred(planes - found), 2 * found], dim=1))
         weights = self.join.weight.split([WIDTH, 2 * PLANES], dim=1)
         rest = F.conv2d(both, weights[1], self.join.bias, padding=1)
         features = convolve(features, weights[0], added=rest)
@@ -214,8 +217,7 @@ class NonlocalDenoiser(nn.Module):
         The filter has a landmark for every so many ``pixels``.
         """
         height, width = planes.shape[-2:]
-        found = full_precision(self.guide)(features.to(planes))
-        guide, logits = found.split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
+        guide, logits = self._guide_of(features.to(planes)).split([FEATURES, LEVELS * (ORDER + 1)], dim=1)
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
         alike, near = self.log_bandwidths.exp()
         places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / near
@@ -227,6 +229,12 @@ class NonlocalDenoiser(nn.Module):
         # Cumulative sums: the sliders increase to 1 for the smooth layer, so that the filter computes means of pixels.
         sliders = logits.unflatten(1, (ORDER + 1, LEVELS)).softmax(1).cumsum(1)[:, :, (0, 1, 1)]
         return (sliders * detail_layers(operator, planes, order=ORDER)).sum(1)
+
+    @full_precision
+    def _guide_of(self, features: Tensor) -> Tensor:
+        """Guide and sliders before their normalisation, (B, FEATURES + LEVELS (ORDER + 1), H, W)."""
+        found: Tensor = self.guide(features)
+        return found
 
 
 def shapes_of(denoiser: NonlocalDenoiser) -> dict[str, tuple[int, ...]]:

@@ -26,11 +26,16 @@ VALUES = torch.tensor(
 def _compiled_convolve(
     features: Tensor, weight: Tensor, bias: Tensor | None = None, dilation: int = 1, added: Tensor | None = None
 ) -> Tensor | None:
-    outputs, (_, channels, height, width) = len(weight), features.shape
+    outputs, (batch, channels, height, width) = len(weight), features.shape
     if channels % LANES or weight.shape[1:] != (channels, 3, 3):
         return None
+    if bias is not None and bias.shape != (outputs,):
+        return None
+    if added is not None and added.shape != (batch, outputs, height, width):
+        return None
     missing = (0, -outputs % LANES)
-    weights = torch.kron(VALUES, VALUES) @ F.pad(weight.permute(2, 3, 1, 0), missing).reshape(9, -1)  # (36, C O)
+    with torch.autocast("cpu", enabled=False):
+        weights = torch.kron(VALUES, VALUES) @ F.pad(weight.permute(2, 3, 1, 0), missing).reshape(9, -1)  # (36, C O)
     padded = weights.new_zeros(weights.shape[1] // channels) if bias is None else F.pad(bias, missing)
     features = features.permute(0, 2, 3, 1).contiguous()
     added = None if added is None else added.permute(0, 2, 3, 1).contiguous()
@@ -67,4 +72,9 @@ def convolve(
 ) -> Tensor:
     """Convolve rectified features (B, C, H, W), with zeros around them, and add (B, O, H, W); channels lie last."""
     found = F.conv2d(F.leaky_relu(features, SLOPE), weight, bias, padding=dilation, dilation=dilation)
-    return (found if added is None else found + added).contiguous(memory_format=torch.channels_last)
+    return channels_last(found if added is None else found + added)
+
+
+def channels_last(planes: Tensor) -> Tensor:
+    """Planes (B, C, H, W) with their channels last in memory; unlike ``Tensor.contiguous``, it works under ``vmap``."""
+    return planes.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
