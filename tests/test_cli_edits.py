@@ -333,4 +333,6 @@ def test_an_empty_picture_of_scribbles_is_refused_beside_rectangles(
         ("recolor", "--strokes", clear, "--region", "5,5,9,9:red"),
     ):
         said = refused(capsys, str(verb), photo, out, *options)
-        assert f"{options[1]} is {'black' if options[1] == black else 'transparent'} everywhere" in said
+        assert (
+            f"{options[1]} is {'darker than middle grey' if options[1] == black else 'transparent'} everywhere" in said
+        )

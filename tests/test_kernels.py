@@ -135,11 +135,3 @@ def test_convolution_of_other_shapes_is_left_to_the_definition() -> None:
         convolution.convolve(features, weight, torch.ones(3))
     with pytest.raises(RuntimeError, match="channels"):
         convolution.convolve(features[:, :8], weight)
-
-
-def test_negligible_entries_count_as_zero_in_gram_matrices() -> None:
-    factor = torch.tensor([[[1e-16, 1.0, 0.0], [2e-16, 0.0, 1.0]]])
-    for context in (nullcontext(), definitions_only()):
-        with context:
-            found = grams.sum_grams(factor, torch.ones(1, 3), None, 1)
-            assert torch.equal(found[0, 0], torch.eye(2).double())

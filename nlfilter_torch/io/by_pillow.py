@@ -22,11 +22,7 @@ def read_by_pillow(
     """Read channels (H, W, S), orientation, profile and EXIF of a PNG, JPEG, WebP or AVIF file."""
     with tiff.decoding(path):
         try:
-            with warnings.catch_warnings():
-                # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                warnings.simplefilter("ignore", UserWarning)  # warnings about EXIF, see exif.split
-                image: ImageFile.ImageFile = Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
+            image = _opened(path)
         except Image.DecompressionBombError as error:
             raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
         except UnidentifiedImageError as error:
@@ -48,10 +44,18 @@ def read_by_pillow(
                 channels = np.rint(channels * (65535 / (2**bits - 1))).astype(np.uint16)
             else:
                 if image.format == "PNG":  # load() ignores wrong checksums
-                    with Image.open(path) as again:
+                    with _opened(path) as again:
                         again.verify()
                 channels = np.asarray(_plain_mode(image, path))
             return channels.reshape(*channels.shape[:2], -1), orientation, image.info.get("icc_profile"), exif
+
+
+def _opened(path: Path) -> ImageFile.ImageFile:
+    with warnings.catch_warnings():
+        # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        warnings.simplefilter("ignore", UserWarning)  # warnings about EXIF, see exif.split
+        return Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
 
 
 def _head(path: Path) -> bytes:

@@ -1,9 +1,5 @@
 /* Gram matrices of the scaled factor; defined in grams.py. */
 
-#define NEGLIGIBLE 1e-15f /* as in grams.py */
-
-INLINE float NAME(shrunk)(float x) { return x > NEGLIGIBLE || x < -NEGLIGIBLE || x != x ? x : 0.0f; }
-
 /* totals (J, M, M) += F diag(r^j) F^T over pixels first to last, with F = factor diag(d). Lower triangles only. */
 static TARGET void NAME(grams)(const struct grams *task, long first, long last, float *scratch, double *totals)
 {
@@ -15,7 +11,7 @@ static TARGET void NAME(grams)(const struct grams *task, long first, long last, 
         for (long m = 0; m < num_landmarks; m++) {
             const float *column = task->factor + m * task->factor_stride + start;
             for (long i = 0; i < width; i++)
-                scaled[m * step + i] = NAME(shrunk)(column[i] * task->scaling[start + i]);
+                scaled[m * step + i] = column[i] * task->scaling[start + i];
             for (long i = width; i < whole; i++)
                 scaled[m * step + i] = 0.0f;
         }
