@@ -1,5 +1,6 @@
 """Region masks: regression and local solve against dense ones, single scribbles, tiles and gradients."""
 
+import heapq
 import math
 from typing import Any
 
@@ -9,10 +10,10 @@ import torch
 
 from nlfilter_torch import nonlocal_operator, region_mask
 from nlfilter_torch.edits import mask as masks
-from nlfilter_torch.edits import matting
+from nlfilter_torch.edits import matting, scribbled_colours
 from nlfilter_torch.edits.in_memory import InMemory, InMemoryOperator
 from nlfilter_torch.edits.resizing import enlarged
-from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, evenness, every_nth
+from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, evenness, every_nth, linked_evenly
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
 from nlfilter_torch.tiled import sampling
 from nlfilter_torch.tiled.pictures import Picture
@@ -43,7 +44,11 @@ def test_one_scribble_is_enough_and_the_background_may_be_painted() -> None:
         assert ((found > 0.5) == (inside > 0.5)).float().mean() > 0.99
 
 
-def test_the_regression_is_the_best_estimate_from_scribbles_and_the_frame() -> None:
+@pytest.mark.parametrize("enlarged", [1.0, 3.0])
+def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
+    monkeypatch: pytest.MonkeyPatch, enlarged: float
+) -> None:
+    monkeypatch.setattr(masks, "FRAME_PIXELS", 20 * 24 / enlarged)
     image = colour("coffee", 20, 24).double()
     front, back = box(9, 10, 3, 4, size=(20, 24)).double(), box(2, 3, 2, 3, size=(20, 24)).double()
     source = InMemory(image)
@@ -52,18 +57,22 @@ def test_the_regression_is_the_best_estimate_from_scribbles_and_the_frame() -> N
     marked = masks._against(source.regions(front, "a"), 0, source.regions(back, "b"))
     held = InMemoryOperator(operator, source)
     places = masks.frame_places((20, 24))
-    unlike = noise(1, 1, len(places), seed=4)
-    found = masks._regression(source, held, marked, held.at(places), unlike, 0.6)(source)
+    grid = torch.tensor([24 * row + column for row in (7, 14) for column in (3, 8, 18)])
+    unlike, linked, within = (noise(1, 1, n, seed=k) for k, n in ((4, len(places)), (5, len(places)), (6, len(grid))))
+    frame, inside = (held.at(places), unlike, linked), (held.at(grid), within)
+    found = masks._regression(source, held, marked, frame, inside, 0.6)(source)
 
     def estimate(values: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
         flat = (values.flatten().numpy(), weights.flatten().numpy())
         return kriging(operator.spectrum(), *flat, 1.0, 0.6, masks.SMOOTHNESS)
 
     first = estimate(front, front + back)
-    weights = (front + back).flatten()
-    assert not bool(weights[places].any())  # here the scribbles do not touch the frame
-    weights[places] = torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
-    expected = estimate(front, weights)
+    values, weights = front.flatten().clone(), (front + back).flatten()
+    assert not bool(weights[torch.cat([places, grid])].any())  # here the scribbles touch neither
+    assert len(torch.cat([places, grid]).unique()) == len(places) + len(grid)
+    weights[places] = enlarged * torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
+    values[places], weights[grid], values[grid] = linked[0, 0], within[0, 0], 1.0
+    expected = estimate(values, weights)
     np.testing.assert_allclose(found.flatten(), expected, atol=2e-5)
 
 
@@ -319,13 +328,70 @@ def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
     scribbles = Scribbles(torch.tensor([0]), torch.tensor([[[1.0], [0.0]]]).double(), image[..., 0])
     frame, unlike = image.squeeze(2), torch.tensor([[[0.0, 1.0, 1.0]]]).double()
 
-    def likelihoods(likely: float) -> torch.Tensor:
+    def likelihoods(likely: float, inside: float = 0.0) -> torch.Tensor:
         by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
-        return colour_likelihood(image, scribbles, frame, unlike, by_regression, 0.08).flatten()
+        grid, linked = image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double()
+        return colour_likelihood(image, scribbles, frame, unlike, by_regression, grid, linked, 0.08).flatten()
 
     assert likelihoods(0.9)[:2].min() > 0.95
     assert likelihoods(0.1)[1] < 0.05
     assert likelihoods(0.9)[2] < 0.05
+    assert likelihoods(0.1, inside=1.0)[1] > 2 * likelihoods(0.1)[1]
+
+
+def best_path(even: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
+    """Least evenness along the best path from the starts to every pixel, (H, W), by Dijkstra's algorithm."""
+    found = torch.zeros_like(even)
+    queue = [(-float(even[tuple(place)]), *place) for place in starts.nonzero().tolist()]
+    heapq.heapify(queue)
+    while queue:
+        value, row, column = heapq.heappop(queue)
+        if -value <= float(found[row, column]):
+            continue
+        found[row, column] = -value
+        for y, x in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if 0 <= y < even.shape[0] and 0 <= x < even.shape[1]:
+                heapq.heappush(queue, (max(value, -float(even[y, x])), y, x))
+    return found
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (12, 1), (17, 23)])
+def test_links_follow_the_best_path(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]) -> None:
+    monkeypatch.setattr(scribbled_colours, "LINK_STEP", 1)
+    even = noise(2, 1, *size)
+    scribbles = (noise(2, 2, *size, seed=1) > 0.9).double() * 0.3
+    found = linked_evenly(even, scribbles)
+    for k in range(2):
+        front, back = (best_path(even[k, 0], scribbles[k, side] > 0) for side in (0, 1))
+        limits = scribbled_colours.UNLINKED, scribbled_colours.LINKED
+        expected = ((front - back - limits[0]) / (limits[1] - limits[0])).clamp(0, 1)
+        torch.testing.assert_close(found[k, 0], expected)
+
+
+def test_links_pass_no_border_narrower_than_the_search() -> None:
+    image = torch.full((1, 3, 60, 90), 0.6).double()
+    image[..., 40] = 0.2  # a line of one pixel, such as a mast
+    scribble = torch.zeros(1, 2, 60, 90).double()
+    scribble[:, 0, 20:30, 5:15] = 1
+    found = linked_evenly(evenness(image), scribble)
+    assert found[..., :30].min() == 1
+    assert found[..., 50:].max() == 0
+
+
+@pytest.mark.parametrize("building", [True, False])
+def test_one_scribble_selects_a_sky_whose_colour_changes(building: bool) -> None:
+    down = torch.linspace(0, 1, 120).view(1, 1, -1, 1)
+    top, horizon = (torch.tensor(colours).view(1, 3, 1, 1) for colours in ((0.25, 0.45, 0.85), (0.85, 0.8, 0.7)))
+    image = torch.lerp(top, horizon, down).expand(1, 3, 120, 160).clone()
+    image[..., 90:, :] = torch.rand(1, 3, 30, 160, generator=torch.Generator().manual_seed(0)) * 0.3
+    if building:
+        image[..., 30:90, 60:90] = torch.tensor([0.5, 0.35, 0.3]).view(1, 3, 1, 1)
+    found = region_mask(image, box(10, 20, 6, 40, size=(120, 160)).float())
+    assert found[..., 80:86, :50].min() > 0.8
+    assert found[..., 80:86, 100:].min() > 0.8
+    assert found[..., 96:, :].mean() < 0.1
+    if building:
+        assert found[..., 36:84, 66:84].mean() < 0.5
 
 
 def test_pixels_to_compare_do_not_depend_on_other_images() -> None:

@@ -2,10 +2,11 @@
 
 A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
 texture separates foreground from background, together with the colours of single pixels
-(:mod:`nlfilter_torch.edits.scribbled_colours`). Two local solves (:mod:`nlfilter_torch.edits.matting`) then align the
-borders of the mask with those of the picture. Both run on a copy reduced to about :data:`SOLVED` pixels, so the cost
-hardly grows with the size of the picture. The result is a linear function of the colour for each place, which gives the
-mask of any pixel from its own colour; results in tiles are therefore exact.
+(:mod:`nlfilter_torch.edits.scribbled_colours`). Points that an even area, such as a sky, links to a scribble count as
+scribbled, too. Two local solves (:mod:`nlfilter_torch.edits.matting`) then align the borders of the mask with those of
+the picture. Both run on a copy reduced to about :data:`SOLVED` pixels, so the cost hardly grows with the size of the
+picture. The result is a linear function of the colour for each place, which gives the mask of any pixel from its own
+colour; results in tiles are therefore exact.
 """
 
 import math
@@ -23,7 +24,14 @@ from nlfilter_torch.edits.matting import LinearMasks, linear_mask, linear_models
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.pixels import corner
 from nlfilter_torch.edits.resizing import block_means, enlarged
-from nlfilter_torch.edits.scribbled_colours import colour_likelihood, evenness, frame_places, likeness
+from nlfilter_torch.edits.scribbled_colours import (
+    colour_likelihood,
+    evenness,
+    frame_places,
+    inner_places,
+    likeness,
+    linked_evenly,
+)
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.edits.source import Blocks, Fitted, Guide, Operator, Planes, Source
@@ -45,6 +53,7 @@ COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask;
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
+FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
 EPSILON = 1e-6
 
@@ -72,8 +81,9 @@ def region_mask(
     """Soft object masks from foreground and background scribbles.
 
     A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
-    similar to background scribbles do not. Points along the borders of the picture also count as background unless they
-    resemble the region, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
+    similar to background scribbles do not. An even area, such as a sky, that holds a scribble belongs to the region as a
+    whole. Points along the borders of the picture also count as background unless they resemble the region or are part
+    of such an area, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
     :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
 
     Args:
@@ -86,7 +96,7 @@ def region_mask(
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
             include less similar pixels.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
-        spatial_bandwidth: in pixels; None is 0.6 of the short side, ``math.inf`` no limit: similar pixels anywhere.
+        spatial_bandwidth: in pixels; None is 0.45 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         num_landmarks: M of the operator.
         **options: further ones of :func:`nonlocal_operator`, such as ``generator``.
 
@@ -229,13 +239,19 @@ def fit_regions(
         options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
     operator = small.operator(Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
-    frame, colours = operator.at(places), small.colours(places)
-    even = small.kept("evenness", [], lambda: evenness(small.image).flatten(2)[:, :, places])
+    inner = inner_places(small.size)
+    at_frame, at_grid = operator.at(places), operator.at(inner)
+    colours, inner_colours = small.colours(places), small.colours(inner)
+    even = small.kept("evenness", [], lambda: evenness(small.image))
     rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
     for number, marked in enumerate(marks):
         unlike = 1 - likeness(marked.image, marked.weights[:, :1], colours, bandwidth)
-        likely = sharpened(_regression(small, operator, marked, frame, unlike, reach)(small))
-        compared = [unlike, likely.flatten(2)[:, :, places] * even, bandwidth]
+        linked = linked_evenly(even, marked.planes(small)).flatten(2)
+        own, within = linked[:, :, places], linked[:, :, inner]
+        regression = _regression(small, operator, marked, (at_frame, unlike, own), (at_grid, within), reach)
+        likely = sharpened(regression(small))
+        own = torch.maximum((likely * even).flatten(2)[:, :, places], own)
+        compared = [unlike, own, inner_colours, within, bandwidth]
         by_colour = small.kept(
             ("likelihood", number),
             [marked.image, marked.weights, *compared],
@@ -295,12 +311,23 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
 
 
 def _regression(
-    source: Source, operator: Operator, marked: Scribbles, frame: Blocks, unlike: Tensor, reach: float | Tensor
+    source: Source,
+    operator: Operator,
+    marked: Scribbles,
+    frame: tuple[Blocks, Tensor, Tensor],
+    inside: tuple[Blocks, Tensor],
+    reach: float | Tensor,
 ) -> Planes:
     """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
 
-    From scribbles on the region and on its background, and the pixels along the borders of the picture: ``frame`` has
-    their columns, ``unlike`` their dissimilarity to the scribbles on the region, (B, 1, n).
+    Args:
+        source: the picture.
+        operator: its operator.
+        marked: scribbles on the region and on its background.
+        frame: pixels along the borders of the picture: their columns, dissimilarity to the scribbles on the region, and
+            :func:`linked_evenly` to these, (B, 1, n).
+        inside: pixels on a grid: their columns, and :func:`linked_evenly`, (B, 1, m).
+        reach: that of :func:`region_mask`.
     """
     columns, weights = operator.at(marked.places), marked.weights
     total = weights.sum(1, keepdim=True).clamp(max=1.0)
@@ -310,8 +337,10 @@ def _regression(
     known = [(columns, total, values)]
     opposed = (weights[:, 1].detach() > 0).any(1).to(weights)  # 1 for images with scribbles on the background
     first = fit(lambda: scribbled_blocks(known), strength=opposed)
-    unlike = unlike * torch.cat([(1 - first(block)).clamp(0.0, 1.0).square() for block in frame()], dim=2)
-    known.append((frame, unlike, torch.zeros_like(unlike)))
+    at_frame, unlike, linked = frame
+    unlike = unlike * torch.cat([(1 - first(block)).clamp(0.0, 1.0).square() for block in at_frame()], dim=2)
+    known.append((at_frame, unlike * max(1.0, pixels / FRAME_PIXELS), linked))
+    known.append((*inside, torch.ones_like(inside[1])))
     fitted = fit(lambda: scribbled_blocks(known), strength=1.0)
     return operator.each(lambda found: fitted(found.factor))
 

@@ -320,7 +320,7 @@ MASK = Edit(
     (
         REACH,
         TOLERANCE,
-        *(p for p in filter_parameters(share=0.6)[1:] if p.name != "patch_size"),
+        *(p for p in filter_parameters(share=0.45)[1:] if p.name != "patch_size"),
     ),
     function="region_mask",
 )

@@ -7,6 +7,7 @@ separate hair and thin parts, too, where their colours differ.
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import pixel_blocks
@@ -22,6 +23,9 @@ NUM_COLOURS = 32  # approximate number of scribbled pixels on each side that the
 BANDWIDTH_SHARE = 0.4  # bandwidth of that comparison as a share of the photometric bandwidth
 EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
 HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
+UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path from scribbles: up to which it links nothing, and fully
+LINK_STEP = 3  # step of the search for paths in pixels; EVEN_SIGMA makes borders wider than that
+INNER_ROWS = 16  # rows of points inside the picture that are compared
 MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
 SMALLEST_EXPONENT = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
 EPSILON = 1e-6
@@ -36,6 +40,43 @@ def frame_places(size: tuple[int, int]) -> Tensor:
     lines = [(top + 0 * columns, columns), (height - 1 - top + 0 * columns, columns)]
     lines += [(rows, left + 0 * rows), (rows, width - 1 - left + 0 * rows)]
     return torch.cat([down * width + along for down, along in lines]).unique()
+
+
+def inner_places(size: tuple[int, int]) -> Tensor:
+    """Indices (n,), ascending, of pixels on a regular grid."""
+    height, width = size
+    step = max(1, min(size) // INNER_ROWS)
+    rows, columns = torch.arange(step // 2, height, step), torch.arange(step // 2, width, step)
+    return (rows.unsqueeze(1) * width + columns).flatten()
+
+
+@torch.no_grad()
+def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
+    """How certainly an even area, such as a sky, links each pixel to scribbles on a region, (B, 1, H, W) in [0, 1].
+
+    The least evenness along the best path to such a scribble, minus that along the best path to one on the background.
+    It has no gradient, and is 0 or 1 nearly everywhere.
+
+    Args:
+        even: :func:`evenness`, (B, 1, H, W).
+        scribbles: weights of those on the region and on its background, (B, 2, H, W).
+    """
+    height, width = even.shape[-2:]
+    step = min(LINK_STEP, height, width)
+    passable = -F.max_pool2d(-even, step, ceil_mode=True)
+    found = passable * F.max_pool2d((scribbles > 0).to(even), step, ceil_mode=True)
+    passable, before = passable.expand_as(found), torch.empty_like(found)
+    while not torch.equal(found, before):  # as often as the paths turn
+        before.copy_(found)
+        for axis in (2, 3):
+            lines, limits = found.unbind(axis), passable.unbind(axis)
+            count = len(lines)
+            for direction, order in ((-1, range(1, count)), (1, range(count - 2, -1, -1))):
+                for k in order:
+                    torch.maximum(lines[k], limits[k].minimum(lines[k + direction]), out=lines[k])
+    front, back = found.split(1, dim=1)
+    linked = ((front - back - UNLINKED) / (LINKED - UNLINKED)).clamp(0.0, 1.0)
+    return linked.repeat_interleave(step, 2).repeat_interleave(step, 3)[..., :height, :width]
 
 
 def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
@@ -58,7 +99,14 @@ def evenness(image: Tensor) -> Tensor:
 
 
 def colour_likelihood(
-    image: Tensor, marked: Scribbles, frame: Tensor, unlike: Tensor, likely: Tensor, bandwidth: float | Tensor
+    image: Tensor,
+    marked: Scribbles,
+    frame: Tensor,
+    unlike: Tensor,
+    likely: Tensor,
+    inner: Tensor,
+    linked: Tensor,
+    bandwidth: float | Tensor,
 ) -> Tensor:
     """Likelihood (B, 1, h, w), in [0, 1], that a pixel belongs to a region, by its own colour alone.
 
@@ -73,6 +121,8 @@ def colour_likelihood(
         likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
             region, such as a sky, reaches the border of the picture, they show its colours far from its scribbles; in
             textures, the regression is too often wrong for that.
+        inner: colours (B, C, m) of :func:`inner_places`.
+        linked: :func:`linked_evenly` of these, (B, 1, m).
         bandwidth: photometric bandwidth of the regression.
     """
     places = hundredths_of_lab(image).flatten(2)
@@ -82,7 +132,8 @@ def colour_likelihood(
     shares = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
     shares = shares / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
     within, around = density(places, colours_in_lab(frame), shares, scale).split(1, dim=1)
-    inside = inside + within
+    shares = linked / linked.sum(2, keepdim=True).clamp(min=1.0)
+    inside = inside + within + density(places, colours_in_lab(inner), shares, scale)
     opposed = (marked.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
     outside = torch.where(opposed, (outside + around) / 2, around)
     return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
