@@ -81,7 +81,7 @@ def region_mask(
     """Soft object masks from foreground and background scribbles.
 
     A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
-    similar to background scribbles do not. An even area, such as a sky, that holds a scribble belongs to the region as a
+    similar to background scribbles do not. An even area with a scribble, such as a sky, belongs to the region as a
     whole. Points along the borders of the picture also count as background unless they resemble the region or are part
     of such an area, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
     :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
