@@ -31,11 +31,11 @@ ALPHA = (3.0, 3.0, 4.0, 1.0)
 def detail() -> dict[str, Tensor]:
     """Detail enhancement of a suit."""
     image, scale = scene("astronaut", SIZE)
-    spot = spots(image, scale, (60, 300, 20, 20))
+    spot = spots(image, scale, (60, 300, 20, 20), (300, 300, 20, 20))
     wide = (..., slice(130, 130 + round(512 / WIDE)), slice(None))
     panels = {
-        "A spot (yellow)": marked(image, spot),
-        "What is like it": region_mask(image, spot),
+        "Spots (yellow)": marked(image, spot),
+        "What is like them": region_mask(image, spot),
         "Detail where it is alike": enhance(image, torch.tensor(ALPHA), spot),
     }
     return {title: panel[wide] for title, panel in panels.items()}
