@@ -62,7 +62,6 @@ def apply(
     for recipe, name in zip(recipes, preset, strict=True):
         showing.note_idle(recipe, name)
     colorizes = any(step.edit == "colorize" for recipe in recipes for step in recipe.acting)
-
     looks = [step for recipe in recipes for step in recipe.acting if step.edit == "look"]
 
     def work(photograph: Photograph) -> Tensor:

@@ -190,8 +190,8 @@ SliderRegions = _rectangles(
 )
 MaskFile = _file(
     "--mask",
-    "A picture of the same size as the photograph, white where selected and "
-    "black elsewhere. Pixels darker than middle grey are not selected.",
+    "A picture of the same size as the photograph, white where selected and black elsewhere. Pixels darker than middle "
+    "grey are not selected.",
 )
 _LOOK_MASK = "A grey picture of the size of the photograph, white in the region of one look. May be repeated."
 Masks = Annotated[list[Path] | None, typer.Option("--mask", metavar="FILE", help=_LOOK_MASK)]

@@ -65,7 +65,7 @@ def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
     step = min(LINK_STEP, height, width)
     passable = -F.max_pool2d(-even, step, ceil_mode=True)
     found = passable * F.max_pool2d((scribbles > 0).to(even), step, ceil_mode=True)
-    passable, before = passable.expand_as(found), torch.empty_like(found)
+    passable, before = passable.expand_as(found), torch.full_like(found, -1.0)
     while not torch.equal(found, before):  # as often as the paths turn
         before.copy_(found)
         for axis in (2, 3):

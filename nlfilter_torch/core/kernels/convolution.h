@@ -78,82 +78,95 @@ INLINE void NAME(products)(const struct convolution *task, long count, const flo
             }
 }
 
+/* Transform the rectified pixels of a tile whose results begin at (top, left): 36 rows of channels, TILES rows apart.
+ * Pixels outside the picture are `zeros`. */
+INLINE void NAME(transform_tile)(const struct convolution *task, long top, long left, const float *zeros, float *out)
+{
+    const long channels = task->channels, apart = task->dilation;
+    const float *sources[6][6];
+    for (long i = 0; i < 6; i++)
+        for (long j = 0; j < 6; j++) {
+            const long y = top + (i - 1) * apart, x = left + (j - 1) * apart;
+            const int inside = y >= 0 && y < task->height && x >= 0 && x < task->width;
+            sources[i][j] = inside ? task->features + (y * task->width + x) * channels : zeros;
+        }
+    for (long c = 0; c < channels; c += LANES) {
+        FLOATS rows[6][6];
+        for (int j = 0; j < 6; j++) {
+            FLOATS column[6], found[6];
+#pragma GCC unroll 6
+            for (int i = 0; i < 6; i++)
+                column[i] = NAME(leaky)(*(const FLOATS *)(sources[i][j] + c), task->slope);
+            NAME(transform)(column, found);
+#pragma GCC unroll 6
+            for (int i = 0; i < 6; i++)
+                rows[i][j] = found[i];
+        }
+        for (int i = 0; i < 6; i++) {
+            FLOATS found[6];
+            NAME(transform)(rows[i], found);
+#pragma GCC unroll 6
+            for (int j = 0; j < 6; j++)
+                *(FLOATS *)(out + (i * 6 + j) * TILES * channels + c) = found[j];
+        }
+    }
+}
+
+/* Compute the results of a tile from its products, 36 rows of outputs, TILES rows apart; add bias and `added`. */
+INLINE void NAME(restore_tile)(const struct convolution *task, long top, long left, const float *products)
+{
+    const long outputs = task->outputs, apart = task->dilation;
+    for (long o = 0; o < outputs; o += LANES) {
+        const long width = outputs - o < LANES ? outputs - o : LANES;
+        const FLOATS bias = *(const FLOATS *)(task->bias + o);
+        FLOATS rows[4][6];
+        for (int j = 0; j < 6; j++) {
+            FLOATS column[6], found[4];
+#pragma GCC unroll 6
+            for (int i = 0; i < 6; i++)
+                column[i] = *(const FLOATS *)(products + (i * 6 + j) * TILES * task->padded_outputs + o);
+            NAME(restore)(column, found);
+#pragma GCC unroll 4
+            for (int i = 0; i < 4; i++)
+                rows[i][j] = found[i];
+        }
+        for (int i = 0; i < 4 && top + i * apart < task->height; i++) {
+            FLOATS found[4];
+            NAME(restore)(rows[i], found);
+            for (int j = 0; j < 4 && left + j * apart < task->width; j++) {
+                const long place = ((top + i * apart) * task->width + left + j * apart) * outputs + o;
+                FLOATS sum = found[j] + bias;
+                if (width == LANES) {
+                    if (task->added)
+                        sum += *(const FLOATS *)(task->added + place);
+                    *(FLOATS *)(task->out + place) = sum;
+                } else
+                    for (long k = 0; k < width; k++)
+                        task->out[place + k] = sum[k] + (task->added ? task->added[place + k] : 0.0f);
+            }
+        }
+    }
+}
+
 /* Compute tiles first to last. Those of each phase of the dilation, whose pixels are `dilation` apart, follow each other
  * row by row. */
 static TARGET void NAME(convolution)(const struct convolution *task, long first, long last, float *scratch)
 {
-    const long channels = task->channels, outputs = task->outputs, padded_outputs = task->padded_outputs;
-    const long apart = task->dilation, across = task->tiles_across, each = task->tiles_down * across;
+    const long channels = task->channels, apart = task->dilation, across = task->tiles_across;
+    const long each = task->tiles_down * across; /* tiles of a phase */
     float *zeros = scratch, *pixels = zeros + channels, *products = pixels + 36 * TILES * channels;
     memset(zeros, 0, channels * sizeof(float));
     for (long start = first; start < last; start += TILES) {
         const long count = last - start < TILES ? last - start : TILES;
-        long top[TILES], left[TILES]; /* first of the 4x4 results */
+        long top[TILES], left[TILES];
         for (long t = 0; t < count; t++) {
             const long phase = (start + t) / each, tile = (start + t) % each;
             top[t] = phase / apart + 4 * apart * (tile / across);
             left[t] = phase % apart + 4 * apart * (tile % across);
-        }
-        for (long t = 0; t < count; t++) {
-            const float *sources[6][6];
-            for (long i = 0; i < 6; i++)
-                for (long j = 0; j < 6; j++) {
-                    const long y = top[t] + (i - 1) * apart, x = left[t] + (j - 1) * apart;
-                    const int inside = y >= 0 && y < task->height && x >= 0 && x < task->width;
-                    sources[i][j] = inside ? task->features + (y * task->width + x) * channels : zeros;
-                }
-            for (long c = 0; c < channels; c += LANES) {
-                FLOATS rows[6][6];
-                for (int j = 0; j < 6; j++) {
-                    FLOATS column[6], found[6];
-#pragma GCC unroll 6
-                    for (int i = 0; i < 6; i++)
-                        column[i] = NAME(leaky)(*(const FLOATS *)(sources[i][j] + c), task->slope);
-                    NAME(transform)(column, found);
-#pragma GCC unroll 6
-                    for (int i = 0; i < 6; i++)
-                        rows[i][j] = found[i];
-                }
-                for (int i = 0; i < 6; i++) {
-                    FLOATS found[6];
-                    NAME(transform)(rows[i], found);
-#pragma GCC unroll 6
-                    for (int j = 0; j < 6; j++)
-                        *(FLOATS *)(pixels + ((i * 6 + j) * TILES + t) * channels + c) = found[j];
-                }
-            }
+            NAME(transform_tile)(task, top[t], left[t], zeros, pixels + t * channels);
         }
         NAME(products)(task, count, pixels, products);
         for (long t = 0; t < count; t++)
-            for (long o = 0; o < outputs; o += LANES) {
-                const long width = outputs - o < LANES ? outputs - o : LANES;
-                FLOATS rows[4][6];
-                for (int j = 0; j < 6; j++) {
-                    FLOATS column[6], found[4];
-#pragma GCC unroll 6
-                    for (int i = 0; i < 6; i++)
-                        column[i] = *(const FLOATS *)(products + ((i * 6 + j) * TILES + t) * padded_outputs + o);
-                    NAME(restore)(column, found);
-#pragma GCC unroll 4
-                    for (int i = 0; i < 4; i++)
-                        rows[i][j] = found[i];
-                }
-                const FLOATS bias = *(const FLOATS *)(task->bias + o);
-                for (int i = 0; i < 4 && top[t] + i * apart < task->height; i++) {
-                    FLOATS found[4];
-                    NAME(restore)(rows[i], found);
-                    for (int j = 0; j < 4 && left[t] + j * apart < task->width; j++) {
-                        const long place = ((top[t] + i * apart) * task->width + left[t] + j * apart) * outputs + o;
-                        FLOATS sum = found[j] + bias;
-                        if (width == LANES) {
-                            if (task->added)
-                                sum += *(const FLOATS *)(task->added + place);
-                            *(FLOATS *)(task->out + place) = sum;
-                        } else
-                            for (long k = 0; k < width; k++)
-                                task->out[place + k] = sum[k] + (task->added ? task->added[place + k] : 0.0f);
-                    }
-                }
-            }
+            NAME(restore_tile)(task, top[t], left[t], products + t * task->padded_outputs);
     }
 }

@@ -36,7 +36,7 @@ def _compiled_convolve(
     missing = (0, -outputs % LANES)
     with torch.autocast("cpu", enabled=False):
         weights = torch.kron(VALUES, VALUES) @ F.pad(weight.permute(2, 3, 1, 0), missing).reshape(9, -1)  # (36, C O)
-    padded = weights.new_zeros(weights.shape[1] // channels) if bias is None else F.pad(bias, missing)
+    padded = weights.new_zeros(weights.shape[1] // channels) if bias is None else F.pad(bias, missing).contiguous()
     features = features.permute(0, 2, 3, 1).contiguous()
     added = None if added is None else added.permute(0, 2, 3, 1).contiguous()
     out = features.new_empty(*features.shape[:3], outputs)
