@@ -132,10 +132,21 @@ def test_damaged_files_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     tifffile.imwrite(tif, (cat() * 255).astype(np.uint8), compression="jpeg", photometric="rgb")
     with tifffile.TiffFile(tif) as file:
         end = file.pages.first.dataoffsets[-1] + file.pages.first.databytecounts[-1]
-    if tif.stat().st_size == end:  # the pixels come last
-        tif.write_bytes(tif.read_bytes()[:-30])
-        assert "in.tif is damaged or cut short (it ends too early)" in refused(capsys, "tone", tif, target)
+    assert tif.stat().st_size == end  # the pixels come last
+    tif.write_bytes(tif.read_bytes()[:-30])
+    assert "in.tif is damaged or cut short (it ends too early)" in refused(capsys, "tone", tif, target)
     assert not target.exists()
+
+
+@pytest.mark.usefixtures("tiled")
+def test_transparency_must_be_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = np.concatenate([cat(), np.ones((*SIZE, 1))], axis=2)
+    values[5, 7, 3] = np.nan
+    source = tmp_path / "in.tif"
+    tifffile.imwrite(source, values.astype(np.float32), photometric="rgb", extrasamples=["unassalpha"])
+    assert main(["tone", str(source), str(tmp_path / "out.tif"), "--contrast", "1.2"]) == 2
+    assert "NaN" in capsys.readouterr().err
+    assert not (tmp_path / "out.tif").exists()
 
 
 def test_strokes_that_cover_the_photograph_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -339,6 +339,18 @@ def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
     assert likelihoods(0.1, inside=1.0)[1] > 2 * likelihoods(0.1)[1]
 
 
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (112, 160), (300, 430), (1, 200_000), (70_000, 3)])
+def test_points_inside_are_few_and_spread_evenly(size: tuple[int, int]) -> None:
+    places = scribbled_colours.inner_places(size)
+    assert 1 <= len(places) <= 64 * 16
+    assert torch.equal(places, places.unique())
+    rows, columns = places // size[1], places % size[1]
+    for found, length in ((rows, size[0]), (columns, size[1])):
+        lines = found.unique()
+        gaps = torch.cat([lines[:1], lines.diff(), length - lines[-1:]])
+        assert gaps.max() <= max(1, min(size) // 16, -(-max(size) // 64))
+
+
 def best_path(even: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
     """Least evenness along the best path from the starts to every pixel, (H, W), by Dijkstra's algorithm."""
     found = torch.zeros_like(even)

@@ -24,8 +24,10 @@ BANDWIDTH_SHARE = 0.4  # bandwidth of that comparison as a share of the photomet
 EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
 HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
 UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path from scribbles: up to which it links nothing, and fully
-LINK_STEP = 3  # step of the search for paths in pixels; EVEN_SIGMA makes borders wider than that
-INNER_ROWS = 16  # rows of points inside the picture that are compared
+# Step of the search for paths in pixels; EVEN_SIGMA makes borders wider than that. It is larger along an axis of more
+# steps than MOST_LINKED, in long, narrow pictures.
+LINK_STEP, MOST_LINKED = 3, 1000
+INNER_ROWS, MOST_INNER = 16, 64  # points inside the picture that are compared, along its short side, and at most
 MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
 SMALLEST_EXPONENT = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
 EPSILON = 1e-6
@@ -45,8 +47,8 @@ def frame_places(size: tuple[int, int]) -> Tensor:
 def inner_places(size: tuple[int, int]) -> Tensor:
     """Indices (n,), ascending, of pixels on a regular grid."""
     height, width = size
-    step = max(1, min(size) // INNER_ROWS)
-    rows, columns = torch.arange(step // 2, height, step), torch.arange(step // 2, width, step)
+    step = max(1, min(size) // INNER_ROWS, math.ceil(max(size) / MOST_INNER))
+    rows, columns = (torch.arange(min(step, length) // 2, length, step) for length in (height, width))
     return (rows.unsqueeze(1) * width + columns).flatten()
 
 
@@ -62,9 +64,9 @@ def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
         scribbles: weights of those on the region and on its background, (B, 2, H, W).
     """
     height, width = even.shape[-2:]
-    step = min(LINK_STEP, height, width)
-    passable = -F.max_pool2d(-even, step, ceil_mode=True)
-    found = passable * F.max_pool2d((scribbles > 0).to(even), step, ceil_mode=True)
+    steps = [max(min(LINK_STEP, length), math.ceil(length / MOST_LINKED)) for length in (height, width)]
+    passable = -F.max_pool2d(-even, steps, ceil_mode=True)
+    found = passable * F.max_pool2d((scribbles > 0).to(even), steps, ceil_mode=True)
     passable, before = passable.expand_as(found), torch.full_like(found, -1.0)
     while not torch.equal(found, before):  # as often as the paths turn
         before.copy_(found)
@@ -76,7 +78,7 @@ def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
                     torch.maximum(lines[k], limits[k].minimum(lines[k + direction]), out=lines[k])
     front, back = found.split(1, dim=1)
     linked = ((front - back - UNLINKED) / (LINKED - UNLINKED)).clamp(0.0, 1.0)
-    return linked.repeat_interleave(step, 2).repeat_interleave(step, 3)[..., :height, :width]
+    return linked.repeat_interleave(steps[0], 2).repeat_interleave(steps[1], 3)[..., :height, :width]
 
 
 def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
