@@ -1,0 +1,109 @@
+"""Colours of scribbles: densities, evenness, links by even areas, and the points that are compared."""
+
+import heapq
+
+import pytest
+import torch
+
+from nlfilter_torch.edits import scribbled_colours
+from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, evenness, every_nth, linked_evenly
+from nlfilter_torch.edits.scribbled_pixels import Scribbles
+from tests.problems import noise
+
+
+def test_densities_are_sums_of_gaussians() -> None:
+    places, points = noise(2, 3, 1, 700).squeeze(2), noise(2, 3, 1, 5, seed=1).squeeze(2)
+    weights = torch.tensor([[[1.0, 0.0, 0.5, 2.0, 0.0]], [[0.0] * 5]], dtype=torch.float64)
+    found = density(places, points, weights, torch.full((1, 1, 1), 0.3, dtype=torch.float64))
+    squares = (places[:, :, :, None] - points[:, :, None]).square().mean(1)
+    wanted = (torch.exp(-squares[0] / 0.09) * weights[0]).sum(1)
+    torch.testing.assert_close(found[0, 0], wanted, atol=1e-12, rtol=0)
+    assert (found[1] == 0).all()  # without weights there is nothing
+
+
+def test_evenness() -> None:
+    flat = torch.full((1, 3, 40, 40), 0.4, dtype=torch.float64)
+    assert evenness(flat).min() > 0.99
+    slope = flat + 0.002 * torch.arange(40).double()  # half a grey level per pixel
+    assert evenness(slope)[..., 8:32].min() > 0.5
+    assert evenness(flat + 0.3 * noise(1, 1, 40, 40)).max() < 0.1
+
+
+def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
+    sky, far, ground = torch.tensor([[0.3, 0.5, 0.8], [0.5, 0.65, 0.85], [0.3, 0.25, 0.1]]).double()
+    image = torch.stack([sky, far, ground]).mT.view(1, 3, 1, 3)
+    scribbles = Scribbles(torch.tensor([0]), torch.tensor([[[1.0], [0.0]]]).double(), image[..., 0])
+    frame, unlike = image.squeeze(2), torch.tensor([[[0.0, 1.0, 1.0]]]).double()
+
+    def likelihoods(likely: float, inside: float = 0.0) -> torch.Tensor:
+        by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
+        grid, linked = image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double()
+        return colour_likelihood(image, scribbles, frame, unlike, by_regression, grid, linked, 0.08).flatten()
+
+    assert likelihoods(0.9)[:2].min() > 0.95
+    assert likelihoods(0.1)[1] < 0.05
+    assert likelihoods(0.9)[2] < 0.05
+    assert likelihoods(0.1, inside=1.0)[1] > 2 * likelihoods(0.1)[1]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (112, 160), (300, 430), (1, 200_000), (70_000, 3)])
+def test_points_inside_are_few_and_spread_evenly(size: tuple[int, int]) -> None:
+    places = scribbled_colours.inner_places(size)
+    assert 1 <= len(places) <= 64 * 16
+    assert torch.equal(places, places.unique())
+    rows, columns = places // size[1], places % size[1]
+    for found, length in ((rows, size[0]), (columns, size[1])):
+        lines = found.unique()
+        gaps = torch.cat([lines[:1], lines.diff(), length - lines[-1:]])
+        assert gaps.max() <= max(1, min(size) // 16, -(-max(size) // 64))
+
+
+def best_path(even: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
+    """Least evenness along the best path from the starts to every pixel, (H, W), by Dijkstra's algorithm."""
+    found = torch.zeros_like(even)
+    queue = [(-float(even[tuple(place)]), *place) for place in starts.nonzero().tolist()]
+    heapq.heapify(queue)
+    while queue:
+        value, row, column = heapq.heappop(queue)
+        if -value <= float(found[row, column]):
+            continue
+        found[row, column] = -value
+        for y, x in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if 0 <= y < even.shape[0] and 0 <= x < even.shape[1]:
+                heapq.heappush(queue, (max(value, -float(even[y, x])), y, x))
+    return found
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (12, 1), (17, 23)])
+def test_links_follow_the_best_path(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]) -> None:
+    monkeypatch.setattr(scribbled_colours, "LINK_STEP", 1)
+    even = noise(2, 1, *size)
+    scribbles = (noise(2, 2, *size, seed=1) > 0.9).double() * 0.3
+    found = linked_evenly(even, scribbles)
+    for k in range(2):
+        front, back = (best_path(even[k, 0], scribbles[k, side] > 0) for side in (0, 1))
+        limits = scribbled_colours.UNLINKED, scribbled_colours.LINKED
+        expected = ((front - back - limits[0]) / (limits[1] - limits[0])).clamp(0, 1)
+        torch.testing.assert_close(found[k, 0], expected)
+
+
+def test_links_pass_no_border_narrower_than_the_search() -> None:
+    image = torch.full((1, 3, 60, 90), 0.6).double()
+    image[..., 40] = 0.2  # a line of one pixel, such as a mast
+    scribble = torch.zeros(1, 2, 60, 90).double()
+    scribble[:, 0, 20:30, 5:15] = 1
+    found = linked_evenly(evenness(image), scribble)
+    assert found[..., :30].min() == 1
+    assert found[..., 50:].max() == 0
+
+
+def test_pixels_to_compare_do_not_depend_on_other_images() -> None:
+    colours = noise(2, 3, 1, 50).squeeze(2)
+    weights = torch.zeros(2, 1, 50, dtype=torch.float64)
+    weights[0, :, ::2], weights[1, :, 7:40] = 1.0, 0.5
+    together, kept = every_nth(colours, weights, 8)
+    for k in range(2):
+        alone, own = every_nth(colours[k : k + 1], weights[k : k + 1], 8)
+        assert 8 <= own.shape[2] <= 16
+        assert torch.equal(together[k][:, kept[k, 0] > 0], alone[0])
+        assert torch.equal(kept[k][kept[k] > 0], own[0, 0])
