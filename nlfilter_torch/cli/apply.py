@@ -61,12 +61,12 @@ def apply(
     editing.check_apart("OUT", target, mask=masks, preset=preset)
     for recipe, name in zip(recipes, preset, strict=True):
         showing.note_idle(recipe, name)
-    colorizes = any(step.edit == "colorize" for recipe in recipes for step in recipe.acting)
-    looks = [step for recipe in recipes for step in recipe.acting if step.edit == "look"]
+    steps = [step for recipe in recipes for step in recipe.acting]
+    colorizes = any(step.edit == "colorize" for step in steps)
 
     def work(photograph: Photograph) -> Tensor:
         if photograph.pixels.shape[1] == 1:
-            showing.note_grey(looks, source)
+            showing.note_grey(steps, source)
         if colorizes:
             showing.note_colours(source, photograph.size, lambda rows: photograph.pixels[..., rows, :])
         if not masks:
@@ -77,7 +77,7 @@ def apply(
     def by_rows(job: Job) -> AbstractContextManager[Tiling]:
         passes = job.passes(full, Path(target).parent)
         if job.picture.shape[2] < 3:
-            showing.note_grey(looks, source)
+            showing.note_grey(steps, source)
         if colorizes:
             picture = Picture(job.picture.rows, source)
             showing.note_colours(source, job.size, lambda rows: picture.tile(rows.start, rows.stop, 0).pixels)

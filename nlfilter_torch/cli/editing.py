@@ -32,7 +32,7 @@ from nlfilter_torch.io.rows import (
     usual_memory,
     write_picture,
 )
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.tiled.pictures import mask_plane
 from nlfilter_torch.tiled.sampling import Report
 from nlfilter_torch.tiled.tiles import Passes, Processes, Statistics, Tiling
 
@@ -70,15 +70,8 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: f
 
 
 def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | None = None) -> Tensor:
-    """Masks (1, K, H, W) from the luminance of files, which are to have the size of one another, or that (H, W).
-
-    Transparent pixels, which may have any colour, are 0.
-    """
-    found = []
-    for path in paths:
-        read = read_photograph(path)
-        grey = reduce_channels(read.pixels, "luminance").clamp(0, 1)
-        found.append(grey if read.alpha is None else grey * read.alpha.to(grey))
+    """Masks (1, K, H, W), see :func:`mask_plane`, of files of the same size, or of the size (H, W)."""
+    found = [mask_plane(read.pixels, read.alpha) for read in map(read_photograph, paths)]
     height, width = found[0].shape[-2:] if size is None else size
     for path, one in zip(paths, found, strict=True):
         if tuple(one.shape[-2:]) != (height, width):

@@ -125,12 +125,15 @@ class Overlay(ABC):
 
     def checked(self) -> Self:
         """Return this overlay; raise ValueError if nothing is marked in its picture."""
-        picture = self.picture
-        if picture is None:
-            return self
-        if not LazyRows(self.shape[:2], lambda rows: self._of_picture(rows, picture)[..., self.marked]).any():
-            raise ValueError(f"{picture.name} is {self.empty}")
+        if self.picture is not None and not self._any(lambda weights: weights != 0):
+            raise ValueError(f"{self.picture.name} is {self.empty}")
         return self
+
+    def _any(self, holds: Callable[[Floats], NDArray[np.bool_]]) -> bool:
+        """Whether a condition holds for the mark of a pixel of the picture."""
+        picture = self.picture
+        assert picture is not None  # for mypy
+        return LazyRows(self.shape[:2], lambda rows: holds(self._of_picture(rows, picture)[..., self.marked])).any()
 
     def at_once(self) -> Tensor:
         """All rows, as planes (1, S, H, W)."""
@@ -154,6 +157,16 @@ class Strokes(Overlay):
     """Coloured scribbles: RGB and their mask, in four channels."""
 
     marked, empty = 3, "transparent everywhere; draw at least one scribble"
+    opaque: ClassVar[str] = (
+        "has no transparency, so every pixel would count as a scribble; "
+        "draw on a transparent layer and save only that layer"
+    )
+
+    def checked(self) -> Self:
+        """Return these scribbles; raise ValueError if their picture has none, or they cover all of it."""
+        if super().checked().picture is not None and not self._any(lambda opacity: opacity == 0):
+            raise ValueError(f"{self.picture.name} {self.opaque}")  # type: ignore[union-attr]
+        return self
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
         tile = picture.tile(rows.start, rows.stop, 0)
@@ -213,12 +226,7 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
                 f"--region must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
             )
         rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
-    picture = _picture(size, path, read, transparent=True)
-    if picture is not None:
-        gaps = LazyRows(size, lambda rows: Strokes((*size, 4), picture, [])[rows][..., Strokes.marked] == 0)
-        if not gaps.any():
-            raise ValueError(_opaque(path))
-    return Strokes((*size, 4), picture, rectangles).checked()
+    return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles).checked()
 
 
 def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
@@ -267,13 +275,5 @@ def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = F
             f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize it"
         )
     if transparent and not stored.alpha:
-        raise ValueError(_opaque(path))
+        raise ValueError(f"{path} {Strokes.opaque}")
     return Picture(stored.rows, str(path))
-
-
-def _opaque(path: Path | None) -> str:
-    """Error for scribbles that cover the whole photograph."""
-    return (
-        f"{path} has no transparency, so every pixel would count as a scribble; "
-        "draw on a transparent layer and save only that layer"
-    )

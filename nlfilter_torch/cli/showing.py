@@ -21,6 +21,7 @@ from nlfilter_torch.edits.defocus import REACH
 from nlfilter_torch.edits.mask import region_mask
 from nlfilter_torch.edits.parameters import MASK
 from nlfilter_torch.edits.presets import Recipe
+from nlfilter_torch.edits.scribbled_colours import frame_places
 from nlfilter_torch.edits.source import seeded
 from nlfilter_torch.edits.steps import Step
 from nlfilter_torch.io.photographs import Photograph, write_photograph
@@ -67,7 +68,7 @@ def tell_colours(drawn: Iterator[tuple[str, Overlay]], read: Read) -> None:
 def tell_selected(mask: Tensor, background: list[str] | None) -> None:
     """Print the share of a picture that a mask (1, 1, H, W) selects, and a note if its borders belong to it too."""
     typer.echo(f"selected: {100 * float(mask.mean()):.0f} % of the picture")
-    borders = torch.cat([mask[..., edge] for edge in (0, -1)] + [mask[..., edge, :] for edge in (0, -1)], dim=2)
+    borders = mask.flatten(2)[..., frame_places((mask.shape[-2], mask.shape[-1]))]
     if float(borders.mean()) > BORDER_SHARE and not background:
         note("nearly all of the picture's borders are selected; mark what is not part of the object with --background")
 

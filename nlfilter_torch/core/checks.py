@@ -109,10 +109,8 @@ def check_photograph(image: Tensor, name: str, *, channels: int | None = None, b
 def warn_of_scale(image: Tensor, name: str) -> bool:
     """Warn if an image of 1 or 3 channels has values above 16: probably 8-bit pixels converted to floats.
 
-    Returns whether it warned.
-
     Skipped if :func:`~nlfilter_torch.core.values.is_hidden`. Images with other numbers of channels are feature maps,
-    which may have any values; HDR pictures stay below 16.
+    which may have any values; HDR pictures stay below 16. Returns whether it warned.
     """
     if is_hidden(image) or image.shape[1] not in (1, 3) or len(image) == 0:
         return False

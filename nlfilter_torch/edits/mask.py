@@ -247,11 +247,11 @@ def fit_regions(
     for number, marked in enumerate(marks):
         unlike = 1 - likeness(marked.image, marked.weights[:, :1], colours, bandwidth)
         linked = linked_evenly(even, marked.planes(small)).flatten(2)
-        own, within = linked[:, :, places], linked[:, :, inner]
-        regression = _regression(small, operator, marked, (at_frame, unlike, own), (at_grid, within), reach)
+        frame_links, grid_links = linked[:, :, places], linked[:, :, inner]
+        regression = _regression(small, operator, marked, (at_frame, unlike, frame_links), (at_grid, grid_links), reach)
         likely = sharpened(regression(small))
-        own = torch.maximum((likely * even).flatten(2)[:, :, places], own)
-        compared = [unlike, own, inner_colours, within, bandwidth]
+        own = torch.maximum((likely * even).flatten(2)[:, :, places], frame_links)
+        compared = [unlike, own, inner_colours, grid_links, bandwidth]
         by_colour = small.kept(
             ("likelihood", number),
             [marked.image, marked.weights, *compared],

@@ -308,6 +308,7 @@ class _Problem:
         filtered_shape = (self.layers.shape[0], *target.shape[1:])
         target = target.expand(filtered_shape)
         image = target - self.edit.view(filtered_shape)
+        shares = None if mask is None else mask.to(target) / mask.amax((1, 2, 3), keepdim=True)
         coefficients = torch.zeros_like(start).requires_grad_()
         optimizer = torch.optim.LBFGS(
             [coefficients],
@@ -325,8 +326,8 @@ class _Problem:
             optimizer.zero_grad()
             change = change_of(coefficients)
             filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
-            if mask is not None:
-                filtered = torch.lerp(target, filtered, mask.to(filtered) / mask.amax((1, 2, 3), keepdim=True))
+            if shares is not None:
+                filtered = torch.lerp(target, filtered, shares)
             found = loss(filtered, target)
             check_tensor(found, "loss", "return a number that depends on the first image")
             if found.numel() != 1 or not found.requires_grad:

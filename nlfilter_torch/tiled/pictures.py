@@ -214,6 +214,11 @@ def transparency(tile: Tile, kind: str) -> NDArray[Any]:
 
 
 def mask_of(tile: Tile) -> Tensor:
-    """Luminance (1, 1, h, W) of a tile of a mask, in [0, 1]; transparent pixels, which may have any colour, are 0."""
-    opacity = torch.from_numpy(transparency(tile, "float32")).prod(2).expand(tile.inner.shape[-2:])
-    return reduce_channels(tile.inner, "luminance").clamp(0, 1) * opacity
+    """:func:`mask_plane` of a tile."""
+    return mask_plane(tile.inner, torch.from_numpy(transparency(tile, "float32")).prod(2))
+
+
+def mask_plane(pixels: Tensor, opacity: Tensor | None) -> Tensor:
+    """Luminance (1, 1, h, W) of a mask, in [0, 1]; transparent pixels, which may have any colour, are 0."""
+    grey = reduce_channels(pixels, "luminance").clamp(0, 1)
+    return grey if opacity is None else grey * opacity
