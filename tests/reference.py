@@ -41,7 +41,7 @@ def patches(image: Array, size: int) -> Array:
     return windows.reshape(-1, size * size)
 
 
-def features(guide: Array, patch_size: int, h_y: float, h_x: float | None = None) -> Array:
+def features(guide: Array, patch_size: int, h_y: float, h_x: float | tuple[float, float] | None = None) -> Array:
     """Rows x_i (n, D) for which the kernel is exp(-||x_i - x_j||^2). Eq. 1; for (C, H, W) the mean of eq. 18."""
     channels = guide[None] if guide.ndim == 2 else guide
     scale = np.sqrt(patch_weights(patch_size).ravel() / len(channels)) / h_y

@@ -148,6 +148,8 @@ BAD_OPTIONS: list[tuple[str, Any, type[Exception], str]] = [
     ("photometric_bandwidth", torch.ones(3), ValueError, "must be a number or have shape () or (2,), got (3,)"),
     ("spatial_bandwidth", 0, ValueError, f"{POSITIVE} 0"),
     ("spatial_bandwidth", "auto", TypeError, f"{NUMBER} str"),
+    ("spatial_bandwidth", (4.0, 0.0), ValueError, f"{POSITIVE} 0.0"),
+    ("spatial_bandwidth", (4.0, 5.0, 6.0), ValueError, "must be a number, or two for vertical"),
     ("spatial_bandwidth", torch.ones(2, 1), ValueError, "must be a number or have shape () or (2,), got (2, 1)"),
     ("num_landmarks", 0, ValueError, "must be at least 1, got 0"),
     ("num_landmarks", 20.0, TypeError, f"{INT} float"),

@@ -25,8 +25,10 @@ def test_window_is_the_reference_window(size: int) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("patch_size", [1, 3, 5, 7])
-@pytest.mark.parametrize("h_x", [None, 2.5])
-def test_features_are_the_reference_features(size: tuple[int, int], patch_size: int, h_x: float | None) -> None:
+@pytest.mark.parametrize("h_x", [None, 2.5, (2.5, 4.0)])
+def test_features_are_the_reference_features(
+    size: tuple[int, int], patch_size: int, h_x: float | tuple[float, float] | None
+) -> None:
     guides = np.stack([random_guide(2, *size, seed) for seed in (0, 1)])
     found = GuideFeatures(patch_window(patch_size), 0.1, h_x, "all")(torch.from_numpy(guides))
     expected = [reference.features(guide, patch_size, 0.1, h_x).T for guide in guides]
@@ -47,6 +49,10 @@ def test_every_image_of_a_batch_has_its_own_bandwidths() -> None:
     for i in range(2):
         alone = reference.features(guides[i].numpy(), 3, h_y[i].item(), h_x[i].item()).T
         np.testing.assert_allclose(together[i], alone, rtol=1e-6)
+    wide = GuideFeatures(patch_window(3), h_y, (h_x, 4.0), "all")(guides)
+    for i in range(2):
+        alone = reference.features(guides[i].numpy(), 3, h_y[i].item(), (h_x[i].item(), 4.0)).T
+        np.testing.assert_allclose(wide[i], alone, rtol=1e-6)
 
 
 @pytest.mark.parametrize("patch_size", [1, 3, 7])

@@ -2,11 +2,16 @@
 
 Three estimates of the chroma are averaged: the regression on the strokes relates pixels of similar brightness and
 texture, however far apart; two :class:`LocalValues` relate pixels that are connected without an edge between them, with
-two notions of an edge. Their errors are in different places, so that the mean is better than each. An estimate counts
-less the farther it is from the other two and the more saturated it is. The regression also counts less, the less the
-strokes nearby determine a pixel, since its errors are large where no stroke is on similar pixels nearby. It extends
-chroma relative to :func:`usual_chroma`, since shadows and highlights of an object have less than its midtones;
-propagation between neighbours, relative to its square root.
+two notions of an edge. Their errors are in different places, so that the mean is better than each.
+
+An estimate counts less the farther it is from the other two and the more saturated it is. The regression also counts
+less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
+relative differences has the fewest large errors: it counts more if there are few strokes, and the distance of the mean
+from it is limited.
+
+Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
+to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
+only where this reduces the chroma.
 """
 
 import math
@@ -26,7 +31,7 @@ from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalVa
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
-from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
+from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
 from nlfilter_torch.edits.texture import TEXTURE_MARGIN, with_texture
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
@@ -58,6 +63,7 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on others, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
+HORIZONTAL = 1.5  # bandwidth of horizontal distances, relative to vertical ones: much in photographs lies in layers
 # With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
 # channels of texture are then 0.
 GUIDE_SCALE = math.sqrt(5 / 2)
@@ -66,6 +72,12 @@ LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 FAINT = 0.2  # chroma below which estimates differ little in weight
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
+LARGE_VARIANCE = 0.02  # of chroma among strokes on similar pixels
+CELLS, LEAST_SHARE = 16, 0.05  # cells along the short side, and the painted share of a cell that counts as half
+# Number of painted cells at which the three estimates have equal factors, and how fast that of the estimate by relative
+# differences falls with the number: with few strokes, it is likely that some colour is missing.
+FEW_CELLS, CAUTION = 6.0, 0.3
+MOST_CHANGE = 0.12  # distance in chroma of the result from that estimate
 
 
 def colorize_guide(image: Tensor) -> Tensor:
@@ -108,7 +120,8 @@ def colorize(
         time: for k-means, diffusion time t > 0 of the segments.
         photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
             surroundings and texture, if they differ, count as further differences.
-        spatial_bandwidth: in pixels; None is 0.5625 of the short side.
+        spatial_bandwidth: of vertical distances in pixels, that of horizontal ones is half as large again; None is
+            0.5625 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
         viewing_size: in megapixels; the colours of a larger image are found in its reduction to this size, patches and
@@ -162,7 +175,7 @@ def colorize(
     def operator_of(stage: Stage) -> Operator:
         scaled = {
             "photometric_bandwidth": stage.photometric * photometric_bandwidth,
-            "spatial_bandwidth": stage.spatial * nearness,
+            "spatial_bandwidth": (stage.spatial * nearness, stage.spatial * HORIZONTAL * nearness),
         }
         return viewed.operator(Guide(options | scaled, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
 
@@ -179,11 +192,11 @@ def colorize(
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
     # Cubed, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
     # size of the picture.
-    marks = [scribbles.places, scribbles.weights**3, wanted / usual_there.sqrt()]
+    painted, scaled = [scribbles.places, scribbles.weights**3], wanted / usual_there.sqrt()
 
-    def propagated(links: Links) -> Callable[[Any, Tensor], Tensor]:
+    def propagated(links: Links, values: Tensor) -> Callable[[Any, Tensor], Tensor]:
         step = links.step(small)
-        guide = viewed.reduced(luminance, step)
+        guide, marks = viewed.reduced(luminance, step), [*painted, values]
         found = viewed.kept(links, [guide, *marks], lambda: LocalValues.of(links, guide, step, small[1], *marks))
 
         def interpolated(some: Any, own: Tensor) -> Tensor:
@@ -192,15 +205,17 @@ def colorize(
 
         return interpolated
 
-    absolute, relative = propagated(ABSOLUTE), propagated(RELATIVE)
+    absolute, relative = propagated(ABSOLUTE, scaled), propagated(RELATIVE, torch.cat([scaled, wanted], dim=1))
     wanted = wanted / usual_there
-    ones = torch.ones_like(wanted[:, :1])  # extended along with the chroma: how far the strokes determine a pixel
+    # Extended along with the chroma: its square, for the variance among strokes on similar pixels, and ones, for the
+    # degree to which strokes nearby determine a pixel.
+    squares, ones = squared_sum(wanted), torch.ones_like(wanted[:, :1])
     parts = []
-    for stage in (FAR, NEAR):
+    for stage, other in ((FAR, squares), (NEAR, ones)):
         operator = operator_of(stage)
         columns = operator.at(scribbles.places)
         fitted = fit_strokes(
-            partial(scribbled_blocks, [(columns, scribbles.weights, torch.cat([wanted, ones], dim=1))]),
+            partial(scribbled_blocks, [(columns, scribbles.weights, torch.cat([wanted, other], dim=1))]),
             operator.pairs,
             pixels,
             strength=strength if stage is FAR else 0.0,
@@ -212,18 +227,24 @@ def colorize(
         del operator  # frees its factor before the next one is computed
     far, near = parts
     everywhere = per_image(strength, wanted, 4)
+    caution = (FEW_CELLS / painted_cells(scribbles, small)) ** CAUTION
 
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
         usual = usual_chroma(own)
         connected, influence = absolute(some, own).tensor_split([2], dim=1)
-        around = relative(some, own)[:, :2]
+        around, unscaled = relative(some, own)[:, :4].split(2, dim=1)
+        around = fainter(around * usual.sqrt(), unscaled)
+        mean, square = far(some).tensor_split([2], dim=1)
         residual, support = near(some).tensor_split([2], dim=1)
-        alike = (far(some)[:, :2] + residual) * usual
-        around = torch.lerp(alike, around * usual.sqrt(), influence + everywhere * (1 - influence))
+        variance = (square - squared_sum(mean)) * usual.square()
+        alike = (mean + residual) * usual
+        around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
-        factors = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5, influence**3, 1.0
-        return weighted_mean((alike, connected, around), factors)
+        trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
+        factors = trust, influence**3, caution
+        change = weighted_mean((alike, connected, around), factors) - around
+        return around + change * (1 + squared_sum(change) / MOST_CHANGE**2).rsqrt()
 
     return _coloured(source, viewed, chroma_of)
 
@@ -234,6 +255,27 @@ def usual_chroma(image: Tensor) -> Tensor:
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
 
 
+def painted_cells(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
+    """Number of cells of a grid on a picture (H, W) that strokes cover in part, (B, 1, 1, 1)."""
+    side = min(size) / CELLS
+    across = math.ceil(size[1] / side)
+    row, column = scribbles.places // size[1], scribbles.places % size[1]
+    cells = (row / side).long() * across + (column / side).long()
+    shares = scribbles.weights.new_zeros(len(scribbles.weights), math.ceil(size[0] / side) * across)
+    shares = shares.index_add(1, cells, scribbles.weights[:, 0] ** 3) / side**2
+    return (shares / (shares + LEAST_SHARE)).sum(1).view(-1, 1, 1, 1)
+
+
+def fainter(first: Tensor, second: Tensor) -> Tensor:
+    """Of two chromas (B, 2, H, W), the less saturated one at each pixel."""
+    return torch.where(squared_sum(first) < squared_sum(second), first, second)
+
+
+def squared_sum(chroma: Tensor) -> Tensor:
+    """Squared saturation (B, 1, H, W) of chroma (B, 2, H, W)."""
+    return chroma.square().sum(1, keepdim=True)
+
+
 def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float | Tensor, ...]) -> Tensor:
     """Average three estimates (B, 2, H, W).
 
@@ -241,15 +283,12 @@ def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float
     other two.
     """
     alike, connected, around = estimates
-    first, second, third = (
-        (one - other).square().sum(1, keepdim=True)
-        for one, other in ((alike, connected), (connected, around), (around, alike))
-    )
+    pairs = ((alike, connected), (connected, around), (around, alike))
+    first, second, third = (squared_sum(one - other) for one, other in pairs)
     distances = (first + third, first + second, second + third)
     total, weights = around.new_zeros(()), around.new_zeros(())
     for estimate, factor, distance in zip(estimates, factors, distances, strict=True):
-        squared = estimate.square().sum(1, keepdim=True)
-        share = factor * ((squared + FAINT**2) * (distance + SAME_CHROMA**2)).rsqrt()
+        share = factor * ((squared_sum(estimate) + FAINT**2) * (distance + SAME_CHROMA**2)).rsqrt()
         total, weights = torch.addcmul(total, share, estimate), weights + share
     return total / weights
 

@@ -6,10 +6,10 @@ The values solve a linear system over the eight neighbours of each pixel. Two ki
 - :data:`RELATIVE` ones compare the difference with the variance around the pixel, as in Levin, Lischinski and Weiss,
   "Colorization using Optimization" (2004). Pixels at an edge depend on both sides, but those beside it hardly on them.
 
-The influence of scribbles falls to zero far from them and behind edges. The system is solved on the picture reduced to
-a limited number of pixels, so that its cost does not grow with the size. The values of a pixel are then a mean over the
-four nearest blocks, weighted by similarity of luminance. They depend only on the pixel's own luminance and position, so
-that tiles are exact.
+The influence of scribbles falls to zero behind edges and, with absolute weights, far from them. The system is solved on
+the picture reduced to a limited number of pixels, so that its cost does not grow with the size. The values of a pixel
+are then a mean over the four nearest blocks, weighted by similarity of luminance. They depend only on the pixel's own
+luminance and position, so that tiles are exact.
 """
 
 import math
@@ -27,8 +27,6 @@ SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a re
 MIN_RELATIVE = 1e-6  # relative weight of the least similar neighbour
 SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference of a pixel from a block, and least weight of a block
 SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
-# Distance at which the influence falls to 1/e in flat areas, relative to the square root of the area.
-DECAY_DISTANCE = 2.0
 MIN_INFLUENCE = 1e-6
 
 
@@ -41,10 +39,13 @@ class Links:
             the picture, both (B, 9, h, w) with the pixel itself in the middle, which counts as not in the picture.
             The result sums to 8 in flat areas.
         pixels: number to which the picture is reduced.
+        decay_distance: at which the influence of scribbles falls to 1/e in flat areas, relative to the square root of
+            the area.
     """
 
     weights: Callable[[Tensor, Tensor], Tensor]
     pixels: int
+    decay_distance: float
 
     def step(self, size: tuple[int, int]) -> int:
         """Side in pixels of the blocks of a picture (H, W)."""
@@ -65,7 +66,8 @@ def _relative(difference: Tensor, inside: Tensor) -> Tensor:
     return 8 * alike / alike.sum(1, keepdim=True).clamp(min=MIN_RELATIVE)
 
 
-ABSOLUTE, RELATIVE = Links(_absolute, 3 << 12), Links(_relative, 1 << 15)
+# With RELATIVE weights the influence hardly decays: scribbles far away then count as they do for Levin et al.
+ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 2.0), Links(_relative, 1 << 15, 20.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +99,10 @@ class LocalValues:
         sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
         sums = sums.unflatten(2, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
-        anchor = sums[:, -1:] + 3 / (DECAY_DISTANCE**2 * rows * columns)
+        anchor = sums[:, -1:].double() + 3 / (links.decay_distance**2 * rows * columns)
         around, inside = (F.unfold(planes, 3, padding=1) for planes in (guide, torch.ones_like(guide[:1])))
         inside[:, 4] = 0.0  # the pixel itself
-        alike = links.weights((around - guide.flatten(2)) * inside, inside).unflatten(2, (rows, columns))
+        alike = links.weights((around - guide.flatten(2)) * inside, inside).double().unflatten(2, (rows, columns))
         own = alike.sum(1, keepdim=True) + anchor
         stencil = torch.cat([-alike[:, :4], own, -alike[:, 5:]], dim=1).unflatten(1, (3, 3))
         return LocalValues(solve_stencil(stencil, sums), guide, step, width)

@@ -25,7 +25,9 @@ from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limite
 from nlfilter_torch.operator.features import (
     GuideChannels,
     GuideFeatures,
+    SpatialBandwidth,
     bandwidth_of_rows,
+    both_axes,
     estimate_bandwidth,
     reduce_channels,
     unit_window,
@@ -58,7 +60,7 @@ def nonlocal_operator(
     *,
     patch_size: int = 5,
     photometric_bandwidth: float | Tensor | Literal["auto"] = "auto",
-    spatial_bandwidth: float | Tensor | None = None,
+    spatial_bandwidth: SpatialBandwidth | None = None,
     num_landmarks: int = 100,
     landmarks: Sampling = "kmeans",
     completion: Completion = "diagonal",
@@ -81,8 +83,8 @@ def nonlocal_operator(
         patch_size: p, odd, at most 101; the image is reflected at its border.
         photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
             shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
-        spatial_bandwidth: h_x in pixels, a positive number or a tensor of shape () or (B,); None leaves out the spatial
-            term, so that W is fully nonlocal.
+        spatial_bandwidth: h_x in pixels, a positive number or a tensor of shape () or (B,), or two of them, for
+            vertical and horizontal distances; None leaves out the spatial term, so that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
         completion: ``"diagonal"`` corrects the diagonal of the kernel to 1; ``"none"`` is the paper's method, which
@@ -113,7 +115,7 @@ def nonlocal_operator(
         >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
         True
     """
-    refuse_transforms("guide", guide, photometric_bandwidth, spatial_bandwidth, patch_weights)
+    refuse_transforms("guide", guide, photometric_bandwidth, *both_axes(spatial_bandwidth), patch_weights)
     check_image(guide, "guide", empty=True)
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
@@ -134,12 +136,11 @@ def nonlocal_operator(
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
         farthest = torch.full_like(largest, max(height, width))
-        check_scale(spatial_bandwidth, "spatial_bandwidth", farthest, "coordinates")
-        spatial_bandwidth = among.copy_to_group(spatial_bandwidth)
-    if isinstance(bandwidth, Tensor):  # copied, since the caller may change it in place
-        bandwidth = bandwidth.clone()
-    if isinstance(spatial_bandwidth, Tensor):
-        spatial_bandwidth = spatial_bandwidth.clone()
+        for one in both_axes(spatial_bandwidth):
+            check_scale(one, "spatial_bandwidth", farthest, "coordinates")
+        vertical, horizontal = map(among.copy_to_group, both_axes(spatial_bandwidth))
+        spatial_bandwidth = (_copy(vertical), _copy(horizontal))
+    bandwidth = _copy(bandwidth)
     recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
     features = recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo)
     return _assemble(features, size, method, recipe=recipe, among=among)
@@ -201,13 +202,18 @@ def operator_from_features(
     return _assemble(features, shape, method, weights=weights, among=among)
 
 
+def _copy(value: float | Tensor) -> float | Tensor:
+    """Copy a tensor, since the caller may change it in place."""
+    return value.clone() if isinstance(value, Tensor) else value
+
+
 def sampled_operator(
     guide: Tensor,
     places: Tensor,
     *,
     patch_size: int,
     photometric_bandwidth: float | Tensor | str,
-    spatial_bandwidth: float | Tensor | None,
+    spatial_bandwidth: SpatialBandwidth | None,
     num_landmarks: int,
     landmarks: Sampling,
     generator: torch.Generator,

@@ -6,7 +6,7 @@ Also the estimate of the photometric bandwidth. Paper: Appendix A, eq. (20).
 import math
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import torch
 import torch.nn.functional as F
@@ -28,6 +28,7 @@ from nlfilter_torch.core.values import is_hidden
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 GuideChannels = Literal["luminance", "all"]
+SpatialBandwidth = float | Tensor | tuple[float | Tensor, float | Tensor]
 
 
 def patch_window(patch_size: int) -> Tensor:
@@ -85,13 +86,14 @@ class GuideFeatures:
     Attributes:
         patch_weights: (p, p), non-negative, of unit sum; differentiable.
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
-        spatial_bandwidth: h_x in pixels, a number or a tensor of shape () or (B,); None leaves out the coordinates.
+        spatial_bandwidth: h_x in pixels, a number or a tensor of shape () or (B,), or two of them, for vertical and
+            horizontal distances; None leaves out the coordinates.
         guide_channels: ``"luminance"`` or ``"all"``.
     """
 
     patch_weights: Tensor
     photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
+    spatial_bandwidth: SpatialBandwidth | None
     guide_channels: GuideChannels
 
     def __call__(
@@ -130,8 +132,23 @@ class GuideFeatures:
         rows = origin[0] + halo[0] + stride * torch.arange(height, dtype=guide.dtype, device=guide.device)
         columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
         grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
-        coordinates = grid / per_image(self.spatial_bandwidth, guide, 3)
-        return torch.cat([features, coordinates.expand(batch, -1, -1)], dim=1)
+        return torch.cat([features, self.coordinates(grid).expand(batch, -1, -1)], dim=1)
+
+    def coordinates(self, places: Tensor) -> Tensor:
+        """Features (1 or B, 2, N) of rows and columns (2, N) of pixels; there must be a spatial bandwidth."""
+        assert self.spatial_bandwidth is not None  # for mypy
+        pairs = zip(places, both_axes(self.spatial_bandwidth), strict=True)
+        scaled = [place / per_image(bandwidth, places, 2) for place, bandwidth in pairs]
+        return torch.stack(torch.broadcast_tensors(*scaled), dim=1)
+
+
+@overload
+def both_axes(bandwidth: SpatialBandwidth) -> tuple[float | Tensor, float | Tensor]: ...
+@overload
+def both_axes(bandwidth: None) -> tuple[None, None]: ...
+def both_axes(bandwidth: Any) -> tuple[Any, Any]:
+    """Spatial bandwidths of vertical and horizontal distances."""
+    return bandwidth if isinstance(bandwidth, tuple) else (bandwidth, bandwidth)
 
 
 def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:

@@ -14,6 +14,7 @@ from nlfilter_torch.core.checks import (
     described,
     warn,
 )
+from nlfilter_torch.operator.features import SpatialBandwidth, both_axes
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
 
@@ -49,12 +50,18 @@ class Construction:
 
 
 def check_bandwidths(
-    photometric: float | Tensor | str, spatial: float | Tensor | None, batch: int | None = None
+    photometric: float | Tensor | str, spatial: SpatialBandwidth | None, batch: int | None = None
 ) -> None:
     """Raise unless these are bandwidths, for all images or for each of a batch."""
     if isinstance(photometric, str):
         check_choice(photometric, "photometric_bandwidth", ("auto",), "pass it or a number")
     else:
         check_positive(photometric, "photometric_bandwidth", batch)
+    if isinstance(spatial, tuple) and len(spatial) != 2:
+        raise ValueError(
+            f"spatial_bandwidth must be a number, or two for vertical and horizontal distances, got {len(spatial)} "
+            "numbers; pass two"
+        )
     if spatial is not None:
-        check_positive(spatial, "spatial_bandwidth", batch)
+        for one in both_axes(spatial):
+            check_positive(one, "spatial_bandwidth", batch)

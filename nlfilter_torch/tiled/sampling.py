@@ -20,6 +20,7 @@ from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.features import (
     GuideChannels,
     GuideFeatures,
+    SpatialBandwidth,
     bandwidth_of_gradient,
     gradients,
     pad_border,
@@ -174,7 +175,7 @@ def take_pilot(
     *,
     patch_size: int = 5,
     photometric_bandwidth: float | Literal["auto"] = "auto",
-    spatial_bandwidth: float | None = None,
+    spatial_bandwidth: SpatialBandwidth | None = None,
     num_landmarks: int = 100,
     landmarks: Sampling = "kmeans",
     completion: Completion = "diagonal",
@@ -264,7 +265,7 @@ def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: Gu
     if recipe.spatial_bandwidth is None:
         return features
     places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]]).to(features)
-    return torch.cat([features, places[None] / torch.as_tensor(recipe.spatial_bandwidth).to(features)], dim=1)
+    return torch.cat([features, recipe.coordinates(places)], dim=1)
 
 
 EVEN_SHARE = 0.1  # share of a sample that is spread evenly over the picture
