@@ -156,7 +156,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--first-seed",
         type=int,
         default=1000,
-        help="first seed of the strokes; 0 to 404 and 20000 to 20003 were used to choose parameters",
+        help="first seed of the strokes; 0 to 404, 20000 to 20003 and 50000 to 136001 were used to choose parameters",
     )
     parser.add_argument("--seeds", type=int, default=SEEDS, help="sets of strokes for each number of strokes")
     parser.add_argument(

@@ -63,7 +63,8 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on others, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
-HORIZONTAL = 1.5  # bandwidth of horizontal distances, relative to vertical ones: much in photographs lies in layers
+# Bandwidth of horizontal distances, relative to vertical ones: sky, buildings and ground lie above each other.
+HORIZONTAL = 1.5
 # With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
 # channels of texture are then 0.
 GUIDE_SCALE = math.sqrt(5 / 2)
@@ -120,7 +121,7 @@ def colorize(
         time: for k-means, diffusion time t > 0 of the segments.
         photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
             surroundings and texture, if they differ, count as further differences.
-        spatial_bandwidth: of vertical distances in pixels, that of horizontal ones is half as large again; None is
+        spatial_bandwidth: of vertical distances, in pixels; that of horizontal ones is 1.5 times as large. None is
             0.5625 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
@@ -272,7 +273,7 @@ def fainter(first: Tensor, second: Tensor) -> Tensor:
 
 
 def squared_sum(chroma: Tensor) -> Tensor:
-    """Squared saturation (B, 1, H, W) of chroma (B, 2, H, W)."""
+    """Squared saturation (B, 1, ...) of chroma (B, 2, ...)."""
     return chroma.square().sum(1, keepdim=True)
 
 
