@@ -69,6 +69,18 @@ def test_filter_in_guide_image_alpha_and_bandwidths(completion: str, landmarks: 
     assert gradcheck(call, arguments, fast_mode=landmarks != "kmeans")
 
 
+def test_filter_in_the_bandwidths_of_vertical_and_horizontal_distances() -> None:
+    guide, image = small().detach(), small(seed=1).detach()
+
+    def call(vertical: Tensor, horizontal: Tensor) -> Tensor:
+        operator = build(guide, "diagonal", spatial_bandwidth=(vertical, horizontal), landmarks="uniform")
+        return polynomial_filter(operator, image, torch.tensor(ALPHA, dtype=torch.float64))
+
+    assert gradcheck(call, (scalar(3.0), scalar(5.0)))
+    square = build(guide, "diagonal", spatial_bandwidth=4.0)
+    torch.testing.assert_close(build(guide, "diagonal", spatial_bandwidth=(4.0, 4.0)).factor, square.factor)
+
+
 @pytest.mark.parametrize("completion", COMPLETIONS)
 def test_filter_of_a_batch_with_its_own_sliders_and_bandwidths(completion: str) -> None:
     def call(guide: Tensor, alpha: Tensor, photometric: Tensor, spatial: Tensor) -> Tensor:
