@@ -27,7 +27,7 @@ from nlfilter_torch.operator.features import (
     GuideFeatures,
     SpatialBandwidth,
     bandwidth_of_rows,
-    both_axes,
+    bandwidths_of,
     estimate_bandwidth,
     reduce_channels,
     unit_window,
@@ -115,7 +115,7 @@ def nonlocal_operator(
         >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
         True
     """
-    refuse_transforms("guide", guide, photometric_bandwidth, *both_axes(spatial_bandwidth), patch_weights)
+    refuse_transforms("guide", guide, photometric_bandwidth, *bandwidths_of(spatial_bandwidth), patch_weights)
     check_image(guide, "guide", empty=True)
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
@@ -136,10 +136,9 @@ def nonlocal_operator(
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     if spatial_bandwidth is not None:
         farthest = torch.full_like(largest, max(height, width))
-        for one in both_axes(spatial_bandwidth):
+        for one in bandwidths_of(spatial_bandwidth):
             check_scale(one, "spatial_bandwidth", farthest, "coordinates")
-        vertical, horizontal = map(among.copy_to_group, both_axes(spatial_bandwidth))
-        spatial_bandwidth = (_copy(vertical), _copy(horizontal))
+        spatial_bandwidth = tuple(_copy(among.copy_to_group(one)) for one in bandwidths_of(spatial_bandwidth))
     bandwidth = _copy(bandwidth)
     recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
     features = recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo)

@@ -6,7 +6,7 @@ Also the estimate of the photometric bandwidth. Paper: Appendix A, eq. (20).
 import math
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -28,7 +28,7 @@ from nlfilter_torch.core.values import is_hidden
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 GuideChannels = Literal["luminance", "all"]
-SpatialBandwidth = float | Tensor | tuple[float | Tensor, float | Tensor]
+SpatialBandwidth = float | Tensor | tuple[float | Tensor, ...]
 
 
 def patch_window(patch_size: int) -> Tensor:
@@ -136,19 +136,13 @@ class GuideFeatures:
 
     def coordinates(self, places: Tensor) -> Tensor:
         """Features (1 or B, 2, N) of rows and columns (2, N) of pixels; there must be a spatial bandwidth."""
-        assert self.spatial_bandwidth is not None  # for mypy
-        pairs = zip(places, both_axes(self.spatial_bandwidth), strict=True)
-        scaled = [place / per_image(bandwidth, places, 2) for place, bandwidth in pairs]
-        return torch.stack(torch.broadcast_tensors(*scaled), dim=1)
+        bandwidths = [per_image(one, places, 2) for one in bandwidths_of(self.spatial_bandwidth)]
+        return places / torch.stack(torch.broadcast_tensors(*bandwidths), dim=1)
 
 
-@overload
-def both_axes(bandwidth: SpatialBandwidth) -> tuple[float | Tensor, float | Tensor]: ...
-@overload
-def both_axes(bandwidth: None) -> tuple[None, None]: ...
-def both_axes(bandwidth: Any) -> tuple[Any, Any]:
-    """Spatial bandwidths of vertical and horizontal distances."""
-    return bandwidth if isinstance(bandwidth, tuple) else (bandwidth, bandwidth)
+def bandwidths_of(spatial: SpatialBandwidth | None) -> tuple[Any, ...]:
+    """The bandwidth of all distances, or those of vertical and of horizontal ones."""
+    return spatial if isinstance(spatial, tuple) else (spatial,)
 
 
 def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:

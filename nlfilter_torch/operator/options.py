@@ -14,7 +14,7 @@ from nlfilter_torch.core.checks import (
     described,
     warn,
 )
-from nlfilter_torch.operator.features import SpatialBandwidth, both_axes
+from nlfilter_torch.operator.features import SpatialBandwidth, bandwidths_of
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
 
@@ -59,9 +59,9 @@ def check_bandwidths(
         check_positive(photometric, "photometric_bandwidth", batch)
     if isinstance(spatial, tuple) and len(spatial) != 2:
         raise ValueError(
-            f"spatial_bandwidth must be a number, or two for vertical and horizontal distances, got {len(spatial)} "
-            "numbers; pass two"
+            "spatial_bandwidth must be a number, or two for vertical and horizontal distances, got a tuple of length "
+            f"{len(spatial)}; pass two numbers"
         )
     if spatial is not None:
-        for one in both_axes(spatial):
+        for one in bandwidths_of(spatial):
             check_positive(one, "spatial_bandwidth", batch)
