@@ -31,7 +31,7 @@ from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalVa
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
-from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks
+from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks, sums_in_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
 from nlfilter_torch.edits.texture import TEXTURE_MARGIN, with_texture
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
@@ -259,12 +259,9 @@ def usual_chroma(image: Tensor) -> Tensor:
 def painted_cells(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
     """Number of cells of a grid on a picture (H, W) that strokes cover in part, (B, 1, 1, 1)."""
     side = min(size) / CELLS
-    across = math.ceil(size[1] / side)
-    row, column = scribbles.places // size[1], scribbles.places % size[1]
-    cells = (row / side).long() * across + (column / side).long()
-    shares = scribbles.weights.new_zeros(len(scribbles.weights), math.ceil(size[0] / side) * across)
-    shares = shares.index_add(1, cells, scribbles.weights[:, 0] ** 3) / side**2
-    return (shares / (shares + LEAST_SHARE)).sum(1).view(-1, 1, 1, 1)
+    shape = (math.ceil(size[0] / side), math.ceil(size[1] / side))
+    shares = sums_in_blocks(scribbles.weights**3, scribbles.places, size[1], side, shape) / side**2
+    return (shares / (shares + LEAST_SHARE)).sum((2, 3), keepdim=True)
 
 
 def fainter(first: Tensor, second: Tensor) -> Tensor:

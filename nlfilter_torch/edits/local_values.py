@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.edits.scribbled_pixels import sums_in_blocks
 from nlfilter_torch.filtering.neighbours import solve_stencil
 
 SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
@@ -94,10 +95,8 @@ class LocalValues:
     ) -> "LocalValues":
         """Solve for scribbled pixels with row-major indices (n,), weights (B, 1, n) and values (B, C, n)."""
         rows, columns = guide.shape[2:]
-        blocks = places // width // step * columns + places % width // step
         weighted = torch.cat([values * weights, weights], dim=1)
-        sums = weighted.new_zeros(*weighted.shape[:2], rows * columns).index_add(2, blocks, weighted)
-        sums = sums.unflatten(2, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
+        sums = sums_in_blocks(weighted, places, width, step, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
         anchor = sums[:, -1:].double() + 3 / (links.decay_distance**2 * rows * columns)
         around, inside = (F.unfold(planes, 3, padding=1) for planes in (guide, torch.ones_like(guide[:1])))

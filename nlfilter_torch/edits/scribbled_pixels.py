@@ -75,3 +75,17 @@ def scribbled_blocks(
             part = slice(first, first + block.shape[2])
             yield block, weights[:, :, part], values[:, :, part]
             first = part.stop
+
+
+def sums_in_blocks(values: Tensor, places: Tensor, width: int, step: float, shape: tuple[int, int]) -> Tensor:
+    """Sums (B, C, h, w) over square blocks of values (B, C, n) at pixels with row-major indices (n,).
+
+    Args:
+        values: to add.
+        places: indices in a picture of that width.
+        width: of the picture, in pixels.
+        step: side of a block, in pixels.
+        shape: numbers of rows and columns of blocks.
+    """
+    blocks = (places // width / step).long() * shape[1] + (places % width / step).long()
+    return values.new_zeros(*values.shape[:2], shape[0] * shape[1]).index_add(2, blocks, values).unflatten(2, shape)
