@@ -24,6 +24,7 @@ int nlfilter_lloyd(int, int, long, long, long, long, long, float, const float *,
 int nlfilter_pivots(int, int, long, long, long, long, float, const float *, const float *, long *);
 int nlfilter_convolution(int, int, long, long, long, long, long, long, long, float, const float *, const float *,
                          const float *, const float *, float *);
+int nlfilter_stencil(int, int, long, long, long, long, const double *, const double *, double *);
 
 static float x[B][D][N], z[B][D][M], centre[B][D], rows[B][M][D + 2], inverse[B][M][M], factor[B][M][N], norms[B][N];
 static float right[B][M][N], left[B][M][R], scale[B][N], diagonal[B][N], points[B][D + 1][M], moved[B][D][N];
@@ -277,6 +278,36 @@ static void check_convolution(int level, int threads, int apart, int adds)
     judge("convolution", status, 1e-5);
 }
 
+/* Each equation holds for the solution. */
+static void check_stencil(int level, int threads)
+{
+    enum { H = 23, W = 40, C = 3 };
+    static double stencil[B][9][H][W], sides[B][C][H][W], results[B][C][H][W];
+    for (int k = 0; k < B * C * H * W; k++)
+        sides[k / (C * H * W)][k / (H * W) % C][k / W % H][k % W] = draw(-1, 1);
+    for (int k = 0; k < B * H * W; k++) {
+        const int b = k / (H * W), y = k / W % H, x_ = k % W;
+        stencil[b][4][y][x_] = 0;
+        for (int l = 0; l < 9; l++)
+            if (l != 4) {
+                stencil[b][l][y][x_] = draw(-1, 0.4f);
+                stencil[b][4][y][x_] += fabs(stencil[b][l][y][x_]);
+            }
+    }
+    const int status = nlfilter_stencil(level, threads, B, H, W, C, stencil[0][0][0], sides[0][0][0], results[0][0][0]);
+    for (int k = 0; k < B * C * H * W; k++) {
+        const int b = k / (C * H * W), c = k / (H * W) % C, y = k / W % H, x_ = k % W;
+        double sum = 0;
+        for (int l = 0; l < 9; l++) {
+            const int row = y + l / 3 - 1, column = x_ + l % 3 - 1;
+            if (row >= 0 && row < H && column >= 0 && column < W)
+                sum += stencil[b][l][y][x_] * results[b][c][row][column];
+        }
+        compare(sum, sides[b][c][y][x_]);
+    }
+    judge("stencil", status, 1e-12);
+}
+
 int main(void)
 {
     fill(x[0][0], sizeof x, -1, 1);
@@ -318,6 +349,7 @@ int main(void)
             check_landmarks(level, threads);
             for (int apart = 1; apart <= 5; apart++)
                 check_convolution(level, threads, apart, apart % 2);
+            check_stencil(level, threads);
         }
     return failures != 0;
 }

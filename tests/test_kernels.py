@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels import columns, convolution, definitions_only, grams, tall_skinny
+from nlfilter_torch.core.kernels import columns, convolution, definitions_only, grams, stencil, tall_skinny
 from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
 from nlfilter_torch.operator import build  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
-DERIVED = ("spread", "moment", "invert", "convolve")
+DERIVED = ("spread", "moment", "invert", "convolve", "solve")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -29,6 +29,8 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
     images = random(BATCH, ROWS, PIXELS, seed=4).to(dtype)
     weights = images[:, 0].exp()
     images16, weight = random(BATCH, 16, 7, 9, seed=5).to(dtype), random(5, 16, 3, 3, seed=6).to(dtype)
+    coefficients = random(BATCH, 3, 3, 6, 7, seed=9).to(dtype)
+    coefficients[:, 1, 1] = coefficients.abs().sum((1, 2))
     backward = (*inputs, True, factor, norms.clamp(min=1.0).rsqrt())
     return {
         "columns": (*inputs, True),
@@ -45,6 +47,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "choose": (features, 1, PIXELS, LANDMARKS, "kmeans"),
         "without": (factor, norms > norms.median()),
         "convolve": (images16, weight, random(5, seed=7).to(dtype), 2, random(BATCH, 5, 7, 9, seed=8).to(dtype)),
+        "solve": (coefficients, random(BATCH, 2, 6, 7, seed=10).to(dtype)),
         "settle": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
 
@@ -135,3 +138,19 @@ def test_convolution_of_other_shapes_is_left_to_the_definition() -> None:
         convolution.convolve(features, weight, torch.ones(3))
     with pytest.raises(RuntimeError, match="channels"):
         convolution.convolve(features[:, :8], weight)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 90), (11, 1), (5, 6), (23, 51), (64, 40)], ids=str)
+def test_systems_of_pixels(size: tuple[int, int]) -> None:
+    coefficients = random(2, 3, 3, *size).double()
+    coefficients[:, 1, 1] = coefficients.abs().sum((1, 2))
+    right = random(2, 3, *size, seed=1).double()
+    found = stencil.solve_stencil(coefficients, right)
+    with definitions_only():
+        torch.testing.assert_close(stencil.solve_stencil(coefficients, right), found, rtol=1e-11, atol=1e-11)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert torch.equal(stencil.solve_stencil(coefficients, right), found)
+    finally:
+        torch.set_num_threads(threads)

@@ -20,8 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.stencil import solve_stencil
 from nlfilter_torch.edits.scribbled_pixels import sums_in_blocks
-from nlfilter_torch.filtering.neighbours import solve_stencil
 
 SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
 SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a relative weight falls to 1/e

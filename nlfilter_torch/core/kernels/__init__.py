@@ -1,4 +1,4 @@
-"""Operators of ``torch.ops.nlfilter``: each has a definition in torch and a kernel in C for float32 on CPUs.
+"""Operators of ``torch.ops.nlfilter``: each has a definition in torch and a kernel in C for CPUs.
 
 Torch's dispatcher chooses between the two; within :func:`definitions_only` the kernels are not used. Importing this
 package loads the library of the kernels, if the installation has one.

@@ -138,6 +138,7 @@ INLINE const float *NAME(fetch)(const float *source, long width, float fill, flo
 #include "convolution.h"
 #include "grams.h"
 #include "landmarks.h"
+#include "stencil.h"
 #include "tall_skinny.h"
 
 #undef FLOATS
@@ -145,3 +146,6 @@ INLINE const float *NAME(fetch)(const float *source, long width, float fill, flo
 #undef PIXELS
 #undef INLINE
 #undef SHUFFLE
+#undef DOUBLES
+#undef BLOCK
+#undef PIVOTS

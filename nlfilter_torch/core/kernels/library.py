@@ -42,6 +42,7 @@ def use(library: ctypes.CDLL, best: int) -> None:
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     library.nlfilter_convolution.argtypes = [*shared, *[_LONG] * 6, _FLOAT, *[_POINTER] * 5]
+    library.nlfilter_stencil.argtypes = [*shared, *[_LONG] * 3, *[_POINTER] * 3]
 
 
 def _openmp() -> Any:
@@ -71,23 +72,29 @@ def definitions_only() -> Iterator[None]:
 
 
 def register(
-    schema: str, compiled: Callable[..., Any] | None, fake: Callable[..., Any], *, differentiable: bool = False
+    schema: str,
+    compiled: Callable[..., Any] | None,
+    fake: Callable[..., Any],
+    *,
+    differentiable: bool = False,
+    dtype: torch.dtype = torch.float32,
 ) -> Callable[[Definition], Definition]:
     """Register a function as the definition of an operator of ``torch.ops.nlfilter``, for all dtypes and devices.
 
     Args:
         schema: name and signature of the operator.
-        compiled: the same computation by a kernel in C, for non-empty float32 tensors on CPUs; may return None to leave
-            it to the definition. None if there is no kernel.
+        compiled: the same computation by a kernel in C, for non-empty tensors of ``dtype`` on CPUs; may return None to
+            leave it to the definition. None if there is no kernel.
         fake: returns uninitialised results for the shapes of the arguments.
         differentiable: whether the definition consists of differentiable operations. Autograd, in reverse and forward
             mode and of any order, and the transforms of ``torch.func`` then see these operations.
+        dtype: of all tensors that the kernel takes.
     """
     name = schema.partition("(")[0]
 
     def decorate(definition: Definition) -> Definition:
         def on_processors(*arguments: Any) -> Any:
-            found = compiled(*arguments) if compiled is not None and level and _suit(arguments) else None
+            found = compiled(*arguments) if compiled is not None and level and _suit(arguments, dtype) else None
             return definition(*arguments) if found is None else found
 
         def under_autograd(keys: Any, *arguments: Any) -> Any:
@@ -122,14 +129,14 @@ def are_derived(arguments: Sequence[Any]) -> bool:
     return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
 
-def _suit(arguments: Sequence[Any]) -> bool:
-    """Whether the kernels support all arguments: all tensors are float32 and not empty."""
+def _suit(arguments: Sequence[Any], dtype: torch.dtype) -> bool:
+    """Whether a kernel supports all arguments: all tensors have its dtype and are not empty."""
     # Runs before every product; a loop takes half the time of a generator.
     for argument in arguments:
         if isinstance(argument, Tensor):
-            if argument.dtype is not torch.float32 or argument.numel() == 0:
+            if argument.dtype is not dtype or argument.numel() == 0:
                 return False
-        elif isinstance(argument, list) and not _suit(argument):
+        elif isinstance(argument, list) and not _suit(argument, dtype):
             return False
     return True
 

@@ -16,6 +16,7 @@
 #define NEAR 196608  /* number of floats of the factor that fit the second-level cache */
 #define MOST_ROWS 6
 #define MOST_PIXELS 64
+#define MOST_LANES 16
 #define TILES 24     /* of a convolution, processed together; a multiple of all ROWS */
 
 static inline long padded(long count, long step) { return (count + step - 1) / step * step; }
@@ -102,6 +103,8 @@ struct set {
                    float *sums);
     void (*pivots)(const struct pivots *, const float *points, long *pivots, float *scratch);
     void (*convolution)(const struct convolution *, long first, long last, float *scratch);
+    void (*eliminate)(double *equations, long own, long count, long stride);
+    void (*substitute)(const double *equations, long own, long count, long length, long sides, double *values);
 };
 
 #pragma GCC visibility push(hidden) /* avoid clashes with other libraries */

@@ -1,0 +1,149 @@
+"""Linear systems in which the equation of each pixel contains the pixel and its eight neighbours.
+
+They are solved in float64. The kernel in C eliminates the pixels by nested dissection, with about 100 N^1.5 operations
+for N pixels; the definition in torch eliminates them row by row, with about 3 N^2.
+"""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.core.kernels.library import pointer, register, run
+from nlfilter_torch.core.precision import full_precision
+
+
+@full_precision
+def solve_stencil(stencil: Tensor, right: Tensor) -> Tensor:
+    """Solve a linear system of pixels and their neighbours.
+
+    Pivots are not exchanged across rows of the image, nor at all by the kernel in C. Of each equation, or of each
+    pixel in all equations, the own coefficient should be at least as large as the sum of the others.
+
+    Args:
+        stencil: (B, 3, 3, H, W); coefficient of the neighbour in the previous, same or next row and column. Those of
+            neighbours outside the image are ignored. The matrix need not be symmetric.
+        right: right sides, (B, C, H, W).
+
+    Returns:
+        The solution (B, C, H, W). Differentiable any number of times; each derivative takes one more solution.
+
+    Example:
+        >>> stencil = torch.zeros(1, 3, 3, 1, 5)  # every pixel is the mean of its neighbours in the row
+        >>> stencil[:, 1, 0] = stencil[:, 1, 2] = -1
+        >>> stencil[:, 1, 1] = 2
+        >>> right = torch.tensor([0.0, 0, 0, 0, 6]).view(1, 1, 1, 5)  # 0 before the row, 6 after it
+        >>> solve_stencil(stencil, right).flatten()
+        tensor([1., 2., 3., 4., 5.])
+    """
+    # torch.compile supports no functions with a jvp.
+    function = solve if torch.compiler.is_compiling() else _Solution.apply
+    found: Tensor = function(stencil.double(), right.double())
+    return found.to(right.dtype)
+
+
+class _Solution(torch.autograd.Function):
+    """:func:`solve`, with derivatives by further solutions instead of those of its steps."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(stencil: Tensor, right: Tensor) -> Tensor:
+        return solve(stencil, right)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0], output)
+        ctx.save_for_forward(inputs[0], output)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+        stencil, found = ctx.saved_tensors
+        grad = solve_stencil(_transposed(stencil), grad)
+        return -(grad[:, :, None, None] * _around(found)).sum(1), grad
+
+    @staticmethod
+    def jvp(ctx: Any, stencil_tangent: Tensor | None, right_tangent: Tensor | None) -> Tensor:
+        stencil, found = ctx.saved_tensors
+        right = torch.zeros_like(found) if right_tangent is None else right_tangent
+        if stencil_tangent is not None:
+            right = right - (stencil_tangent.unsqueeze(1) * _around(found)).sum((2, 3))
+        return solve_stencil(stencil, right)
+
+
+def _around(planes: Tensor) -> Tensor:
+    """Values (B, C, 3, 3, H, W) of each pixel's neighbours, 0 outside the image."""
+    height, width = planes.shape[2:]
+    padded = F.pad(planes, (1, 1, 1, 1))
+    rows = [torch.stack([padded[..., k : k + height, j : j + width] for j in range(3)], dim=2) for k in range(3)]
+    return torch.stack(rows, dim=2)
+
+
+def _transposed(stencil: Tensor) -> Tensor:
+    """Stencil of the transposed matrix: each coefficient is that of the pixel in its neighbour's equation."""
+    around = _around(stencil.flatten(1, 2).flip(1)).unflatten(1, (3, 3))  # (B, 3, 3, 3, 3, H, W)
+    return around.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2).permute(0, 3, 4, 1, 2)
+
+
+def _compiled_solve(stencil: Tensor, right: Tensor) -> Tensor:
+    stencil, right = stencil.contiguous(), right.contiguous()
+    out = torch.empty_like(right)
+    _, sides, height, width = right.shape
+    run("stencil", torch.get_num_threads(), len(right), height, width, sides, *map(pointer, (stencil, right, out)))
+    return out
+
+
+@register(
+    "solve(Tensor stencil, Tensor right) -> Tensor",
+    _compiled_solve,
+    lambda stencil, right: torch.empty_like(right),
+    differentiable=True,
+    dtype=torch.float64,
+)
+def solve(stencil: Tensor, right: Tensor) -> Tensor:
+    """:func:`solve_stencil` in float64.
+
+    The matrix is block tridiagonal, with a block for each row of pixels (or each column, if these are shorter), and is
+    eliminated block by block: an image of h x w pixels, h <= w, takes about 3 h^3 w operations.
+    """
+    if right.shape[3] > right.shape[2]:
+        return _by_rows(stencil.transpose(1, 2).mT, right.mT).mT.contiguous()
+    return _by_rows(stencil, right)
+
+
+def _by_rows(stencil: Tensor, right: Tensor) -> Tensor:
+    width = right.shape[3]
+    # Matrices are stored transposed, since LAPACK expects columns to be contiguous.
+    rows: list[Tensor] = []  # of each row of pixels: matrix for the next row and constant, (B, W+C, W)
+    stencils = stencil.permute(3, 1, 0, 2, 4)  # (H, 3, B, 3, W)
+    padded = F.pad(stencils, (1, 1))
+    turned = torch.stack([padded[..., 2, :-2], stencils[..., 1, :], padded[..., 0, 2:]], dim=-1)  # (H, 3, B, W, 3)
+    for bands, columns, constant in zip(stencils, turned, right.permute(2, 0, 1, 3), strict=True):
+        own, after = _tridiagonal(columns[1]), _tridiagonal(columns[2])
+        if rows:
+            eliminated = _tridiagonal_product(bands[0], rows[-1])
+            own, constant = own + eliminated[:, :width], constant - eliminated[:, width:]
+        rows.append(torch.linalg.solve(own.mT, torch.cat([-after, constant], dim=1).mT).mT)
+    found = [rows.pop()[:, width:]]
+    for row in reversed(rows):
+        found.append(torch.baddbmm(row[:, width:], found[-1], row[:, :width]))
+    return torch.stack(found[::-1], dim=2)
+
+
+def _tridiagonal(bands: Tensor) -> Tensor:
+    """Matrices (B, N, N) with the rows' entries (B, N, 3) on and beside the diagonal."""
+    count = bands.shape[1]
+    # Rows of N + 3 entries, read as rows of N + 2, move to the right by one from row to row.
+    entries = F.pad(bands, (0, count)).flatten(1)[:, : count * (count + 2)]
+    return entries.unflatten(1, (count, count + 2))[..., 1:-1]
+
+
+def _tridiagonal_product(bands: Tensor, transposed: Tensor) -> Tensor:
+    """Transposed product of tridiagonal matrices and matrices, of which the second are given transposed, (B, K, N).
+
+    ``bands`` (B, 3, N) has the entries before, on and after the diagonal in each row.
+    """
+    before, own, after = bands.split(1, dim=1)  # (B, 1, N)
+    padded = F.pad(transposed, (1, 1))
+    return torch.addcmul(torch.addcmul(own * transposed, before, padded[..., :-2]), after, padded[..., 2:])
