@@ -1,6 +1,6 @@
 """Linear systems in which the equation of each pixel contains the pixel and its eight neighbours.
 
-They are solved in float64. The kernel in C eliminates the pixels by nested dissection, with about 100 N^1.5 operations
+They are solved in float64. The kernel in C eliminates the pixels by nested dissection, with about 50 N^1.5 operations
 for N pixels; the definition in torch eliminates them row by row, with about 3 N^2.
 """
 
