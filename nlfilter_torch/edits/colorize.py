@@ -7,7 +7,8 @@ two notions of an edge. Their errors are in different places, so that the mean i
 An estimate counts less the farther it is from the other two and the more saturated it is. The regression also counts
 less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
 relative differences has the fewest large errors: it counts more if there are few strokes, and the distance of the mean
-from it is limited.
+from it is limited. Both predict the colour of each stroke from other strokes; the one with the smaller errors counts
+more.
 
 Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
 to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
@@ -33,6 +34,7 @@ from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
 from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks, sums_in_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
+from nlfilter_torch.edits.stroke_groups import StrokeGroups
 from nlfilter_torch.edits.texture import TEXTURE_MARGIN, with_texture
 from nlfilter_torch.edits.viewing import Coarse, viewed_size
 from nlfilter_torch.filtering.masks import segment
@@ -79,6 +81,8 @@ CELLS, LEAST_SHARE = 16, 0.05  # cells along the short side, and the painted sha
 # differences falls with the number: with few strokes, it is likely that some colour is missing.
 FEW_CELLS, CAUTION = 6.0, 0.3
 MOST_CHANGE = 0.12  # distance in chroma of the result from that estimate
+SAME_ERROR = 3e-3  # squared error of a predicted stroke that hardly counts
+BELIEF, MOST_BELIEF = 2.0, 9.0  # exponent of the ratio of errors, and limit of the resulting factor
 
 
 def colorize_guide(image: Tensor) -> Tensor:
@@ -193,48 +197,36 @@ def colorize(
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
     # Cubed, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
     # size of the picture.
-    painted, scaled = [scribbles.places, scribbles.weights**3], wanted / usual_there.sqrt()
+    cubed, scaled = scribbles.weights**3, wanted / usual_there.sqrt()
 
-    def propagated(links: Links, values: Tensor) -> Callable[[Any, Tensor], Tensor]:
+    groups = StrokeGroups.of(scribbles, small)
+
+    def propagated(links: Links, values: Tensor, predicted: Tensor | None = None) -> LocalValues:
         step = links.step(small)
-        guide, marks = viewed.reduced(luminance, step), [*painted, values]
-        found = viewed.kept(links, [guide, *marks], lambda: LocalValues.of(links, guide, step, small[1], *marks))
+        guide, places = viewed.reduced(luminance, step), scribbles.places
+        solved = partial(LocalValues.of, links, guide, step, small[1], places, cubed, values, groups, predicted)
+        return viewed.kept(links, [guide, places, cubed, values], solved)
 
-        def interpolated(some: Any, own: Tensor) -> Tensor:
-            place = (links, some.first, some.image.shape)
-            return viewed.kept(place, [found.values], lambda: found(own, some.first))
+    def interpolated(found: LocalValues, some: Any, own: Tensor) -> Tensor:
+        place = (found.links, some.first, some.image.shape)
+        return viewed.kept(place, [found.values], lambda: found(own, some.first))
 
-        return interpolated
-
-    absolute, relative = propagated(ABSOLUTE, scaled), propagated(RELATIVE, torch.cat([scaled, wanted], dim=1))
-    wanted = wanted / usual_there
-    # Extended along with the chroma: its square, for the variance among strokes on similar pixels, and ones, for the
-    # degree to which strokes nearby determine a pixel.
-    squares, ones = squared_sum(wanted), torch.ones_like(wanted[:, :1])
-    parts = []
-    for stage, other in ((FAR, squares), (NEAR, ones)):
-        operator = operator_of(stage)
-        columns = operator.at(scribbles.places)
-        fitted = fit_strokes(
-            partial(scribbled_blocks, [(columns, scribbles.weights, torch.cat([wanted, other], dim=1))]),
-            operator.pairs,
-            pixels,
-            strength=strength if stage is FAR else 0.0,
-            reach=stage.reach,
-            smoothness=stage.smoothness,
-        )
-        wanted = wanted - torch.cat([fitted(block)[:, :2] for block in columns()], dim=2)
-        parts.append(operator.each(lambda found, fitted=fitted: fitted(found.factor)))  # type: ignore[misc]
-        del operator  # frees its factor before the next one is computed
-    far, near = parts
+    absolute = propagated(ABSOLUTE, scaled)
+    relative = propagated(RELATIVE, torch.cat([scaled, wanted], dim=1), wanted)
+    weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
+    (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
     everywhere = per_image(strength, wanted, 4)
     caution = (FEW_CELLS / painted_cells(scribbles, small)) ** CAUTION
+    belief: float | Tensor = 1.0
+    if relative.left_out is not None:
+        residual = groups.of_own(residuals[1:]) * usual_there
+        belief = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
 
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
         usual = usual_chroma(own)
-        connected, influence = absolute(some, own).tensor_split([2], dim=1)
-        around, unscaled = relative(some, own)[:, :4].split(2, dim=1)
+        connected, influence = interpolated(absolute, some, own).tensor_split([2], dim=1)
+        around, unscaled = interpolated(relative, some, own)[:, :4].split(2, dim=1)
         around = fainter(around * usual.sqrt(), unscaled)
         mean, square = far(some).tensor_split([2], dim=1)
         residual, support = near(some).tensor_split([2], dim=1)
@@ -243,7 +235,7 @@ def colorize(
         around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
-        factors = trust, influence**3, caution
+        factors = belief * trust, influence**3, caution
         change = weighted_mean((alike, connected, around), factors) - around
         return around + change * (1 + squared_sum(change) / MOST_CHANGE**2).rsqrt()
 
@@ -262,6 +254,75 @@ def painted_cells(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
     shape = (math.ceil(size[0] / side), math.ceil(size[1] / side))
     shares = sums_in_blocks(scribbles.weights**3, scribbles.places, size[1], side, shape) / side**2
     return (shares / (shares + LEAST_SHARE)).sum((2, 3), keepdim=True)
+
+
+def extended(
+    operator_of: Callable[[Stage], Operator],
+    places: Tensor,
+    weights: list[Tensor],
+    wanted: Tensor,
+    pixels: int,
+    strength: float | Tensor,
+) -> tuple[list[Planes], list[Tensor]]:
+    """Extend values by the regressions :data:`FAR` and :data:`NEAR`, for several sets of weights.
+
+    Args:
+        operator_of: the operator of a stage.
+        places: row-major indices of the scribbled pixels, (n,).
+        weights: of the scribbled pixels, for each set (B, 1, n).
+        wanted: values of the scribbled pixels, (B, 2, n).
+        pixels: number of pixels of the picture.
+        strength: of the first regression, see :func:`propagate_strokes`.
+
+    Returns:
+        Results of both stages for the first set: (B, 3, h, W), the values, and as a third channel for FAR their squared
+        sum, from which the variance among strokes on similar pixels follows; for NEAR, the degree to which strokes
+        nearby determine a pixel. For every set, the residuals at the scribbled pixels, (B, 2, n).
+    """
+    residuals = [wanted] * len(weights)
+    planes = []
+    for stage, other in ((FAR, squared_sum(wanted)), (NEAR, torch.ones_like(wanted[:, :1]))):
+        operator = operator_of(stage)
+        columns = operator.at(places)
+        fits = [
+            fit_strokes(
+                partial(scribbled_blocks, [(columns, own, torch.cat([residual, other], dim=1))]),
+                operator.pairs,
+                pixels,
+                strength=strength if stage is FAR else 0.0,
+                reach=stage.reach,
+                smoothness=stage.smoothness,
+            )
+            for own, residual in zip(weights, residuals, strict=True)
+        ]
+        known = [
+            torch.cat(blocks, dim=2) for blocks in zip(*([fit(b) for fit in fits] for b in columns()), strict=True)
+        ]
+        residuals = [before - values[:, :2] for before, values in zip(residuals, known, strict=True)]
+        planes.append(operator.each(lambda found, fitted=fits[0]: fitted(found.factor)))  # type: ignore[misc]
+        del operator  # frees its factor before the next one is computed
+    return planes, residuals
+
+
+def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Tensor, left_out: Tensor) -> Tensor:
+    """Factor (B, 1, 1, 1) of the regression, from its errors and those of another estimate for strokes left out.
+
+    Args:
+        groups: of the strokes.
+        weights: of the scribbled pixels, (B, 1, n).
+        residual: of the regression on the other groups, in units of chroma, (B, 2, n).
+        wanted: chroma of the strokes, (B, 2, n).
+        left_out: of the other estimate, see :class:`LocalValues`.
+    """
+    painted, flow = groups.sums(weights), groups.sums(left_out)  # (B, 1, S), (B, 3, S)
+    valid = (painted > 0) & (flow[:, -1:] > 0)
+    painted = torch.where(valid, painted, 1.0)
+    error = squared_sum(groups.sums(residual * weights) / painted)
+    predicted = flow[:, :-1] / torch.where(valid, flow[:, -1:], 1.0)
+    other = squared_sum(predicted - groups.sums(wanted * weights) / painted)
+    ratios = ((other + SAME_ERROR) / (error + SAME_ERROR)).log() * valid
+    ratio = ratios.sum(2) / valid.sum(2).clamp(min=1)
+    return (BELIEF * ratio).exp().clamp(max=MOST_BELIEF).to(weights).view(-1, 1, 1, 1)
 
 
 def fainter(first: Tensor, second: Tensor) -> Tensor:

@@ -21,7 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.stencil import solve_stencil
-from nlfilter_torch.edits.scribbled_pixels import sums_in_blocks
+from nlfilter_torch.edits.scribbled_pixels import blocks_at, sums_in_blocks
+from nlfilter_torch.edits.stroke_groups import StrokeGroups
 
 SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
 SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a relative weight falls to 1/e
@@ -68,7 +69,7 @@ def _relative(difference: Tensor, inside: Tensor) -> Tensor:
 
 
 # With RELATIVE weights the influence hardly decays: scribbles far away then count as they do for Levin et al.
-ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 2.0), Links(_relative, 1 << 15, 20.0)
+ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 2.0), Links(_relative, 1 << 18, 20.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,35 +77,60 @@ class LocalValues:
     """Values of any pixel, by interpolation of a solution on blocks.
 
     Attributes:
+        links: between neighbours.
         values: solutions for the scribbles' values and for ones, (B, C+1, h, w). The solution for ones, in [0, 1], is
             the degree to which the scribbles determine a block; the ratio of both is a weighted mean of the scribbles'
             values.
         guide: luminance of the blocks, (B, 1, h, w).
         step: side of a block in pixels.
         width: W of the picture.
+        left_out: at each scribbled pixel, the solutions of its block if the values and ones of its own group of strokes
+            are replaced by 0, (B, P+1, n) in float64; None if no strokes were compared. The ratio of both is the
+            prediction from the other strokes.
     """
 
+    links: Links
     values: Tensor
     guide: Tensor
     step: int
     width: int
+    left_out: Tensor | None = None
 
     @staticmethod
     def of(
-        links: Links, guide: Tensor, step: int, width: int, places: Tensor, weights: Tensor, values: Tensor
+        links: Links,
+        guide: Tensor,
+        step: int,
+        width: int,
+        places: Tensor,
+        weights: Tensor,
+        values: Tensor,
+        groups: StrokeGroups | None = None,
+        predicted: Tensor | None = None,
     ) -> "LocalValues":
-        """Solve for scribbled pixels with row-major indices (n,), weights (B, 1, n) and values (B, C, n)."""
+        """Solve for scribbled pixels with row-major indices (n,), weights (B, 1, n) and values (B, C, n).
+
+        With ``groups``, the ``predicted`` values (B, P, n) are also extended from the other groups of strokes.
+        """
         rows, columns = guide.shape[2:]
-        weighted = torch.cat([values * weights, weights], dim=1)
-        sums = sums_in_blocks(weighted, places, width, step, (rows, columns)) * (SCRIBBLE_WEIGHT / step**2)
+        sets = [torch.cat([values * weights, weights], dim=1)]
+        if groups is not None and predicted is not None:
+            sets += groups.without_each(torch.cat([predicted * weights, weights], dim=1))
+        sums = sums_in_blocks(torch.cat(sets, dim=1), places, width, step, (rows, columns)).double()
+        sums, ones = sums * (SCRIBBLE_WEIGHT / step**2), values.shape[1]
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
-        anchor = sums[:, -1:].double() + 3 / (links.decay_distance**2 * rows * columns)
+        anchor = sums[:, ones : ones + 1] + 3 / (links.decay_distance**2 * rows * columns)
         around, inside = (F.unfold(planes, 3, padding=1) for planes in (guide, torch.ones_like(guide[:1])))
         inside[:, 4] = 0.0  # the pixel itself
         alike = links.weights((around - guide.flatten(2)) * inside, inside).double().unflatten(2, (rows, columns))
         own = alike.sum(1, keepdim=True) + anchor
         stencil = torch.cat([-alike[:, :4], own, -alike[:, 5:]], dim=1).unflatten(1, (3, 3))
-        return LocalValues(solve_stencil(stencil, sums), guide, step, width)
+        found, *others = solve_stencil(stencil, sums).split([known.shape[1] for known in sets], dim=1)
+        left_out = None
+        if groups is not None and others:
+            at = blocks_at(places, width, step, (rows, columns))
+            left_out = groups.of_own([one.flatten(2)[:, :, at] for one in others])
+        return LocalValues(links, found.to(guide), guide, step, width, left_out)
 
     def __call__(self, own: Tensor, first: int) -> Tensor:
         """Return mean values of scribbles, and their influence in [0, 1], for a rectangle: (B, C+1, h, w).

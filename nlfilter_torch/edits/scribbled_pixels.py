@@ -87,5 +87,10 @@ def sums_in_blocks(values: Tensor, places: Tensor, width: int, step: float, shap
         step: side of a block, in pixels.
         shape: numbers of rows and columns of blocks.
     """
-    blocks = (places // width / step).long() * shape[1] + (places % width / step).long()
+    blocks = blocks_at(places, width, step, shape)
     return values.new_zeros(*values.shape[:2], shape[0] * shape[1]).index_add(2, blocks, values).unflatten(2, shape)
+
+
+def blocks_at(places: Tensor, width: int, step: float, shape: tuple[int, int]) -> Tensor:
+    """Row-major indices (n,) of the blocks of pixels; the arguments are those of :func:`sums_in_blocks`."""
+    return (places // width / step).long() * shape[1] + (places % width / step).long()

@@ -1,0 +1,64 @@
+"""Groups of strokes, each of which is predicted from the others, to compare methods on the scribbles themselves."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.edits.scribbled_pixels import Scribbles, blocks_at, sums_in_blocks
+
+GROUPS = 5
+CELLS = 64  # along the short side, in which painted areas are connected
+
+
+@dataclass(frozen=True, eq=False)
+class StrokeGroups:
+    """The strokes of a picture, or of a batch of them: its connected painted areas.
+
+    Attributes:
+        strokes: number of the stroke at each scribbled pixel, (n,). Strokes with the same remainder after division by
+            :data:`GROUPS` are a group.
+        count: number S of strokes.
+    """
+
+    strokes: Tensor
+    count: int
+
+    @staticmethod
+    def of(scribbles: Scribbles, size: tuple[int, int]) -> "StrokeGroups":
+        """Number the strokes of a picture (H, W), of all images of a batch together.
+
+        Areas closer together than 1/64 of the short side count as connected.
+        """
+        from skimage.measure import label
+
+        places, side = scribbles.places, max(1.0, min(size) / CELLS)
+        cells = (math.ceil(size[0] / side), math.ceil(size[1] / side))
+        weights = scribbles.weights.detach().amax((0, 1), keepdim=True)
+        painted = sums_in_blocks(weights, places, size[1], side, cells)[0, 0] > 0
+        numbers, count = label(painted.cpu().numpy(), connectivity=2, return_num=True)
+        strokes = torch.from_numpy(numbers).to(places).flatten()[blocks_at(places, size[1], side, cells)]
+        return StrokeGroups((strokes - 1).clamp(min=0), int(count))
+
+    def without_each(self, weighted: Tensor) -> list[Tensor]:
+        """Values (B, C, n) with those of one group replaced by 0, for each group; an empty list for a single stroke."""
+        if self.count < 2:
+            return []
+        return [weighted * (self.strokes % GROUPS != number) for number in range(min(GROUPS, self.count))]
+
+    def weights_without_each(self, weights: Tensor) -> list[Tensor]:
+        """:meth:`without_each`, but images of which no weight (B, 1, n) would be left keep all of them."""
+        sets = self.without_each(weights)
+        return [torch.where(left.sum(2, keepdim=True) > 0, left, weights) for left in sets]
+
+    def of_own(self, values: Sequence[Tensor]) -> Tensor:
+        """Of values (B, C, n) for each group, those for the group of each pixel."""
+        own = (self.strokes % GROUPS).expand(1, *values[0].shape)
+        return torch.stack(list(values)).gather(0, own).squeeze(0)
+
+    def sums(self, values: Tensor) -> Tensor:
+        """Sums (B, C, S) of values (B, C, n) over each stroke, in float64."""
+        sums = values.new_zeros(*values.shape[:2], self.count, dtype=torch.float64)
+        return sums.index_add(2, self.strokes, values.double())
