@@ -86,6 +86,8 @@ QUICK := \
 	'tables --long-side 32' \
 	'masks --quick' \
 	'recolor --quick' \
+	'colorize --quick' \
+	'colorize --quick --lines' \
 	'compilation --quick --only export' \
 	'memory --side 128 --repeats 1' \
 	'fuzz --cases 20'

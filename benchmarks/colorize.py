@@ -4,7 +4,8 @@ Grey versions of photographs are colourised from 6, 20 and 60 random 5x5 strokes
 each. Prints the PSNR of the RGB result against the photograph, and CPU time, for the regression mixed with values of
 neighbours (the default), the paper's k-means method, and Levin's optimisation (:mod:`benchmarks.levin`). All keep the
 luminance and use the same gamut mapping. Parameters were chosen on :data:`CHOOSING` and on other photographs; results
-are reported on :data:`REPORTING`, or on every photograph of a folder, with strokes of other seeds.
+are reported on :data:`REPORTING`, or on every photograph of a folder, with strokes of other seeds. With ``--lines`` the
+strokes are lines of one colour each, which end where the photograph's colour changes, as people draw them.
 """
 
 import argparse
@@ -29,6 +30,8 @@ SIDE, SHAPE = 160, (160, 240)  # pixels of the short side, and of crops
 COUNTS = (6, 20, 60)
 SEEDS = 3
 BRUSH = 5
+LENGTHS, WIDTH = (0.1, 0.3), 3  # of lines: shortest and longest, relative to the short side, and width in pixels
+SAME_COLOUR = 0.07  # change of chroma at which a line ends
 WON, AHEAD, WORST, TIME = 0.85, 0.8, -0.4, 1.5  # share won, median and worst lead in dB, relative time
 
 GREY = 45  # dB; a photograph whose luminance has a higher PSNR counts as grey
@@ -70,6 +73,28 @@ def random_strokes(count: int, seed: int, size: tuple[int, int]) -> Tensor:
     return mask
 
 
+def random_lines(image: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Strokes (1, 3, H, W) along ``count`` random lines, each of the mean colour of its pixels, and their mask."""
+    generator = np.random.default_rng(seed)
+    height, width = image.shape[2:]
+    chroma, mask, strokes = split_luminance(image)[1][0], torch.zeros(1, 1, height, width), torch.zeros_like(image)
+    for _ in range(count):
+        start = generator.integers((0, 0), (height, width))
+        angle, length = generator.uniform(0, 2 * np.pi), height * generator.uniform(*LENGTHS)
+        steps = np.arange(max(1, round(length)))[:, None] * (np.sin(angle), np.cos(angle))
+        rows, columns = torch.from_numpy(np.rint(start + steps)).long().unbind(1)
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        rows, columns = rows[inside], columns[inside]
+        change = (chroma[:, rows, columns] - chroma[:, rows[:1], columns[:1]]).norm(dim=0)
+        before = (change > SAME_COLOUR).cumsum(0) == 0
+        line = torch.zeros(1, 1, height, width)
+        line[..., rows[before], columns[before]] = 1
+        line = torch.nn.functional.max_pool2d(line, WIDTH, 1, WIDTH // 2) * (1 - mask)
+        colour = (image * line).sum((2, 3), keepdim=True) / line.sum().clamp(min=1)
+        mask, strokes = mask + line, strokes + colour * line
+    return strokes, mask
+
+
 def levin(grey: Tensor, strokes: Tensor, mask: Tensor) -> Tensor:
     """Levin's optimisation with the library's gamut mapping."""
     chroma = split_luminance(strokes)[1][0].double()
@@ -105,13 +130,18 @@ def crops(names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Tensor]:
     return found
 
 
-def measure(name: str, image: Tensor, count: int, seed: int, save: Path | None) -> Case:
+def measure(name: str, image: Tensor, count: int, seed: int, lines: bool, save: Path | None) -> Case:
     """Run every method on one photograph with one set of strokes; save the results side by side."""
-    grey, mask = split_luminance(image)[0], random_strokes(count, seed, (image.shape[2], image.shape[3]))
-    results, shown = {}, [torch.where(mask > 0, image, grey)]
+    grey = split_luminance(image)[0]
+    if lines:
+        strokes, mask = random_lines(image, count, seed)
+    else:
+        mask = random_strokes(count, seed, (image.shape[2], image.shape[3]))
+        strokes = image * mask
+    results, shown = {}, [torch.where(mask > 0, strokes, grey)]
     for method, function in METHODS.items():
         start = time.process_time()
-        found = function(grey, image * mask, mask)
+        found = function(grey, strokes, mask)
         results[method] = Result(psnr(found, image), time.process_time() - start)
         shown.append(found)
     if save is not None:
@@ -158,6 +188,7 @@ def main(arguments: list[str] | None = None) -> None:
         default=1000,
         help="first seed of the strokes; 0 to 404, 20000 to 20003 and 50000 to 136001 were used to choose parameters",
     )
+    parser.add_argument("--lines", action="store_true", help="lines of one colour in place of squares of true colours")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="sets of strokes for each number of strokes")
     parser.add_argument(
         "--save", type=Path, help="folder for pictures of the scribbles, all results and the photograph, side by side"
@@ -176,7 +207,8 @@ def main(arguments: list[str] | None = None) -> None:
     for function in METHODS.values():  # the first call imports
         function(photograph("coffee", 16, 24)[:, :1], photograph("coffee", 16, 24), torch.ones(1, 1, 16, 24))
 
-    print(f"PSNR in dB of coloured photographs, mean of {len(seeds)} sets of 5x5 strokes")
+    kind = "lines" if options.lines else "5x5 strokes"
+    print(f"PSNR in dB of coloured photographs, mean of {len(seeds)} sets of {kind}")
     print(f"{'photograph':24}{'strokes':>8}" + "".join(f"{method:>12}" for method in METHODS))
     cases: list[Case] = []
     for name, image in images.items():
@@ -184,7 +216,7 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"{name:24} is left out: it is grey")
             continue
         for count in COUNTS:
-            group = [measure(name, image, count, seed, options.save) for seed in seeds]
+            group = [measure(name, image, count, seed, options.lines, options.save) for seed in seeds]
             means = [statistics.mean(case.results[method].psnr for case in group) for method in METHODS]
             print(f"{name:24}{count:8d}" + "".join(f"{value:12.2f}" for value in means), flush=True)
             cases += group

@@ -69,7 +69,7 @@ def _relative(difference: Tensor, inside: Tensor) -> Tensor:
 
 
 # With RELATIVE weights the influence hardly decays: scribbles far away then count as they do for Levin et al.
-ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 2.0), Links(_relative, 1 << 18, 20.0)
+ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 2.0), Links(_relative, 1 << 17, 20.0)
 
 
 @dataclass(frozen=True, eq=False)
