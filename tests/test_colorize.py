@@ -1,14 +1,12 @@
 """Colourising: colours are recovered from strokes, and the luminance is unchanged."""
 
 import numpy as np
-import pytest
 import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import colorize_guide, fainter, painted_cells, weighted_mean
+from nlfilter_torch.edits.colorize import colorize_guide, fainter, weighted_mean
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.edits.in_memory import InMemory
 from tests.problems import box, colour, luminance, paint
 
 
@@ -65,18 +63,6 @@ def test_the_mean_of_estimates_leaves_out_what_differs_and_what_nothing_supports
     torch.testing.assert_close(weighted_mean((red, red, red), (one, one, 1.0)), red)
     assert (weighted_mean((blue, red, red), (one, one, 1.0)) - red).norm() < 0.3 * (blue - red).norm()
     torch.testing.assert_close(weighted_mean((blue, blue, red), (none, none, 1.0)), red)
-
-
-def test_cells_are_counted_wherever_strokes_lie_and_for_every_image() -> None:
-    def counted(*masks: torch.Tensor) -> list[float]:
-        mask = torch.cat(masks)
-        return painted_cells(InMemory(mask).scribbles(mask, None, "mask"), (64, 96)).flatten().tolist()
-
-    one, corner = box(8, 8, 4, 4, size=(64, 96)), box(60, 92, 4, 4, size=(64, 96))  # a cell has 4x4 pixels
-    assert counted(one) == pytest.approx([1.0], abs=0.05)
-    assert counted(one + corner, corner) == pytest.approx([2.0, 1.0], abs=0.1)
-    assert counted(box(8, 8, 4, 16, size=(64, 96))) == pytest.approx([4.0], abs=0.2)
-    assert counted(0.1 * one)[0] < 0.05  # hardly painted
 
 
 def test_the_fainter_of_two_colours_is_chosen_at_each_pixel() -> None:

@@ -6,9 +6,9 @@ two notions of an edge. Their errors are in different places, so that the mean i
 
 An estimate counts less the farther it is from the other two and the more saturated it is. The regression also counts
 less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
-relative differences has the fewest large errors: it counts more if there are few strokes, and the distance of the mean
-from it is limited. Both predict the colour of each stroke from other strokes; the one with the smaller errors counts
-more.
+relative differences has the fewest large errors, so that the distance of the mean from it is limited. It and the
+regression are compared by predicting the colour of each stroke from other strokes: the smaller the errors of the
+regression are in comparison, the more it counts.
 
 Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
 to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
@@ -32,7 +32,7 @@ from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalVa
 from nlfilter_torch.edits.mask import blocks_of
 from nlfilter_torch.edits.parameters import COLORIZE
 from nlfilter_torch.edits.pixels import part_of
-from nlfilter_torch.edits.scribbled_pixels import Scribbles, scribbled_blocks, sums_in_blocks
+from nlfilter_torch.edits.scribbled_pixels import scribbled_blocks
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Planes, Source, luminance
 from nlfilter_torch.edits.stroke_groups import StrokeGroups
 from nlfilter_torch.edits.texture import TEXTURE_MARGIN, with_texture
@@ -76,10 +76,7 @@ SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 FAINT = 0.2  # chroma below which estimates differ little in weight
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
 LARGE_VARIANCE = 0.02  # of chroma among strokes on similar pixels
-CELLS, LEAST_SHARE = 16, 0.05  # cells along the short side, and the painted share of a cell that counts as half
-# Number of painted cells at which the three estimates have equal factors, and how fast that of the estimate by relative
-# differences falls with the number: with few strokes, it is likely that some colour is missing.
-FEW_CELLS, CAUTION = 6.0, 0.3
+CAUTION = 0.8  # factor of the estimate by relative differences
 MOST_CHANGE = 0.12  # distance in chroma of the result from that estimate
 SAME_ERROR = 3e-3  # squared error of a predicted stroke that hardly counts
 BELIEF, MOST_BELIEF = 2.0, 9.0  # exponent of the ratio of errors, and limit of the resulting factor
@@ -216,7 +213,6 @@ def colorize(
     weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
     (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
     everywhere = per_image(strength, wanted, 4)
-    caution = (FEW_CELLS / painted_cells(scribbles, small)) ** CAUTION
     belief: float | Tensor = 1.0
     if relative.left_out is not None:
         residual = groups.of_own(residuals[1:]) * usual_there
@@ -235,7 +231,7 @@ def colorize(
         around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
-        factors = belief * trust, influence**3, caution
+        factors = belief * trust, influence**3, CAUTION
         change = weighted_mean((alike, connected, around), factors) - around
         return around + change * (1 + squared_sum(change) / MOST_CHANGE**2).rsqrt()
 
@@ -246,14 +242,6 @@ def usual_chroma(image: Tensor) -> Tensor:
     """Usual chroma of pixels (B, 1 or 3, H, W) of one colour, (B, 1, H, W): largest halfway from black to white."""
     own = reduce_channels(image, "luminance")
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
-
-
-def painted_cells(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
-    """Number of cells of a grid on a picture (H, W) that strokes cover in part, (B, 1, 1, 1)."""
-    side = min(size) / CELLS
-    shape = (math.ceil(size[0] / side), math.ceil(size[1] / side))
-    shares = sums_in_blocks(scribbles.weights**3, scribbles.places, size[1], side, shape) / side**2
-    return (shares / (shares + LEAST_SHARE)).sum((2, 3), keepdim=True)
 
 
 def extended(
