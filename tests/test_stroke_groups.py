@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nlfilter_torch import colorize
 from nlfilter_torch.edits.colorize import SAME_ERROR, Stage, colorize_guide, compared, extended
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
@@ -29,13 +30,14 @@ def dots(*positions: tuple[int, int], size: tuple[int, int] = SIZE) -> Tensor:
     return mask
 
 
-def test_strokes_are_connected_areas_of_any_image() -> None:
-    mask = torch.cat([box(2, 3, 4, 2, size=SIZE) + box(6, 5, 2, 6, size=SIZE), box(15, 20, 3, 3, size=SIZE)])
-    groups, places = groups_of(mask)  # the first two areas touch at a corner
+def test_strokes_are_connected_areas_of_each_image() -> None:
+    first = box(2, 3, 4, 2, size=SIZE) + box(6, 5, 2, 6, size=SIZE)  # these touch at a corner
+    mask = torch.cat([first + box(15, 20, 3, 3, size=SIZE), box(4, 8, 12, 1, size=SIZE)])
+    groups, places = groups_of(mask)
     assert groups.count == 2
-    assert torch.equal(groups.strokes, (places >= 15 * 30).long())
-    sums = groups.sums(mask.flatten(2)[:, :, places])
-    assert sums.squeeze(1).tolist() == [[20, 0], [0, 9]]
+    painted = mask.flatten(2)[:, :, places]
+    assert torch.equal(groups.strokes[0][painted[0, 0] > 0], (places >= 15 * 30).long()[painted[0, 0] > 0])
+    assert groups.sums(painted).squeeze(1).tolist() == [[20, 9], [12, 0]]
 
 
 def test_in_large_pictures_areas_close_together_are_one_stroke() -> None:
@@ -53,14 +55,19 @@ def test_each_group_is_left_out_once() -> None:
     assert len(sets) == GROUPS
     torch.testing.assert_close(sum(sets), (GROUPS - 1) * values)  # type: ignore[arg-type]
     assert not groups.of_own(sets).any()
-    torch.testing.assert_close(groups.of_own([values * k for k in range(GROUPS)]), values * (groups.strokes % GROUPS))
+    torch.testing.assert_close(
+        groups.of_own([values * k for k in range(GROUPS)]), values * (groups.strokes % GROUPS)[:, None]
+    )
 
 
 def test_a_single_stroke_is_not_left_out_nor_are_all_strokes_of_an_image() -> None:
     assert not groups_of(box(2, 3, 4, 2, size=SIZE))[0].without_each(torch.ones(1, 1, 8))
-    weights = torch.eye(2).unsqueeze(1)  # two images with one stroke each
-    sets = groups_of(dots((2, 3), (9, 20)))[0].weights_without_each(weights)
-    assert all(torch.equal(left, weights) for left in sets)
+    mask = torch.cat([dots((2, 3), (9, 20)), dots((9, 20))])
+    groups, places = groups_of(mask)
+    weights = mask.flatten(2)[:, :, places]
+    first, second = groups.weights_without_each(weights)
+    assert first.squeeze(1).tolist() == [[0, 1], [0, 1]]
+    assert second.squeeze(1).tolist() == [[1, 0], [0, 1]]
 
 
 @pytest.mark.parametrize("links", [ABSOLUTE, RELATIVE], ids=["absolute", "relative"])
@@ -102,21 +109,31 @@ def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
         return values - groups.of_own(residuals[1:]), (local[:, :2] / local[:, 2:]).to(values)
 
     values = torch.rand(1, 2, len(places), generator=generator)
-    changed = torch.where(groups.strokes == 1, values + 0.5, values)
+    changed = torch.where(groups.strokes[0] == 1, values + 0.5, values)
     for before, after in zip(predictions(values), predictions(changed), strict=True):
-        torch.testing.assert_close(before[:, :, groups.strokes == 1], after[:, :, groups.strokes == 1])
-        assert (before - after)[:, :, groups.strokes != 1].abs().max() > 1e-3
+        torch.testing.assert_close(before[:, :, groups.strokes[0] == 1], after[:, :, groups.strokes[0] == 1])
+        assert (before - after)[:, :, groups.strokes[0] != 1].abs().max() > 1e-3
 
 
 def test_the_regression_counts_more_if_it_predicts_strokes_better() -> None:
-    groups, _ = groups_of(dots((2, 3), (9, 20), (15, 8)))
-    weights, wanted = torch.ones(3, 1, 3), torch.zeros(3, 2, 3)
-    weights[2, :, 1:] = 0  # a single stroke: nothing is compared
+    mask = torch.cat([dots((2, 3), (9, 20), (15, 8))] * 2 + [dots((2, 3))])
+    groups, places = groups_of(mask)
+    weights, wanted = mask.flatten(2)[:, :, places], torch.zeros(3, 2, 3)
     flow = torch.full((3, 3, 3), 0.5, dtype=torch.float64)
     flow[:, :2] *= SAME_ERROR**0.5  # all predictions are off by this
-    flow[2, :, 1:] = 0
+    flow[2] = 0  # a single stroke: nothing is compared
     residual = torch.full((3, 2, 3), SAME_ERROR**0.5)
     residual[1] = 0.0
     factors = compared(groups, weights, residual, wanted, flow).flatten()
     torch.testing.assert_close(factors, torch.tensor([1.0, 9.0, 1.0]))
     assert compared(groups, weights, residual * 9, wanted, flow)[0] < 0.01
+
+
+def test_colours_do_not_depend_on_other_images_of_a_batch() -> None:
+    image = torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(4))
+    mask = torch.cat([dots((2, 3), (9, 20), (15, 8), (4, 24), (10, 9)), dots((3, 3), (9, 21))])
+    grey = image.mean(1, keepdim=True)
+    both = colorize(grey, image, mask, num_landmarks=30)
+    for k in range(2):
+        alone = colorize(grey[k : k + 1], image[k : k + 1], mask[k : k + 1], num_landmarks=30)
+        torch.testing.assert_close(both[k : k + 1], alone, atol=1e-4, rtol=0)

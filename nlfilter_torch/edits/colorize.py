@@ -302,7 +302,7 @@ def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Te
         wanted: chroma of the strokes, (B, 2, n).
         left_out: of the other estimate, see :class:`LocalValues`.
     """
-    painted, flow = groups.sums(weights), groups.sums(left_out)  # (B, 1, S), (B, 3, S)
+    painted, flow = groups.sums(weights), groups.sums(left_out * (weights > 0))  # (B, 1, S), (B, 3, S)
     valid = (painted > 0) & (flow[:, -1:] > 0)
     painted = torch.where(valid, painted, 1.0)
     error = squared_sum(groups.sums(residual * weights) / painted)

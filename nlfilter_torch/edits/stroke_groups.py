@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,12 +16,12 @@ CELLS = 64  # along the short side, in which painted areas are connected
 
 @dataclass(frozen=True, eq=False)
 class StrokeGroups:
-    """The strokes of a picture, or of a batch of them: its connected painted areas.
+    """The strokes of each image of a batch: its connected painted areas.
 
     Attributes:
-        strokes: number of the stroke at each scribbled pixel, (n,). Strokes with the same remainder after division by
-            :data:`GROUPS` are a group.
-        count: number S of strokes.
+        strokes: number of the stroke at each scribbled pixel, (B, n); any number where nothing is painted. Strokes with
+            the same remainder after division by :data:`GROUPS` are a group.
+        count: number S of strokes, the largest of all images.
     """
 
     strokes: Tensor
@@ -28,25 +29,23 @@ class StrokeGroups:
 
     @staticmethod
     def of(scribbles: Scribbles, size: tuple[int, int]) -> "StrokeGroups":
-        """Number the strokes of a picture (H, W), of all images of a batch together.
-
-        Areas closer together than 1/64 of the short side count as connected.
-        """
+        """Number the strokes of a picture (H, W). Areas closer together than 1/64 of the short side are connected."""
         from skimage.measure import label
 
         places, side = scribbles.places, max(1.0, min(size) / CELLS)
         cells = (math.ceil(size[0] / side), math.ceil(size[1] / side))
-        weights = scribbles.weights.detach().amax((0, 1), keepdim=True)
-        painted = sums_in_blocks(weights, places, size[1], side, cells)[0, 0] > 0
-        numbers, count = label(painted.cpu().numpy(), connectivity=2, return_num=True)
-        strokes = torch.from_numpy(numbers).to(places).flatten()[blocks_at(places, size[1], side, cells)]
-        return StrokeGroups((strokes - 1).clamp(min=0), int(count))
+        weights = scribbles.weights.detach().amax(1, keepdim=True)
+        painted = sums_in_blocks(weights, places, size[1], side, cells).squeeze(1) > 0
+        numbers = torch.from_numpy(np.stack([label(image, connectivity=2) for image in painted.cpu().numpy()]))
+        strokes = numbers.to(places).flatten(1)[:, blocks_at(places, size[1], side, cells)]
+        return StrokeGroups((strokes - 1).clamp(min=0), int(numbers.max()))
 
     def without_each(self, weighted: Tensor) -> list[Tensor]:
-        """Values (B, C, n) with those of one group replaced by 0, for each group; an empty list for a single stroke."""
+        """Values (B, C, n) with those of one group replaced by 0, for each group; an empty list for single strokes."""
         if self.count < 2:
             return []
-        return [weighted * (self.strokes % GROUPS != number) for number in range(min(GROUPS, self.count))]
+        groups = (self.strokes % GROUPS).unsqueeze(1)
+        return [weighted * (groups != number) for number in range(min(GROUPS, self.count))]
 
     def weights_without_each(self, weights: Tensor) -> list[Tensor]:
         """:meth:`without_each`, but images of which no weight (B, 1, n) would be left keep all of them."""
@@ -55,10 +54,10 @@ class StrokeGroups:
 
     def of_own(self, values: Sequence[Tensor]) -> Tensor:
         """Of values (B, C, n) for each group, those for the group of each pixel."""
-        own = (self.strokes % GROUPS).expand(1, *values[0].shape)
+        own = (self.strokes % GROUPS).unsqueeze(1).expand(1, *values[0].shape)
         return torch.stack(list(values)).gather(0, own).squeeze(0)
 
     def sums(self, values: Tensor) -> Tensor:
         """Sums (B, C, S) of values (B, C, n) over each stroke, in float64."""
         sums = values.new_zeros(*values.shape[:2], self.count, dtype=torch.float64)
-        return sums.index_add(2, self.strokes, values.double())
+        return sums.scatter_add(2, self.strokes.unsqueeze(1).expand(values.shape), values.double())
