@@ -58,32 +58,34 @@ class _Solution(torch.autograd.Function):
         ctx.save_for_forward(inputs[0], output)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor]:
         stencil, found = ctx.saved_tensors
         grad = solve_stencil(_transposed(stencil), grad)
-        return -(grad[:, :, None, None] * _around(found)).sum(1), grad
+        if not ctx.needs_input_grad[0]:
+            return None, grad
+        return -torch.stack([(grad * values).sum(1) for values in _around(found)], dim=1).unflatten(1, (3, 3)), grad
 
     @staticmethod
     def jvp(ctx: Any, stencil_tangent: Tensor | None, right_tangent: Tensor | None) -> Tensor:
         stencil, found = ctx.saved_tensors
         right = torch.zeros_like(found) if right_tangent is None else right_tangent
         if stencil_tangent is not None:
-            right = right - (stencil_tangent.unsqueeze(1) * _around(found)).sum((2, 3))
+            for tangent, values in zip(stencil_tangent.flatten(1, 2).split(1, dim=1), _around(found), strict=True):
+                right = right - tangent * values
         return solve_stencil(stencil, right)
 
 
-def _around(planes: Tensor) -> Tensor:
-    """Values (B, C, 3, 3, H, W) of each pixel's neighbours, 0 outside the image."""
+def _around(planes: Tensor) -> list[Tensor]:
+    """Values (B, C, H, W) of each pixel's nine neighbours, with the pixel itself, row by row; 0 outside the image."""
     height, width = planes.shape[2:]
     padded = F.pad(planes, (1, 1, 1, 1))
-    rows = [torch.stack([padded[..., k : k + height, j : j + width] for j in range(3)], dim=2) for k in range(3)]
-    return torch.stack(rows, dim=2)
+    return [padded[..., k : k + height, j : j + width] for k in range(3) for j in range(3)]
 
 
 def _transposed(stencil: Tensor) -> Tensor:
     """Stencil of the transposed matrix: each coefficient is that of the pixel in its neighbour's equation."""
-    around = _around(stencil.flatten(1, 2).flip(1)).unflatten(1, (3, 3))  # (B, 3, 3, 3, 3, H, W)
-    return around.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2).permute(0, 3, 4, 1, 2)
+    around = _around(stencil.flatten(1, 2).flip(1))
+    return torch.stack([values[:, number] for number, values in enumerate(around)], dim=1).unflatten(1, (3, 3))
 
 
 def _compiled_solve(stencil: Tensor, right: Tensor) -> Tensor:
