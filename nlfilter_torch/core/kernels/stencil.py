@@ -63,15 +63,16 @@ class _Solution(torch.autograd.Function):
         grad = solve_stencil(_transposed(stencil), grad)
         if not ctx.needs_input_grad[0]:
             return None, grad
-        return -torch.stack([(grad * values).sum(1) for values in _around(found)], dim=1).unflatten(1, (3, 3)), grad
+        products = torch.stack([(grad * values).sum(1) for values in _around(found)], dim=1)
+        return -products.view(stencil.shape), grad
 
     @staticmethod
     def jvp(ctx: Any, stencil_tangent: Tensor | None, right_tangent: Tensor | None) -> Tensor:
         stencil, found = ctx.saved_tensors
         right = torch.zeros_like(found) if right_tangent is None else right_tangent
         if stencil_tangent is not None:
-            for tangent, values in zip(stencil_tangent.flatten(1, 2).split(1, dim=1), _around(found), strict=True):
-                right = right - tangent * values
+            for number, values in enumerate(_around(found)):
+                right = right - stencil_tangent[:, number // 3, number % 3, None] * values
         return solve_stencil(stencil, right)
 
 
