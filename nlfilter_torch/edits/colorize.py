@@ -109,8 +109,9 @@ def colorize(
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
     distances, then the residual near the strokes. Two estimates by propagation between neighbouring pixels up to edges
-    are blended in. Shadows and highlights get less chroma than midtones of the same object. ``"kmeans"`` is the paper's
-    method: :func:`segment_mask` divides the image into one segment per colour.
+    are blended in. The regression counts more the better it predicts the colour of each stroke from other strokes.
+    Shadows and highlights get less chroma than midtones of the same object. ``"kmeans"`` is the paper's method:
+    :func:`segment_mask` divides the image into one segment per colour.
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
