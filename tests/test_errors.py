@@ -128,6 +128,7 @@ def test_images_of_another_size_or_batch(function: str) -> None:
 
 POSITIVE = "must be positive and finite, got"
 NUMBER = "must be a number or a tensor, got"
+TWO = "must be a number, or two for vertical and horizontal distances, got"
 INT = "must be an int, got"
 ODD = "must be odd and at least 1, got"
 SQUARE = "must have shape (p, p) with odd p, got"
@@ -149,7 +150,8 @@ BAD_OPTIONS: list[tuple[str, Any, type[Exception], str]] = [
     ("spatial_bandwidth", 0, ValueError, f"{POSITIVE} 0"),
     ("spatial_bandwidth", "auto", TypeError, f"{NUMBER} str"),
     ("spatial_bandwidth", (4.0, 0.0), ValueError, f"{POSITIVE} 0.0"),
-    ("spatial_bandwidth", (4.0, 5.0, 6.0), ValueError, "must be a number, or two for vertical"),
+    ("spatial_bandwidth", (4.0, 5.0, 6.0), ValueError, f"{TWO} 3 in a tuple; pass two numbers"),
+    ("spatial_bandwidth", [4.0], ValueError, f"{TWO} 1 in a list; pass two numbers"),
     ("spatial_bandwidth", torch.ones(2, 1), ValueError, "must be a number or have shape () or (2,), got (2, 1)"),
     ("num_landmarks", 0, ValueError, "must be at least 1, got 0"),
     ("num_landmarks", 20.0, TypeError, f"{INT} float"),

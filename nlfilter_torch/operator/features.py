@@ -28,7 +28,7 @@ from nlfilter_torch.core.values import is_hidden
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 GuideChannels = Literal["luminance", "all"]
-SpatialBandwidth = float | Tensor | tuple[float | Tensor, ...]
+SpatialBandwidth = float | Tensor | tuple[float | Tensor, ...] | list[float | Tensor]
 
 
 def patch_window(patch_size: int) -> Tensor:
@@ -142,7 +142,7 @@ class GuideFeatures:
 
 def bandwidths_of(spatial: SpatialBandwidth | None) -> tuple[Any, ...]:
     """The bandwidth of all distances, or those of vertical and of horizontal ones."""
-    return spatial if isinstance(spatial, tuple) else (spatial,)
+    return tuple(spatial) if isinstance(spatial, tuple | list) else (spatial,)
 
 
 def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:

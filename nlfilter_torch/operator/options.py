@@ -57,10 +57,10 @@ def check_bandwidths(
         check_choice(photometric, "photometric_bandwidth", ("auto",), "pass it or a number")
     else:
         check_positive(photometric, "photometric_bandwidth", batch)
-    if isinstance(spatial, tuple) and len(spatial) != 2:
+    if isinstance(spatial, tuple | list) and len(spatial) != 2:
         raise ValueError(
-            "spatial_bandwidth must be a number, or two for vertical and horizontal distances, got a tuple of length "
-            f"{len(spatial)}; pass two numbers"
+            "spatial_bandwidth must be a number, or two for vertical and horizontal distances, got "
+            f"{len(spatial)} in a {type(spatial).__name__}; pass two numbers"
         )
     if spatial is not None:
         for one in bandwidths_of(spatial):
