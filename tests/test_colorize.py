@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import colorize_guide, fainter, weighted_mean
+from nlfilter_torch.edits.colorize import colorize_guide, limit_saturation, weighted_mean
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 from tests.problems import box, colour, luminance, paint
 
@@ -65,11 +65,11 @@ def test_the_mean_of_estimates_leaves_out_what_differs_and_what_nothing_supports
     torch.testing.assert_close(weighted_mean((blue, blue, red), (none, none, 1.0)), red)
 
 
-def test_the_fainter_of_two_colours_is_chosen_at_each_pixel() -> None:
-    first = torch.tensor([[0.3, -0.1], [0.1, 0.0]]).mT.view(1, 2, 1, 2)
-    second = torch.tensor([[-0.2, 0.1], [0.0, 0.2]]).mT.view(1, 2, 1, 2)
-    wanted = torch.tensor([[-0.2, 0.1], [0.1, 0.0]]).mT.view(1, 2, 1, 2)
-    torch.testing.assert_close(fainter(first, second), wanted)
+def test_saturation_is_limited_to_that_of_another_colour() -> None:
+    chroma = torch.tensor([[0.3, 0.4], [0.1, 0.0], [0.0, 0.0]]).mT.view(1, 2, 1, 3)
+    other = torch.tensor([[-0.25, 0.0], [0.0, 0.2], [0.1, 0.1]]).mT.view(1, 2, 1, 3)
+    wanted = torch.tensor([[0.15, 0.2], [0.1, 0.0], [0.0, 0.0]]).mT.view(1, 2, 1, 3)
+    torch.testing.assert_close(limit_saturation(chroma, other), wanted, atol=1e-6, rtol=0)
 
 
 def test_colours_spread_farther_along_rows_than_along_columns() -> None:

@@ -72,6 +72,7 @@ HORIZONTAL = 1.5
 GUIDE_SCALE = math.sqrt(5 / 2)
 TEXTURE_WEIGHT = 3.0
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
+NO_CHROMA = 1e-8  # square of a saturation that cannot be seen; keeps quotients and derivatives finite
 SAME_CHROMA = 0.003  # difference of estimates that hardly counts
 FAINT = 0.2  # chroma below which estimates differ little in weight
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
@@ -224,7 +225,7 @@ def colorize(
         usual = usual_chroma(own)
         connected, influence = interpolated(absolute, some, own).tensor_split([2], dim=1)
         around, unscaled = interpolated(relative, some, own)[:, :4].split(2, dim=1)
-        around = fainter(around * usual.sqrt(), unscaled)
+        around = limit_saturation(unscaled, around * usual.sqrt())
         mean, square = far(some).tensor_split([2], dim=1)
         residual, support = near(some).tensor_split([2], dim=1)
         variance = (square - squared_sum(mean)) * usual.square()
@@ -314,9 +315,9 @@ def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Te
     return (BELIEF * ratio).exp().clamp(max=MOST_BELIEF).to(weights).view(-1, 1, 1, 1)
 
 
-def fainter(first: Tensor, second: Tensor) -> Tensor:
-    """Of two chromas (B, 2, H, W), the less saturated one at each pixel."""
-    return torch.where(squared_sum(first) < squared_sum(second), first, second)
+def limit_saturation(chroma: Tensor, other: Tensor) -> Tensor:
+    """Reduce the saturation of chroma (B, 2, H, W) to that of another chroma, where that is less saturated."""
+    return chroma * ((squared_sum(other) + NO_CHROMA) / (squared_sum(chroma) + NO_CHROMA)).clamp(max=1.0).sqrt()
 
 
 def squared_sum(chroma: Tensor) -> Tensor:
