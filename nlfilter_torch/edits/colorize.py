@@ -8,7 +8,7 @@ An estimate counts less the farther it is from the other two and the more satura
 less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
 relative differences has the fewest large errors, so that the distance of the mean from it is limited. It and the
 regression are compared by predicting the colour of each stroke from other strokes: the smaller the errors of the
-regression are in comparison, the more it counts.
+regression are in comparison, the more it counts, and the larger the distance may be.
 
 Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
 to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
@@ -78,7 +78,7 @@ FAINT = 0.2  # chroma below which estimates differ little in weight
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
 LARGE_VARIANCE = 0.02  # of chroma among strokes on similar pixels
 CAUTION = 0.8  # factor of the estimate by relative differences
-MOST_CHANGE = 0.12  # distance in chroma of the result from that estimate
+MOST_CHANGE = 0.12  # distance in chroma of the result from that estimate, if both predict strokes equally well
 SAME_ERROR = 3e-3  # squared error of a predicted stroke that hardly counts
 BELIEF, MOST_BELIEF = 2.0, 9.0  # exponent of the ratio of errors, and limit of the resulting factor
 
@@ -235,7 +235,7 @@ def colorize(
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
         factors = belief * trust, influence**3, CAUTION
         change = weighted_mean((alike, connected, around), factors) - around
-        return around + change * (1 + squared_sum(change) / MOST_CHANGE**2).rsqrt()
+        return around + change * (1 + squared_sum(change) / (belief * MOST_CHANGE**2)).rsqrt()
 
     return _coloured(source, viewed, chroma_of)
 
