@@ -42,9 +42,9 @@ def test_strokes_are_connected_areas_of_each_image() -> None:
 
 def test_in_large_pictures_areas_close_together_are_one_stroke() -> None:
     size = (640, 640)
-    near, far = box(10, 10, 4, 4, size=size), box(10, 15, 4, 4, size=size)
-    assert groups_of(near + far)[0].count == 1
-    assert groups_of(near + box(10, 40, 4, 4, size=size))[0].count == 2
+    first = box(10, 10, 4, 4, size=size)
+    assert groups_of(first + box(10, 15, 4, 4, size=size))[0].count == 1
+    assert groups_of(first + box(10, 40, 4, 4, size=size))[0].count == 2
 
 
 def test_each_group_is_left_out_once() -> None:

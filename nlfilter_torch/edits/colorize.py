@@ -285,10 +285,11 @@ def extended(
             )
             for own, residual in zip(weights, residuals, strict=True)
         ]
-        known = [
-            torch.cat(blocks, dim=2) for blocks in zip(*([fit(b) for fit in fits] for b in columns()), strict=True)
+        found = [[fitted(block)[:, :2] for fitted in fits] for block in columns()]  # columns are computed once for all
+        residuals = [
+            before - torch.cat(blocks, dim=2)
+            for before, blocks in zip(residuals, zip(*found, strict=True), strict=True)
         ]
-        residuals = [before - values[:, :2] for before, values in zip(residuals, known, strict=True)]
         planes.append(operator.each(lambda found, fitted=fits[0]: fitted(found.factor)))  # type: ignore[misc]
         del operator  # frees its factor before the next one is computed
     return planes, residuals

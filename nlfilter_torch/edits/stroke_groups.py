@@ -40,12 +40,16 @@ class StrokeGroups:
         strokes = numbers.to(places).flatten(1)[:, blocks_at(places, size[1], side, cells)]
         return StrokeGroups((strokes - 1).clamp(min=0), int(numbers.max()))
 
+    @property
+    def groups(self) -> Tensor:
+        """Number of the group at each scribbled pixel, (B, 1, n)."""
+        return (self.strokes % GROUPS).unsqueeze(1)
+
     def without_each(self, weighted: Tensor) -> list[Tensor]:
         """Values (B, C, n) with those of one group replaced by 0, for each group; an empty list for single strokes."""
         if self.count < 2:
             return []
-        groups = (self.strokes % GROUPS).unsqueeze(1)
-        return [weighted * (groups != number) for number in range(min(GROUPS, self.count))]
+        return [weighted * (self.groups != number) for number in range(min(GROUPS, self.count))]
 
     def weights_without_each(self, weights: Tensor) -> list[Tensor]:
         """:meth:`without_each`, but images of which no weight (B, 1, n) would be left keep all of them."""
@@ -54,8 +58,7 @@ class StrokeGroups:
 
     def of_own(self, values: Sequence[Tensor]) -> Tensor:
         """Of values (B, C, n) for each group, those for the group of each pixel."""
-        own = (self.strokes % GROUPS).unsqueeze(1).expand(1, *values[0].shape)
-        return torch.stack(list(values)).gather(0, own).squeeze(0)
+        return torch.stack(list(values)).gather(0, self.groups.expand(1, *values[0].shape)).squeeze(0)
 
     def sums(self, values: Tensor) -> Tensor:
         """Sums (B, C, S) of values (B, C, n) over each stroke, in float64."""

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.library import pointer, register, run
+from nlfilter_torch.core.kernels.library import pointer, register, run, threads
 from nlfilter_torch.core.precision import full_precision
 
 
@@ -18,8 +18,8 @@ from nlfilter_torch.core.precision import full_precision
 def solve_stencil(stencil: Tensor, right: Tensor) -> Tensor:
     """Solve a linear system of pixels and their neighbours.
 
-    Pivots are not exchanged across rows of the image, nor at all by the kernel in C. Of each equation, or of each
-    pixel in all equations, the own coefficient should be at least as large as the sum of the others.
+    The matrix or its transpose should be diagonally dominant, since the kernel in C does not exchange pivots, and the
+    definition does so only within a row of the image.
 
     Args:
         stencil: (B, 3, 3, H, W); coefficient of the neighbour in the previous, same or next row and column. Those of
@@ -93,7 +93,7 @@ def _compiled_solve(stencil: Tensor, right: Tensor) -> Tensor:
     stencil, right = stencil.contiguous(), right.contiguous()
     out = torch.empty_like(right)
     _, sides, height, width = right.shape
-    run("stencil", torch.get_num_threads(), len(right), height, width, sides, *map(pointer, (stencil, right, out)))
+    run("stencil", threads(stencil), len(right), height, width, sides, *map(pointer, (stencil, right, out)))
     return out
 
 
