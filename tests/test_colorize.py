@@ -5,8 +5,9 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import colorize_guide, limit_saturation, weighted_mean
+from nlfilter_torch.edits.colorize import colorize_guide, compared, limit_saturation, weighted_mean
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
+from nlfilter_torch.edits.stroke_groups import StrokeGroups
 from tests.problems import box, colour, luminance, paint
 
 
@@ -65,11 +66,37 @@ def test_the_mean_of_estimates_leaves_out_what_differs_and_what_nothing_supports
     torch.testing.assert_close(weighted_mean((blue, blue, red), (none, none, 1.0)), red)
 
 
+def test_the_regression_counts_more_if_it_predicts_strokes_better_and_if_there_are_more_of_them() -> None:
+    def factor(count: int, error: float, other: float) -> float:
+        wanted, ones = torch.zeros(1, 2, count), torch.ones(1, 1, count)
+        left_out = torch.cat([wanted + other, ones], dim=1).double()
+        return float(compared(StrokeGroups(torch.arange(count)[None], count), ones, wanted + error, wanted, left_out))
+
+    assert factor(12, 0.5, 0.1) < factor(12, 0.5, 0.5) < factor(12, 0.1, 0.5)
+    assert factor(3, 0.1, 0.5) < factor(12, 0.1, 0.5)
+
+
 def test_saturation_is_limited_to_that_of_another_colour() -> None:
     chroma = torch.tensor([[0.3, 0.4], [0.1, 0.0], [0.0, 0.0]]).mT.view(1, 2, 1, 3)
     other = torch.tensor([[-0.25, 0.0], [0.0, 0.2], [0.1, 0.1]]).mT.view(1, 2, 1, 3)
     wanted = torch.tensor([[0.15, 0.2], [0.1, 0.0], [0.0, 0.0]]).mT.view(1, 2, 1, 3)
     torch.testing.assert_close(limit_saturation(chroma, other), wanted, atol=1e-6, rtol=0)
+
+
+def test_chroma_is_proportional_to_that_of_the_strokes() -> None:
+    image = colour("coffee", 60, 90)
+    grey, chroma = luminance(image), split_luminance(image)[1]
+    mask = torch.zeros(1, 1, 60, 90)
+    for row, column in np.random.default_rng(1).integers(0, (56, 86), (8, 2)):
+        mask[..., row : row + 4, column : column + 4] = 1
+
+    def found(saturation: float) -> torch.Tensor:
+        return colorize(grey, (grey + saturation * chroma) * mask, mask) - grey
+
+    strong, faint = found(0.2), found(0.01)
+    assert strong.abs().max() > 0.02
+    torch.testing.assert_close(20 * faint, strong, atol=1e-5, rtol=0)
+    assert found(0.0).abs().max() < 1e-6
 
 
 def test_colours_spread_farther_along_rows_than_along_columns() -> None:

@@ -8,7 +8,7 @@ An estimate counts less the farther it is from the other two and the more satura
 less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
 relative differences has the fewest large errors, so that the distance of the mean from it is limited. It and the
 regression are compared by predicting the colour of each stroke from other strokes: the smaller the errors of the
-regression are in comparison, the more it counts, and the larger the distance may be.
+regression are in comparison, and the more strokes there are, the more it counts, and the larger the distance may be.
 
 Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
 to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
@@ -66,21 +66,23 @@ class Stage:
 # names for that and on others, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
 # Bandwidth of horizontal distances, relative to vertical ones: sky, buildings and ground lie above each other.
-HORIZONTAL = 1.5
+HORIZONTAL = 3.0
 # With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
 # channels of texture are then 0.
 GUIDE_SCALE = math.sqrt(5 / 2)
 TEXTURE_WEIGHT = 3.0
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 NO_CHROMA = 1e-8  # square of a saturation that cannot be seen; keeps quotients and derivatives finite
-SAME_CHROMA = 0.003  # difference of estimates that hardly counts
-FAINT = 0.2  # chroma below which estimates differ little in weight
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
-LARGE_VARIANCE = 0.02  # of chroma among strokes on similar pixels
-CAUTION = 0.8  # factor of the estimate by relative differences
-MOST_CHANGE = 0.12  # distance in chroma of the result from that estimate, if both predict strokes equally well
-SAME_ERROR = 3e-3  # squared error of a predicted stroke that hardly counts
+CAUTION = 0.55  # factor of the estimate by relative differences
+# In units of the saturation of the strokes, or of its square, so that strokes of half the saturation give half of it.
+SAME_CHROMA = 0.02  # difference of estimates that hardly counts
+FAINT = 1.0  # chroma below which estimates differ little in weight
+LARGE_VARIANCE = 0.45  # of chroma among strokes on similar pixels
+MOST_CHANGE = 1.6  # distance of the result from that estimate, if it and the regression predict strokes equally well
+SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
 BELIEF, MOST_BELIEF = 2.0, 9.0  # exponent of the ratio of errors, and limit of the resulting factor
+FEW_STROKES = 5  # the factor is smaller if no more strokes than this are compared
 
 
 def colorize_guide(image: Tensor) -> Tensor:
@@ -124,8 +126,8 @@ def colorize(
         time: for k-means, diffusion time t > 0 of the segments.
         photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
             surroundings and texture, if they differ, count as further differences.
-        spatial_bandwidth: of vertical distances, in pixels; that of horizontal ones is 1.5 times as large. None is
-            0.5625 of the short side.
+        spatial_bandwidth: of vertical distances, in pixels; that of horizontal ones is three times as large. None is
+            0.4 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
         viewing_size: in megapixels; the colours of a larger image are found in its reduction to this size, patches and
@@ -192,6 +194,8 @@ def colorize(
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
         return _coloured(source, viewed, part_of(chroma[:, ::2]))
     wanted = wanted[:, ::2]  # green follows from red and blue
+    saturation = rms_saturation(wanted, scribbles.weights)
+    wanted = wanted / saturation
 
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
     # Cubed, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
@@ -215,7 +219,7 @@ def colorize(
     weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
     (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
     everywhere = per_image(strength, wanted, 4)
-    belief: float | Tensor = 1.0
+    belief: float | Tensor = 1 / (1 + FEW_STROKES)
     if relative.left_out is not None:
         residual = groups.of_own(residuals[1:]) * usual_there
         belief = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
@@ -233,9 +237,10 @@ def colorize(
         around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
-        factors = belief * trust, influence**3, CAUTION
+        factors = belief * trust, influence**2, CAUTION
         change = weighted_mean((alike, connected, around), factors) - around
-        return around + change * (1 + squared_sum(change) / (belief * MOST_CHANGE**2)).rsqrt()
+        limited = change * (1 + squared_sum(change) / (belief * MOST_CHANGE**2)).rsqrt()
+        return saturation.unsqueeze(3) * (around + limited)
 
     return _coloured(source, viewed, chroma_of)
 
@@ -298,10 +303,12 @@ def extended(
 def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Tensor, left_out: Tensor) -> Tensor:
     """Factor (B, 1, 1, 1) of the regression, from its errors and those of another estimate for strokes left out.
 
+    It is smaller if few strokes are compared.
+
     Args:
         groups: of the strokes.
         weights: of the scribbled pixels, (B, 1, n).
-        residual: of the regression on the other groups, in units of chroma, (B, 2, n).
+        residual: of the regression on the other groups, (B, 2, n), in the unit of ``wanted``.
         wanted: chroma of the strokes, (B, 2, n).
         left_out: of the other estimate, see :class:`LocalValues`.
     """
@@ -312,8 +319,15 @@ def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Te
     predicted = flow[:, :-1] / torch.where(valid, flow[:, -1:], 1.0)
     other = squared_sum(predicted - groups.sums(wanted * weights) / painted)
     ratios = ((other + SAME_ERROR) / (error + SAME_ERROR)).log() * valid
-    ratio = ratios.sum(2) / valid.sum(2).clamp(min=1)
-    return (BELIEF * ratio).exp().clamp(max=MOST_BELIEF).to(weights).view(-1, 1, 1, 1)
+    count = valid.sum(2)
+    factor = (BELIEF * ratios.sum(2) / count.clamp(min=1)).exp().clamp(max=MOST_BELIEF)
+    return (factor * (1 + count) / (1 + count + FEW_STROKES)).to(weights).view(-1, 1, 1, 1)
+
+
+def rms_saturation(chroma: Tensor, weights: Tensor) -> Tensor:
+    """RMS saturation (B, 1, 1) of scribbled pixels of chroma (B, 2, n) and weights (B, 1, n)."""
+    square = (weights * squared_sum(chroma)).sum(2, keepdim=True) / weights.sum(2, keepdim=True)
+    return (square + NO_CHROMA).sqrt()
 
 
 def limit_saturation(chroma: Tensor, other: Tensor) -> Tensor:

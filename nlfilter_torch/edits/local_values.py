@@ -29,7 +29,7 @@ SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a re
 MIN_RELATIVE = 1e-6  # relative weight of the least similar neighbour
 SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference of a pixel from a block, and least weight of a block
 SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
-MIN_INFLUENCE = 1e-6
+MIN_INFLUENCE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def _relative(difference: Tensor, inside: Tensor) -> Tensor:
 
 
 # With RELATIVE weights the influence hardly decays: scribbles far away then count as they do for Levin et al.
-ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 2.0), Links(_relative, 1 << 17, 20.0)
+ABSOLUTE, RELATIVE = Links(_absolute, 1 << 13, 1.0), Links(_relative, 1 << 17, 20.0)
 
 
 @dataclass(frozen=True, eq=False)
