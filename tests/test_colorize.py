@@ -5,9 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import colorize_guide, compared, limit_saturation, weighted_mean
+from nlfilter_torch.edits.colorize import colorize_guide, limit_saturation, weighted_mean
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.edits.stroke_groups import StrokeGroups
 from tests.problems import box, colour, luminance, paint
 
 
@@ -64,16 +63,6 @@ def test_the_mean_of_estimates_leaves_out_what_differs_and_what_nothing_supports
     torch.testing.assert_close(weighted_mean((red, red, red), (one, one, 1.0)), red)
     assert (weighted_mean((blue, red, red), (one, one, 1.0)) - red).norm() < 0.3 * (blue - red).norm()
     torch.testing.assert_close(weighted_mean((blue, blue, red), (none, none, 1.0)), red)
-
-
-def test_the_regression_counts_more_if_it_predicts_strokes_better_and_if_there_are_more_of_them() -> None:
-    def factor(count: int, error: float, other: float) -> float:
-        wanted, ones = torch.zeros(1, 2, count), torch.ones(1, 1, count)
-        left_out = torch.cat([wanted + other, ones], dim=1).double()
-        return float(compared(StrokeGroups(torch.arange(count)[None], count), ones, wanted + error, wanted, left_out))
-
-    assert factor(12, 0.5, 0.1) < factor(12, 0.5, 0.5) < factor(12, 0.1, 0.5)
-    assert factor(3, 0.1, 0.5) < factor(12, 0.1, 0.5)
 
 
 def test_saturation_is_limited_to_that_of_another_colour() -> None:

@@ -5,7 +5,15 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import SAME_ERROR, Stage, colorize_guide, compared, extended
+from nlfilter_torch.edits.colorize import (
+    FEW_STROKES,
+    MOST_BELIEF,
+    SAME_ERROR,
+    Stage,
+    colorize_guide,
+    compared,
+    extended,
+)
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
@@ -115,7 +123,7 @@ def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
         assert (before - after)[:, :, groups.strokes[0] != 1].abs().max() > 1e-3
 
 
-def test_the_regression_counts_more_if_it_predicts_strokes_better() -> None:
+def test_the_regression_counts_more_if_it_predicts_strokes_better_and_if_there_are_more_of_them() -> None:
     mask = torch.cat([dots((2, 3), (9, 20), (15, 8))] * 2 + [dots((2, 3))])
     groups, places = groups_of(mask)
     weights, wanted = mask.flatten(2)[:, :, places], torch.zeros(3, 2, 3)
@@ -125,7 +133,8 @@ def test_the_regression_counts_more_if_it_predicts_strokes_better() -> None:
     residual = torch.full((3, 2, 3), SAME_ERROR**0.5)
     residual[1] = 0.0
     factors = compared(groups, weights, residual, wanted, flow).flatten()
-    torch.testing.assert_close(factors, torch.tensor([1.0, 9.0, 1.0]))
+    few, none = 4 / (4 + FEW_STROKES), 1 / (1 + FEW_STROKES)  # for three strokes and for no comparison
+    torch.testing.assert_close(factors, torch.tensor([few, MOST_BELIEF * few, none]))
     assert compared(groups, weights, residual * 9, wanted, flow)[0] < 0.01
 
 
