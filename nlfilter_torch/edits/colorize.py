@@ -26,7 +26,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_tensor
 from nlfilter_torch.core.precision import per_image
-from nlfilter_torch.edits.colour import group_colours, merge_luminance, split_luminance, with_green
+from nlfilter_torch.edits.colour import group_colours, merge_luminance, region_means, split_luminance, with_green
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.edits.mask import blocks_of
@@ -82,7 +82,7 @@ LARGE_VARIANCE = 0.45  # of chroma among strokes on similar pixels
 MOST_CHANGE = 1.6  # distance of the result from that estimate, if it and the regression predict strokes equally well
 SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
 BELIEF, MOST_BELIEF = 2.0, 9.0  # exponent of the ratio of errors, and limit of the resulting factor
-FEW_STROKES = 5  # the factor is smaller if no more strokes than this are compared
+FEW_STROKES = 5  # number of compared strokes at which the factor is about half of that for many
 
 
 def colorize_guide(image: Tensor) -> Tensor:
@@ -194,7 +194,8 @@ def colorize(
         chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
         return _coloured(source, viewed, part_of(chroma[:, ::2]))
     wanted = wanted[:, ::2]  # green follows from red and blue
-    saturation = rms_saturation(wanted, scribbles.weights)
+    mean_square = region_means(squared_sum(wanted).unsqueeze(2), scribbles.weights.unsqueeze(2))  # (B, 1, 1)
+    saturation = (mean_square + NO_CHROMA).sqrt()
     wanted = wanted / saturation
 
     usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
@@ -322,12 +323,6 @@ def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Te
     count = valid.sum(2)
     factor = (BELIEF * ratios.sum(2) / count.clamp(min=1)).exp().clamp(max=MOST_BELIEF)
     return (factor * (1 + count) / (1 + count + FEW_STROKES)).to(weights).view(-1, 1, 1, 1)
-
-
-def rms_saturation(chroma: Tensor, weights: Tensor) -> Tensor:
-    """RMS saturation (B, 1, 1) of scribbled pixels of chroma (B, 2, n) and weights (B, 1, n)."""
-    square = (weights * squared_sum(chroma)).sum(2, keepdim=True) / weights.sum(2, keepdim=True)
-    return (square + NO_CHROMA).sqrt()
 
 
 def limit_saturation(chroma: Tensor, other: Tensor) -> Tensor:
