@@ -1,12 +1,14 @@
 """Colourising: colours are recovered from strokes, and the luminance is unchanged."""
 
 import numpy as np
+import pytest
 import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import colorize_guide, limit_saturation, weighted_mean
+from nlfilter_torch.edits.colorize import bandwidth_ratio, colorize_guide, limit_saturation, weighted_mean
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
+from nlfilter_torch.edits.in_memory import InMemory
 from tests.problems import box, colour, luminance, paint
 
 
@@ -88,12 +90,36 @@ def test_chroma_is_proportional_to_that_of_the_strokes() -> None:
     assert found(0.0).abs().max() < 1e-6
 
 
-def test_colours_spread_farther_along_rows_than_along_columns() -> None:
-    grey = torch.full((1, 1, 80, 80), 0.5)
-    beside, above = box(38, 16, 4, 4, size=(80, 80)), box(16, 38, 4, 4, size=(80, 80))
-    strokes = paint(0.8, 0.2, 0.2, beside) + paint(0.2, 0.2, 0.8, above)
-    found = colorize(grey, strokes, beside + above, num_landmarks=100)[0, :, 38:42, 38:42].mean((1, 2))
-    assert found[0] > found[2] + 0.003
+def test_colours_spread_farther_where_brightness_changes_less() -> None:
+    bands = torch.where(torch.arange(80) < 4, 0.2, 0.5).view(1, 1, 80, 1).expand(1, 1, 80, 80)
+    beside, above = box(40, 18, 4, 4, size=(80, 80)), box(20, 38, 4, 4, size=(80, 80))
+    strokes, painted = paint(0.8, 0.2, 0.2, beside) + paint(0.2, 0.2, 0.8, above), beside + above
+
+    def redness(turned: bool) -> torch.Tensor:
+        given = (x.mT if turned else x for x in (bands, strokes, painted))
+        found = colorize(*given, num_landmarks=100)
+        red, _, blue = (found.mT if turned else found)[0, :, 40:44, 38:42].mean((1, 2))
+        return red - blue
+
+    assert redness(turned=False) > 0.02
+    assert redness(turned=True) > 0.02
+
+
+def test_the_ratio_of_bandwidths_follows_the_changes_of_brightness_at_a_large_scale() -> None:
+    picture = luminance(colour("rocket", 60, 90))
+    ramp = torch.linspace(0.0, 1.0, 60).view(1, 1, 60, 1).expand(1, 1, 60, 90)
+    stripes = (torch.arange(96) % 2).expand(1, 1, 64, 96).float()
+
+    def ratio(image: torch.Tensor) -> float:
+        return float(bandwidth_ratio(InMemory(image)))
+
+    assert ratio(ramp) == 3.0
+    assert ratio(stripes) == 1.0
+    assert ratio(torch.full((1, 1, 60, 90), 0.3)) == pytest.approx(1.0, abs=1e-4)
+    assert 0.4 < ratio(picture) < 0.95
+    assert ratio(picture.mT) * ratio(picture) == pytest.approx(1.0, rel=1e-4)
+    assert ratio(ramp[..., :1]) == 3.0
+    assert ratio(ramp[..., :1].mT) == pytest.approx(1 / 3)
 
 
 def test_shadows_and_highlights_of_a_coloured_object_get_less_chroma_than_its_midtones() -> None:

@@ -8,6 +8,7 @@ import torch
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.pixels import Fitted, strips_of
+from nlfilter_torch.edits.source import Guide
 from tests.problems import box, noise, paint
 
 GREY = 0.2 + 0.6 * noise(2, 1, 20, 22, dtype=torch.float32)
@@ -77,6 +78,18 @@ def test_pictures_are_divided_if_they_are_large(monkeypatch: pytest.MonkeyPatch)
     assert torch.equal(
         source.mean_of(Fitted(lambda part: part.image), torch.mul), image.square().mean((2, 3), keepdim=True)
     )
+
+
+def test_operators_are_cached_by_the_values_of_their_options() -> None:
+    source = InMemory(torch.rand(1, 1, 12, 13), {})
+
+    def operator(*spatial: float, learned: bool = False) -> object:
+        bandwidths = tuple(torch.tensor([bandwidth], requires_grad=learned) for bandwidth in spatial)
+        return source.operator(Guide({"spatial_bandwidth": bandwidths, "num_landmarks": 20}))
+
+    assert operator(3.0, 5.0) is operator(3.0, 5.0)
+    assert operator(3.0, 5.0) is not operator(5.0, 3.0)
+    assert operator(3.0, 5.0, learned=True) is not operator(3.0, 5.0, learned=True)
 
 
 @each_edit

@@ -65,8 +65,9 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on others, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
-# Bandwidth of horizontal distances, relative to vertical ones: sky, buildings and ground lie above each other.
-HORIZONTAL = 3.0
+BLOCKS = 8  # on the short side, between whose means brightness is compared for the ratio of bandwidths
+SAME_BRIGHTNESS = 1e-3  # mean difference of blocks that hardly counts
+ANISOTROPY, MOST_ANISOTROPY = 2.5, 3.0  # exponent of the ratio of differences, and limit of the resulting ratio
 # With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
 # channels of texture are then 0.
 GUIDE_SCALE = math.sqrt(5 / 2)
@@ -74,14 +75,14 @@ TEXTURE_WEIGHT = 3.0
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 NO_CHROMA = 1e-8  # square of a saturation that cannot be seen; keeps quotients and derivatives finite
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
-CAUTION = 0.55  # factor of the estimate by relative differences
+CAUTION = 0.5  # factor of the estimate by relative differences
 # In units of the saturation of the strokes, or of its square, so that strokes of half the saturation give half of it.
 SAME_CHROMA = 0.02  # difference of estimates that hardly counts
 FAINT = 1.0  # chroma below which estimates differ little in weight
 LARGE_VARIANCE = 0.45  # of chroma among strokes on similar pixels
 MOST_CHANGE = 1.6  # distance of the result from that estimate, if it and the regression predict strokes equally well
 SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
-BELIEF, MOST_BELIEF = 2.0, 9.0  # exponent of the ratio of errors, and limit of the resulting factor
+BELIEF, MOST_BELIEF = 2.0, 3.0  # exponent of the ratio of errors, and limit of the resulting factor
 FEW_STROKES = 5  # number of compared strokes at which the factor is about half of that for many
 
 
@@ -126,8 +127,8 @@ def colorize(
         time: for k-means, diffusion time t > 0 of the segments.
         photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
             surroundings and texture, if they differ, count as further differences.
-        spatial_bandwidth: of vertical distances, in pixels; that of horizontal ones is three times as large. None is
-            0.4 of the short side.
+        spatial_bandwidth: in pixels, the geometric mean of those of vertical and horizontal distances; the more
+            brightness changes in one of these directions, the smaller is its bandwidth. None is 0.7 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
         viewing_size: in megapixels; the colours of a larger image are found in its reduction to this size, patches and
@@ -176,12 +177,14 @@ def colorize(
         scribbles = blocks_of(scribbles, viewed, source.size, source.size[1] / small[1])
     pixels = small[0] * small[1]
     options = {"patch_size": patch_size, "num_landmarks": min(num_landmarks, pixels), "generator": generator}
+    ratio = viewed.measured(bandwidth_ratio)
     nearness = COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small)
+    bandwidths = nearness / ratio.sqrt(), nearness * ratio.sqrt()
 
     def operator_of(stage: Stage) -> Operator:
         scaled = {
             "photometric_bandwidth": stage.photometric * photometric_bandwidth,
-            "spatial_bandwidth": (stage.spatial * nearness, stage.spatial * HORIZONTAL * nearness),
+            "spatial_bandwidth": tuple(stage.spatial * bandwidth for bandwidth in bandwidths),
         }
         return viewed.operator(Guide(options | scaled, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
 
@@ -250,6 +253,17 @@ def usual_chroma(image: Tensor) -> Tensor:
     """Usual chroma of pixels (B, 1 or 3, H, W) of one colour, (B, 1, H, W): largest halfway from black to white."""
     own = reduce_channels(image, "luminance")
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
+
+
+def bandwidth_ratio(source: Source) -> Tensor:
+    """Ratio (B,) of the bandwidths of horizontal and vertical distances, from changes of brightness at a large scale.
+
+    Where sky, buildings and ground lie above each other, brightness changes more from top to bottom, and so do colours.
+    """
+    blocks = source.reduced(luminance, max(1, min(source.size) // BLOCKS))
+    changes = [blocks.diff(dim=dim).abs().flatten(1) for dim in (2, 3)]
+    down, across = (change.sum(1) / max(1, change.shape[1]) + SAME_BRIGHTNESS for change in changes)
+    return (down / across).pow(ANISOTROPY).clamp(1 / MOST_ANISOTROPY, MOST_ANISOTROPY)
 
 
 def extended(

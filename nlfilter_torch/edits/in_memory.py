@@ -43,17 +43,14 @@ class InMemory:
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """Build, or take from the cache, :func:`nonlocal_operator` of the guide."""
-        key = (
-            guide.transform,
-            guide.blur,
-            *((name, value) for name, value in sorted(guide.options.items()) if name != "generator"),
-        )
-        if self.cache is not None and key in self.cache:
-            return cast(InMemoryOperator, self.cache[key])
-        operator = InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
-        if self.cache is not None and not any(isinstance(value, Tensor) for value in guide.options.values()):
-            self.cache[key] = operator
-        return operator
+        if self.cache is None:
+            return InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
+        options = ((name, _key_of(value)) for name, value in sorted(guide.options.items()) if name != "generator")
+        key = (guide.transform, guide.blur, *options)
+        if key not in self.cache:
+            operator = nonlocal_operator(guide(self.image), **guide.options)
+            self.cache[key] = InMemoryOperator(operator, self, guide.sampled)
+        return cast(InMemoryOperator, self.cache[key])
 
     def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
         """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
@@ -198,6 +195,13 @@ class InMemoryOperator:
         """Columns of the factor at single pixels."""
         columns = self.operator.factor[:, :, places]
         return lambda: [columns]
+
+
+def _key_of(option: Any) -> Any:
+    """Key of an option in a cache: a tensor by its values, or, if it has a gradient, as this one tensor."""
+    if isinstance(option, Tensor):
+        return option if option.requires_grad else (option.shape, *option.flatten().tolist())
+    return tuple(map(_key_of, option)) if isinstance(option, tuple | list) else option
 
 
 def edited(image: Tensor, fit: Callable[..., Fitted], /, *arguments: Any, **options: Any) -> Tensor:

@@ -263,7 +263,7 @@ COLORIZE = Edit(
             "`regression`: soft colours that mix between strokes. `kmeans`: segments of one flat colour each.",
         ),
         VIEWING_SIZE,
-        *filter_parameters(bandwidth=40.0, share=0.4, patch_size=1)[:4],
+        *filter_parameters(bandwidth=40.0, share=0.7, patch_size=1)[:4],
     ),
     hint="For grey photographs: paint some colours, and they spread over similar areas nearby.",
     brushes=(("colour", "Paint"),),
