@@ -285,6 +285,23 @@ def test_wrong_options(
     assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
 
 
+@pytest.mark.parametrize("tiles", [[], ["--memory", "0.001"]])
+@pytest.mark.parametrize(
+    ("verb", "options"),
+    [
+        ("recolor", ["--region", "1,2,5,4:red", "--keep", "2,3,2,2"]),
+        ("defocus", ["--region", "1,2,5,4", "--background", "1,2,5,4"]),
+    ],
+)
+def test_contradictory_rectangles(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str, options: list[str], tiles: list[str]
+) -> None:
+    assert main([verb, str(photo), str(tmp_path / "out.png"), *options, *tiles]) == 2
+    name = options[-2].removeprefix("--")
+    assert f"{name} must hold a painted pixel outside the scribbles on the object" in capsys.readouterr().err
+    assert not (tmp_path / "out.png").exists()
+
+
 def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out.png"
     Image.new("RGBA", (WIDTH, HEIGHT)).save(tmp_path / "clear.png")

@@ -101,6 +101,12 @@ def test_background_scribbles_are_blurred_with_what_resembles_them() -> None:
     torch.testing.assert_close(none, alone, rtol=0, atol=0)
 
 
+def test_background_scribbles_under_those_on_the_subject_are_refused() -> None:
+    region, background = box(20, 20, 8, 8), box(22, 22, 4, 4)
+    with pytest.raises(ValueError, match="background must hold a painted pixel outside the scribbles on the object"):
+        defocus(colour("chelsea"), region, background=background, num_landmarks=20)
+
+
 def test_background_scribbles_have_a_gradient() -> None:
     image = colour("chelsea", 40, 40).double()
     background = 0.5 * box(4, 4, 8, 8).double()[..., :40, :40]

@@ -1,5 +1,6 @@
 """Recolouring: which pixels change colour and which do not, and the underlying groups and means."""
 
+import pytest
 import torch
 import torch.nn.functional as F
 
@@ -148,6 +149,17 @@ def test_a_batch_is_recoloured_like_its_images_where_only_one_has_a_background()
         own = None if keep is None else keep[1:]
         alone = recolor(image[1:], strokes[1:], painted[1:], keep=own, num_landmarks=20)
         torch.testing.assert_close(together[1:], alone)
+
+
+def test_a_background_under_the_strokes_is_refused() -> None:
+    image, stroke = noise(2, 3, 20, 24), box(4, 4, 8, 8, size=(20, 24)).expand(2, 1, -1, -1)
+    strokes = paint(0.1, 0.3, 0.9, stroke)
+    beside, under = box(13, 15, 4, 4, size=(20, 24)), box(5, 5, 4, 4, size=(20, 24))
+    for keep in (under, torch.cat([beside, under])):
+        with pytest.raises(ValueError, match="keep must hold a painted pixel outside the scribbles on the object"):
+            recolor(image, strokes, stroke, keep=keep, num_landmarks=20)
+    # A keep that reaches beyond the stroke, and none in one image, are valid.
+    recolor(image, strokes, stroke, keep=torch.cat([under + beside, 0 * under]), num_landmarks=20)
 
 
 def test_means_of_regions_are_exact_on_large_images() -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.edits.in_memory import edit_of
-from nlfilter_torch.edits.mask import fit_regions
+from nlfilter_torch.edits.mask import check_outside, fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
 from nlfilter_torch.edits.source import Fitted, Source
 
@@ -59,7 +59,8 @@ def defocus(
         image, region and background.
 
     Raises:
-        TypeError, ValueError: if a tensor has another size, leaves its range, or the region is empty.
+        TypeError, ValueError: if a tensor has another size, leaves its range, the region is empty, or ``background`` is
+            painted only under it.
 
     Example:
         >>> image = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(0)) * 0.2
@@ -79,6 +80,8 @@ def defocus(
     check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
     others = [] if background is None else [source.scribbles(background, None, "background", needed=False)]
+    for other in others:
+        check_outside(other, scribbles, "background")
     options = {"reach": REACH} | options
     found = fit_regions(
         source,

@@ -201,6 +201,21 @@ def select_regions(
     return found
 
 
+def check_outside(background: Scribbles, inside: Scribbles, name: str) -> None:
+    """Refuse background scribbles that contradict those on the objects: in one image, all are under these.
+
+    Raises:
+        ValueError: if they do; ``name`` is the name of the background scribbles.
+    """
+    painted = (background.weights > 0).flatten(1).any(1)
+    free = (inside.joined(background).weights[:, -1] > 0).any(1)
+    if bool((painted & ~free).any()):
+        raise ValueError(
+            f"{name} must hold a painted pixel outside the scribbles on the object, got only pixels under them; "
+            "paint outside them, or omit it"
+        )
+
+
 def fit_regions(
     source: Source,
     inside: list[Scribbles],

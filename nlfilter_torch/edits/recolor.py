@@ -9,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_tensor
 from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.in_memory import edit_of
-from nlfilter_torch.edits.mask import fit_regions
+from nlfilter_torch.edits.mask import check_outside, fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
 from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
@@ -59,7 +59,8 @@ def recolor(
         Differentiable in image, strokes, mask and parameters, at a fixed grouping of the colours.
 
     Raises:
-        TypeError, ValueError: if a tensor has another size, a mask leaves [0, 1], or nothing is painted.
+        TypeError, ValueError: if a tensor has another size, a mask leaves [0, 1], nothing is painted, or ``keep`` is
+            painted only under the strokes.
 
     Example:
         >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2
@@ -74,7 +75,9 @@ def recolor(
         check_tensor(strokes, "strokes")
     RECOLOR.check(source.batch, reach=reach)
     scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
-    kept = None if keep is None else source.scribbles(keep, None, "keep", needed=False)
+    kept = [] if keep is None else [source.scribbles(keep, None, "keep", needed=False)]
+    for background in kept:
+        check_outside(background, scribbles, "keep")
 
     colours, regions, valid = _grouped(scribbles)
     brightness, old = (
@@ -85,7 +88,7 @@ def recolor(
     found = fit_regions(
         source,
         inside,
-        [] if kept is None else [kept],
+        kept,
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=RECOLOR["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
