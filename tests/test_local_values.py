@@ -40,9 +40,9 @@ def spread(links: Links, image: Tensor, mask: Tensor, values: Tensor) -> tuple[T
 
 def local(links: Links, image: Tensor, places: Tensor, weights: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean values and influence of scribbled pixels."""
-    step = links.step((image.shape[2], image.shape[3]))
-    guide = InMemory(image).reduced(luminance, step)
-    found = LocalValues.of(links, guide, step, image.shape[3], places, weights, values)(image, 0)
+    size = (image.shape[2], image.shape[3])
+    guide = InMemory(image).reduced(luminance, links.step(size))
+    found = LocalValues.of(links, guide, size, places, weights, values)(image, 0)
     return found[:, :-1], found[:, -1:]
 
 

@@ -85,12 +85,12 @@ def test_neighbours_predict_a_dot_as_if_it_were_not_painted(links: Links) -> Non
     values = torch.rand(1, 2, *SIZE, generator=torch.Generator().manual_seed(2))
     groups, places = groups_of(mask)
     weights, known = torch.ones(1, 1, 4), values.flatten(2)[:, :, places]
-    found = LocalValues.of(links, image, 1, SIZE[1], places, weights, known, groups, known)
+    found = LocalValues.of(links, image, SIZE, places, weights, known, groups, known)
     assert found.left_out is not None
     ratio = found.left_out[:, :-1] / found.left_out[:, -1:]
     for k in range(4):
         rest = torch.arange(4) != k
-        without = LocalValues.of(links, image, 1, SIZE[1], places[rest], weights[..., rest], known[..., rest])
+        without = LocalValues.of(links, image, SIZE, places[rest], weights[..., rest], known[..., rest])
         wanted = without(image, 0)[:, :-1].flatten(2)[:, :, places[k]]
         torch.testing.assert_close(ratio[:, :, k].float(), wanted, rtol=1e-4, atol=1e-5)
 
@@ -112,7 +112,7 @@ def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
         whole = (far(source) + near(source))[:, :2].flatten(2)[:, :, places]
         torch.testing.assert_close(values - residuals[0], whole, rtol=1e-4, atol=1e-5)
         guide = source.reduced(luminance, 1)
-        local = LocalValues.of(RELATIVE, guide, 1, SIZE[1], places, weights, values, groups, values).left_out
+        local = LocalValues.of(RELATIVE, guide, SIZE, places, weights, values, groups, values).left_out
         assert local is not None
         return values - groups.of_own(residuals[1:]), (local[:, :2] / local[:, 2:]).to(values)
 

@@ -209,9 +209,8 @@ def colorize(
     groups = StrokeGroups.of(scribbles, small)
 
     def propagated(links: Links, values: Tensor, predicted: Tensor | None = None) -> LocalValues:
-        step = links.step(small)
-        guide, places = viewed.reduced(luminance, step), scribbles.places
-        solved = partial(LocalValues.of, links, guide, step, small[1], places, cubed, values, groups, predicted)
+        guide, places = viewed.reduced(luminance, links.step(small)), scribbles.places
+        solved = partial(LocalValues.of, links, guide, small, places, cubed, values, groups, predicted)
         return viewed.kept(links, [guide, places, cubed, values], solved)
 
     def interpolated(found: LocalValues, some: Any, own: Tensor) -> Tensor:
@@ -223,7 +222,7 @@ def colorize(
     weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
     (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
     everywhere = per_image(strength, wanted, 4)
-    belief: float | Tensor = 1 / (1 + FEW_STROKES)
+    belief = share_of_many(0)
     if relative.left_out is not None:
         residual = groups.of_own(residuals[1:]) * usual_there
         belief = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
@@ -336,7 +335,12 @@ def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Te
     ratios = ((other + SAME_ERROR) / (error + SAME_ERROR)).log() * valid
     count = valid.sum(2)
     factor = (BELIEF * ratios.sum(2) / count.clamp(min=1)).exp().clamp(max=MOST_BELIEF)
-    return (factor * (1 + count) / (1 + count + FEW_STROKES)).to(weights).view(-1, 1, 1, 1)
+    return (factor * share_of_many(count)).to(weights).view(-1, 1, 1, 1)
+
+
+def share_of_many(count: float | Tensor) -> float | Tensor:
+    """Factor for a number of compared strokes, as a share of that for many."""
+    return (1 + count) / (1 + count + FEW_STROKES)
 
 
 def limit_saturation(chroma: Tensor, other: Tensor) -> Tensor:

@@ -100,8 +100,7 @@ class LocalValues:
     def of(
         links: Links,
         guide: Tensor,
-        step: int,
-        width: int,
+        size: tuple[int, int],
         places: Tensor,
         weights: Tensor,
         values: Tensor,
@@ -110,8 +109,10 @@ class LocalValues:
     ) -> "LocalValues":
         """Solve for scribbled pixels with row-major indices (n,), weights (B, 1, n) and values (B, C, n).
 
-        With ``groups``, the ``predicted`` values (B, P, n) are also extended from the other groups of strokes.
+        ``guide`` holds the means over blocks of ``links.step(size)`` pixels of a picture of that size (H, W). With
+        ``groups``, the ``predicted`` values (B, P, n) are also extended from the other groups of strokes.
         """
+        step, width = links.step(size), size[1]
         rows, columns = guide.shape[2:]
         sets = [torch.cat([values * weights, weights], dim=1)]
         if groups is not None and predicted is not None:
