@@ -132,8 +132,9 @@ def show(
     region, kept = laid["--region"], laid.get("--keep", laid.get("--background"))
     is_strokes = any(isinstance(overlay, Strokes) for _, overlay in overlays(drawn))
     painted = region[:, 3:].ceil() if is_strokes else region.amax(1, keepdim=True).ceil()
-    if kept is not None and not bool((kept.ceil() > painted).any()):
-        kept = None  # the scribbles on the object cover it, and take precedence
+    if kept is not None:
+        kept = kept * (1 - painted)  # the scribbles on the object take precedence
+        kept = kept if bool(kept.any()) else None
     options = arguments((image.shape[-2], image.shape[-1]), stride)
     if edit == "colorize":
         mask = torch.ones_like(painted)  # all pixels are coloured
