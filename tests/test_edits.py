@@ -80,16 +80,25 @@ def test_pictures_are_divided_if_they_are_large(monkeypatch: pytest.MonkeyPatch)
     )
 
 
-def test_operators_are_cached_by_the_values_of_their_options() -> None:
+def test_the_last_operator_with_the_same_options_is_cached() -> None:
     source = InMemory(torch.rand(1, 1, 12, 13), {})
+    learned, written = torch.tensor([3.0], requires_grad=True), torch.tensor([3.0])
 
-    def operator(*spatial: float, learned: bool = False) -> object:
-        bandwidths = tuple(torch.tensor([bandwidth], requires_grad=learned) for bandwidth in spatial)
+    def operator(*bandwidths: float | torch.Tensor) -> object:
         return source.operator(Guide({"spatial_bandwidth": bandwidths, "num_landmarks": 20}))
 
+    def tensors(*bandwidths: float) -> object:
+        return operator(*(torch.tensor([bandwidth]) for bandwidth in bandwidths))
+
+    assert tensors(3.0, 5.0) is tensors(3.0, 5.0)
+    assert tensors(3.0, 5.0) is not tensors(5.0, 3.0)
     assert operator(3.0, 5.0) is operator(3.0, 5.0)
-    assert operator(3.0, 5.0) is not operator(5.0, 3.0)
-    assert operator(3.0, 5.0, learned=True) is not operator(3.0, 5.0, learned=True)
+    assert operator(written, 5.0) is not operator(written, 3.0)
+    assert operator(learned, learned) is not operator(learned, learned)
+    before = operator(written, written)
+    written += 1
+    assert operator(written, written) is not before
+    assert len(source.cache or {}) == 4
 
 
 @each_edit

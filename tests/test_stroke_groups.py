@@ -7,7 +7,7 @@ from torch import Tensor
 from nlfilter_torch import colorize
 from nlfilter_torch.edits.colorize import (
     FEW_STROKES,
-    MOST_BELIEF,
+    MOST_WEIGHT,
     SAME_ERROR,
     Stage,
     colorize_guide,
@@ -134,7 +134,7 @@ def test_the_regression_counts_more_if_it_predicts_strokes_better_and_if_there_a
     residual[1] = 0.0
     factors = compared(groups, weights, residual, wanted, flow).flatten()
     few, none = 4 / (4 + FEW_STROKES), 1 / (1 + FEW_STROKES)  # for three strokes and for no comparison
-    torch.testing.assert_close(factors, torch.tensor([few, MOST_BELIEF * few, none]))
+    torch.testing.assert_close(factors, torch.tensor([few, MOST_WEIGHT * few, none]))
     assert compared(groups, weights, residual * 9, wanted, flow)[0] < 0.01
 
 

@@ -65,7 +65,7 @@ class Stage:
 # These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
 # names for that and on others, with 6 to 60 random strokes.
 FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
-BLOCKS = 8  # on the short side, between whose means brightness is compared for the ratio of bandwidths
+BLOCKS = 8  # least number of blocks along the short side whose mean brightness is compared
 SAME_BRIGHTNESS = 1e-3  # mean difference of blocks that hardly counts
 ANISOTROPY, MOST_ANISOTROPY = 2.5, 3.0  # exponent of the ratio of differences, and limit of the resulting ratio
 # With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
@@ -75,14 +75,16 @@ TEXTURE_WEIGHT = 3.0
 LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
 NO_CHROMA = 1e-8  # square of a saturation that cannot be seen; keeps quotients and derivatives finite
 LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
-CAUTION = 0.5  # factor of the estimate by relative differences
+RELATIVE_WEIGHT = 0.5  # factor of the estimate by relative differences
 # In units of the saturation of the strokes, or of its square, so that strokes of half the saturation give half of it.
 SAME_CHROMA = 0.02  # difference of estimates that hardly counts
 FAINT = 1.0  # chroma below which estimates differ little in weight
 LARGE_VARIANCE = 0.45  # of chroma among strokes on similar pixels
-MOST_CHANGE = 1.6  # distance of the result from that estimate, if it and the regression predict strokes equally well
+# Limit of the distance of the result from the estimate by relative differences, if this and the regression predict many
+# strokes equally well.
+MOST_CHANGE = 1.6
 SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
-BELIEF, MOST_BELIEF = 2.0, 3.0  # exponent of the ratio of errors, and limit of the resulting factor
+ERROR_EXPONENT, MOST_WEIGHT = 2.0, 3.0  # exponent of the ratio of errors, and limit of the resulting factor
 FEW_STROKES = 5  # number of compared strokes at which the factor is about half of that for many
 
 
@@ -127,8 +129,8 @@ def colorize(
         time: for k-means, diffusion time t > 0 of the segments.
         photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
             surroundings and texture, if they differ, count as further differences.
-        spatial_bandwidth: in pixels, the geometric mean of those of vertical and horizontal distances; the more
-            brightness changes in one of these directions, the smaller is its bandwidth. None is 0.7 of the short side.
+        spatial_bandwidth: in pixels: the geometric mean of the vertical and the horizontal bandwidth. The one along
+            which brightness changes more is smaller, by a factor of at most 3. None is 0.7 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
         viewing_size: in megapixels; the colours of a larger image are found in its reduction to this size, patches and
@@ -178,8 +180,8 @@ def colorize(
     pixels = small[0] * small[1]
     options = {"patch_size": patch_size, "num_landmarks": min(num_landmarks, pixels), "generator": generator}
     ratio = viewed.measured(bandwidth_ratio)
-    nearness = COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small)
-    bandwidths = nearness / ratio.sqrt(), nearness * ratio.sqrt()
+    mean = per_image(COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small), ratio, 1)
+    bandwidths = mean / ratio.sqrt(), mean * ratio.sqrt()
 
     def operator_of(stage: Stage) -> Operator:
         scaled = {
@@ -222,10 +224,10 @@ def colorize(
     weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
     (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
     everywhere = per_image(strength, wanted, 4)
-    belief = share_of_many(0)
+    regression_weight = factor_of_count(0)
     if relative.left_out is not None:
         residual = groups.of_own(residuals[1:]) * usual_there
-        belief = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
+        regression_weight = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
 
     def chroma_of(some: Any) -> Tensor:
         own = luminance(some)
@@ -240,9 +242,9 @@ def colorize(
         around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
-        factors = belief * trust, influence**2, CAUTION
+        factors = regression_weight * trust, influence**2, RELATIVE_WEIGHT
         change = weighted_mean((alike, connected, around), factors) - around
-        limited = change * (1 + squared_sum(change) / (belief * MOST_CHANGE**2)).rsqrt()
+        limited = change * (1 + squared_sum(change) / (regression_weight * MOST_CHANGE**2)).rsqrt()
         return saturation.unsqueeze(3) * (around + limited)
 
     return _coloured(source, viewed, chroma_of)
@@ -255,11 +257,13 @@ def usual_chroma(image: Tensor) -> Tensor:
 
 
 def bandwidth_ratio(source: Source) -> Tensor:
-    """Ratio (B,) of the bandwidths of horizontal and vertical distances, from changes of brightness at a large scale.
+    """Ratio (B,) of the horizontal to the vertical bandwidth, from changes of brightness at a large scale.
 
     Where sky, buildings and ground lie above each other, brightness changes more from top to bottom, and so do colours.
     """
-    blocks = source.reduced(luminance, max(1, min(source.size) // BLOCKS))
+    step = max(1, min(source.size) // BLOCKS)
+    height, width = (length // step for length in source.size)
+    blocks = source.reduced(luminance, step)[..., :height, :width]  # without those that the border cuts off
     changes = [blocks.diff(dim=dim).abs().flatten(1) for dim in (2, 3)]
     down, across = (change.sum(1) / max(1, change.shape[1]) + SAME_BRIGHTNESS for change in changes)
     return (down / across).pow(ANISOTROPY).clamp(1 / MOST_ANISOTROPY, MOST_ANISOTROPY)
@@ -334,12 +338,12 @@ def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Te
     other = squared_sum(predicted - groups.sums(wanted * weights) / painted)
     ratios = ((other + SAME_ERROR) / (error + SAME_ERROR)).log() * valid
     count = valid.sum(2)
-    factor = (BELIEF * ratios.sum(2) / count.clamp(min=1)).exp().clamp(max=MOST_BELIEF)
-    return (factor * share_of_many(count)).to(weights).view(-1, 1, 1, 1)
+    factor = (ERROR_EXPONENT * ratios.sum(2) / count.clamp(min=1)).exp().clamp(max=MOST_WEIGHT)
+    return (factor * factor_of_count(count)).to(weights).view(-1, 1, 1, 1)
 
 
-def share_of_many(count: float | Tensor) -> float | Tensor:
-    """Factor for a number of compared strokes, as a share of that for many."""
+def factor_of_count(count: float | Tensor) -> float | Tensor:
+    """Factor that reduces the weight of the regression if few strokes are compared; approaches 1 for many."""
     return (1 + count) / (1 + count + FEW_STROKES)
 
 

@@ -60,7 +60,7 @@ def defocus(
 
     Raises:
         TypeError, ValueError: if a tensor has another size, leaves its range, the region is empty, or ``background`` is
-            painted only under it.
+            painted only under it in some image.
 
     Example:
         >>> image = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(0)) * 0.2

@@ -30,7 +30,7 @@ P = ParamSpec("P")
 class InMemory:
     """An image (B, C, H, W), float32 or float64, in memory: both a source and the set of all its pixels.
 
-    ``cache`` holds its operators, by their options, and what they compute; None caches nothing.
+    ``cache`` holds its operators, by their options, and other results, by name; None caches nothing.
     """
 
     first = 0
@@ -42,15 +42,21 @@ class InMemory:
         self.size, self.width = (size[0], size[1]), size[1]
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
-        """Build, or take from the cache, :func:`nonlocal_operator` of the guide."""
-        if self.cache is None:
-            return InMemoryOperator(nonlocal_operator(guide(self.image), **guide.options), self, guide.sampled)
-        options = ((name, _key_of(value)) for name, value in sorted(guide.options.items()) if name != "generator")
-        key = (guide.transform, guide.blur, *options)
-        if key not in self.cache:
+        """Build, or take from the cache, :func:`nonlocal_operator` of the guide.
+
+        Of operators that differ only in options that are tensors, the last is cached, unless these need gradients.
+        """
+
+        def build() -> InMemoryOperator:
             operator = nonlocal_operator(guide(self.image), **guide.options)
-            self.cache[key] = InMemoryOperator(operator, self, guide.sampled)
-        return cast(InMemoryOperator, self.cache[key])
+            return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
+
+        options = [(name, value) for name, value in sorted(guide.options.items()) if name != "generator"]
+        tensors = [one for _, value in options for one in tensors_in(value)]
+        if any(one.requires_grad for one in tensors):
+            return build()
+        named = tuple((name, without_tensors(value)) for name, value in options)
+        return self.kept((guide.transform, guide.blur, *named), [one.clone() for one in tensors], build)
 
     def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
         """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
@@ -85,12 +91,7 @@ class InMemory:
 
     def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
         """The result of a function, from the cache if it was last computed from equal tensors."""
-        if self.cache is None:
-            return compute()
-        found = self.cache.get(name)
-        if found is None or not all(torch.equal(a, b) for a, b in zip(found[0], given, strict=True)):
-            found = self.cache[name] = (given, compute())
-        return cast(Kept, found[1])
+        return kept_in(self.cache, name, given, compute)
 
     def blocks(self, step: float, floats: int) -> "InMemory":
         """Reduce the image by :func:`block_means`."""
@@ -155,11 +156,13 @@ class InMemoryOperator:
         operator: W.
         source: the image.
         sampled: whether the spectrum may be estimated from a sample of the pixels.
+        cache: of what it computes, by name; None caches nothing.
     """
 
     operator: NonlocalOperator
     source: InMemory
     sampled: bool = False
+    cache: dict[Any, Any] | None = None
 
     @cached_property
     def pairs(self) -> RitzPairs:
@@ -179,13 +182,13 @@ class InMemoryOperator:
     def layers(self, planes: Planes, order: int) -> Planes:
         """Compute :func:`detail_layers`."""
         values = planes(self.source)
-        key = ("layers", self.operator, order)
-        return part_of(self.source.kept(key, [values], lambda: detail_layers(self.operator, values, order=order)))
+        name = ("layers", order)
+        return part_of(kept_in(self.cache, name, [values], lambda: detail_layers(self.operator, values, order=order)))
 
     def coefficients(self, planes: Planes) -> Tensor:
         """Compute :meth:`Spectrum.coefficients`."""
         values, spectrum = planes(self.source), cast(Spectrum, self.pairs)
-        return self.source.kept(("coefficients", self.operator), [values], lambda: spectrum.coefficients(values))
+        return kept_in(self.cache, "coefficients", [values], lambda: spectrum.coefficients(values))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
@@ -197,11 +200,26 @@ class InMemoryOperator:
         return lambda: [columns]
 
 
-def _key_of(option: Any) -> Any:
-    """Key of an option in a cache: a tensor by its values, or, if it has a gradient, as this one tensor."""
-    if isinstance(option, Tensor):
-        return option if option.requires_grad else (option.shape, *option.flatten().tolist())
-    return tuple(map(_key_of, option)) if isinstance(option, tuple | list) else option
+def kept_in(cache: dict[Any, Any] | None, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+    """The result of a function, from a cache if it was last computed from equal tensors under this name."""
+    if cache is None:
+        return compute()
+    found = cache.get(name)
+    if found is None or not all(torch.equal(a, b) for a, b in zip(found[0], given, strict=True)):
+        found = cache[name] = (given, compute())
+    return cast(Kept, found[1])
+
+
+def tensors_in(option: Any) -> list[Tensor]:
+    """The tensors among an option, which may be several values."""
+    return [one for one in (option if isinstance(option, tuple | list) else [option]) if isinstance(one, Tensor)]
+
+
+def without_tensors(option: Any) -> Any:
+    """An option with its type in place of every tensor."""
+    if isinstance(option, tuple | list):
+        return tuple(map(without_tensors, option))
+    return Tensor if isinstance(option, Tensor) else option
 
 
 def edited(image: Tensor, fit: Callable[..., Fitted], /, *arguments: Any, **options: Any) -> Tensor:

@@ -202,10 +202,10 @@ def select_regions(
 
 
 def check_outside(background: Scribbles, inside: Scribbles, name: str) -> None:
-    """Refuse background scribbles that contradict those on the objects: in one image, all are under these.
+    """Refuse background scribbles that lie entirely under those on the objects in any image of the batch.
 
     Raises:
-        ValueError: if they do; ``name`` is the name of the background scribbles.
+        ValueError: if they do; the message calls them ``name``.
     """
     painted = (background.weights > 0).flatten(1).any(1)
     free = (inside.joined(background).weights[:, -1] > 0).any(1)

@@ -60,7 +60,7 @@ def recolor(
 
     Raises:
         TypeError, ValueError: if a tensor has another size, a mask leaves [0, 1], nothing is painted, or ``keep`` is
-            painted only under the strokes.
+            painted only under the strokes in some image.
 
     Example:
         >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2

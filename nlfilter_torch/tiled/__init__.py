@@ -195,7 +195,7 @@ def stream_colorize(
         strength: as in :func:`~nlfilter_torch.colorize`, like bandwidths, ``patch_size``, ``num_landmarks`` and
             ``generator``.
         photometric_bandwidth: in units of the image.
-        spatial_bandwidth: of vertical distances, in pixels; None is 0.4 of the short side.
+        spatial_bandwidth: in pixels, as in :func:`~nlfilter_torch.colorize`; None is 0.7 of the short side.
         patch_size: of the patches that are compared.
         num_landmarks: M of the operators.
         generator: source of randomness for the landmarks.
