@@ -186,7 +186,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--first-seed",
         type=int,
         default=1000,
-        help="first seed of the strokes; 0 to 404, 20000 to 20003, 50000 to 137001 and 500000 to 711003 were used to "
+        help="first seed of the strokes; 0 to 404, 20000 to 20003, 50000 to 137001 and 500000 to 723003 were used to "
         "choose parameters",
     )
     parser.add_argument("--lines", action="store_true", help="lines of one colour in place of squares of true colours")
