@@ -9,7 +9,18 @@ from nlfilter_torch import colorize
 from nlfilter_torch.edits.colorize import bandwidth_ratio, colorize_guide, limit_saturation, weighted_mean
 from nlfilter_torch.edits.colour import merge_luminance, split_luminance
 from nlfilter_torch.edits.in_memory import InMemory
-from tests.problems import box, colour, luminance, paint
+from tests.problems import box, colour, luminance, noise, paint
+
+
+def test_strokes_of_a_narrow_picture_stay_where_they_are() -> None:
+    """The rounding of the reduced size makes the scales of rows and columns differ by 2 %."""
+    grey = 0.5 + 0.01 * noise(1, 1, 3000, 31, dtype=torch.float32)
+    above, below = box(2800, 8, 20, 16, size=(3000, 31)), box(2900, 8, 20, 16, size=(3000, 31))
+    strokes, painted = paint(0.8, 0.2, 0.2, above) + paint(0.2, 0.2, 0.8, below), above + below
+    found = colorize(grey, strokes, painted, viewing_size=0.01, num_landmarks=40)
+    redness = (found[:, 0] - found[:, 2])[..., 8:24].mean((0, 2))
+    assert redness[2800:2820].mean() > 0.1
+    assert redness[2900:2920].mean() < -0.1
 
 
 def test_colours_come_back_from_strokes() -> None:
@@ -133,6 +144,12 @@ def test_shadows_and_highlights_of_a_coloured_object_get_less_chroma_than_its_mi
     assert chroma[20, 30] > 0.9 * chroma.max()
     assert (chroma[:, [4, 57]] < 0.7 * chroma[:, 30:31]).all()
     assert (chroma[:, [4, 55]] > 0.01).all()
+
+
+def test_strokes_of_another_scale_are_reported() -> None:
+    image, mask = colour("coffee", 24, 24), box(4, 4, size=(24, 24))
+    with pytest.warns(UserWarning, match=r"strokes must be in or near \[0, 1\], got values up to"):
+        colorize(luminance(image), 255 * image * mask, mask, num_landmarks=20)
 
 
 def test_one_pixel_and_all_pixels_may_be_painted() -> None:

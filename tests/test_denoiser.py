@@ -160,6 +160,15 @@ def test_bright_pictures_are_denoised_as_their_scaled_selves() -> None:
         )  # the largest magnitude that the network sees is 2
 
 
+def test_levels_far_above_those_of_training_leave_the_contrast() -> None:
+    image = CAT[..., :64, :64]
+    with torch.no_grad():
+        found = [TRAINED_ONE(image, level / 255) for level in (100, 255)]
+    assert torch.equal(*found)
+    assert found[1].mean() > 0.9 * image.mean()
+    assert (found[1] - image).square().mean().sqrt() < 30 / 255
+
+
 def test_gradients_reach_everything() -> None:
     model = NonlocalDenoiser.trained()
     image = noisy(CAT[..., :32, :32], 0.1).requires_grad_()

@@ -230,16 +230,16 @@ def test_the_second_solve_is_the_same_in_float32(name: str) -> None:
 def test_parts_of_enlarged_blocks_are_those_of_the_whole(step: float) -> None:
     blocks = noise(1, 2, 7, 5)
     height, width = int(7 * step), int(5 * step)
-    whole = enlarged(blocks, step, (0, 0), (height, width))
+    whole = enlarged(blocks, (step, step), (0, 0), (height, width))
     for row, column, h, w in ((0, 0, 4, width), (3, 2, 3, 1), (5, 1, height - 5, width - 1), (height - 1, 0, 1, 2)):
-        part = enlarged(blocks, step, (row, column), (h, w))
+        part = enlarged(blocks, (step, step), (row, column), (h, w))
         torch.testing.assert_close(part, whole[:, :, row : row + h, column : column + w])
 
 
 @pytest.mark.parametrize("step", [1, 2, 3])
 def test_enlarged_blocks_are_interpolated_bilinearly(step: int) -> None:
     blocks = noise(1, 2, 7, 5)
-    whole = enlarged(blocks, step, (0, 0), (7 * step, 5 * step))
+    whole = enlarged(blocks, (step, step), (0, 0), (7 * step, 5 * step))
     expected = torch.nn.functional.interpolate(blocks, scale_factor=step, mode="bilinear", align_corners=False)
     torch.testing.assert_close(whole, expected)
 
@@ -323,7 +323,7 @@ def test_weights_of_blocks_are_the_means_of_their_pixels(step: float) -> None:
     small = source.blocks(step, 1)
     painted = torch.zeros(1, 1, 41, 57)
     painted[..., 37:, :], painted[..., 54:] = 1, 0.5
-    found = masks.blocks_of(source.scribbles(painted, None, "mask"), small, source.size, step).planes(small)
+    found = masks.blocks_of(source.scribbles(painted, None, "mask"), small, source.size, (step, step)).planes(small)
     assert found[0, 0, -1, :10].min() == 1
     assert found[0, 0, :5, -1].min() == 0.5
     assert found.max() == 1
@@ -334,3 +334,41 @@ def test_options_of_the_guide_are_refused() -> None:
         region_mask(colour("chelsea"), box(8, 8), guide_channels="luminance")
     with pytest.raises(TypeError, match="photometric_bandwidth must be a number or a tensor, got str; pass a number"):
         region_mask(colour("chelsea"), box(8, 8), photometric_bandwidth="auto")
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_masks_of_a_narrow_picture_are_where_its_scribbles_are(monkeypatch: pytest.MonkeyPatch, turned: bool) -> None:
+    """The rounding of the reduced size makes the scales of rows and columns differ by 2 %."""
+    monkeypatch.setattr(masks, "VIEWED", 0.01)
+    image, bars = 0.4 + 0.05 * noise(1, 3, 3000, 31, seed=1, dtype=torch.float32), torch.zeros(1, 1, 3000, 31)
+    for top in range(100, 3000, 400):
+        bars[..., top : top + 60, 6:25] = 1
+    image[:, :1] += 0.4 * bars
+    scribble = box(2920, 10, 20, 6, size=(3000, 31))
+    mask = region_mask(image.mT, scribble.mT, num_landmarks=40).mT if turned else region_mask(image, scribble)
+    part, wanted = mask[..., 2600:, :], bars[..., 2600:, :]
+    assert (part - wanted).abs().mean() < 0.05
+
+
+@pytest.mark.parametrize("brightest", [50.0, 1e4, 1e9])
+@pytest.mark.filterwarnings("ignore:image must be in or near")
+def test_a_far_brighter_pixel_of_a_float_file_leaves_masks_as_they_are(brightest: float) -> None:
+    image, scribble = colour("coffee", 64, 96), box(20, 40, 12, 20, size=(64, 96))
+    usual = region_mask(image, scribble)
+    bright = image.clone()
+    bright[..., 5, 5] = brightest
+    white = image.clone()
+    white[..., 5, 5] = 1.0
+    torch.testing.assert_close(region_mask(bright, scribble), region_mask(white, scribble), atol=1e-3, rtol=0)
+    assert (region_mask(bright, scribble) - usual).abs().mean() < 0.02
+
+
+def test_masks_do_not_depend_on_the_default_dtype() -> None:
+    image, scribble = colour("coffee", 480, 640), box(160, 320, 64, 96, size=(480, 640))
+    usual = region_mask(image, scribble, num_landmarks=50)
+    try:
+        torch.set_default_dtype(torch.bfloat16)
+        found = region_mask(image, scribble, num_landmarks=50)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    torch.testing.assert_close(found, usual, atol=2e-3, rtol=0)

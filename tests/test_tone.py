@@ -57,6 +57,14 @@ def test_sharpening_raises_edges_and_spares_noise() -> None:
     torch.testing.assert_close(sharpen(shading, amount=8.0), shading, atol=0.5 / 255, rtol=0)
 
 
+@pytest.mark.parametrize("viewing_size", [0.0, 0.001])
+def test_regions_are_checked_at_every_viewing_size(viewing_size: float) -> None:
+    image, sliders = colour("astronaut"), torch.tensor([2.0, 1.0])
+    for negative in (box(1, 1).numpy(), box(1, 1)[0], box(1, 1).long(), box(1, 1).bool()):
+        with pytest.raises((TypeError, ValueError), match=r"^negative must (have|be a torch\.Tensor)"):
+            enhance(image, sliders, box(37, 8), negative=negative, viewing_size=viewing_size)
+
+
 def test_detail_reaches_the_likes_of_a_region_only() -> None:
     image = colour("astronaut")
     sliders = torch.tensor([4.0, 4.0, 4.0, 1.0])

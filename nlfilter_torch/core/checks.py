@@ -48,6 +48,7 @@ def check_dtype(tensor: Tensor, name: str, remedy: str, *, values: str = "") -> 
     """Raise unless ``tensor`` is a tensor of a floating-point dtype; ``values`` is inserted in the message."""
     check_tensor(tensor, name)
     if tensor.dtype not in FLOATING:
+        remedy = "convert it with .float()" if tensor.dtype == torch.bool else remedy
         raise TypeError(f"{name} must have a floating-point dtype{values}, got {tensor.dtype}; {remedy}")
 
 
@@ -75,7 +76,9 @@ def check_image(
         )
     if batch is not None and image.shape[0] not in (1, batch):
         sizes = "1" if batch == 1 else f"1 or {batch}"
-        raise ValueError(f"{name} must have batch size {sizes}, got {image.shape[0]}; pass one image per guide")
+        raise ValueError(
+            f"{name} must have batch size {sizes}, got {image.shape[0]}; pass one for each image, or one for all"
+        )
     check_finite(image, name)
 
 

@@ -176,7 +176,8 @@ def colorize(
     small = viewed_size(source.size, viewing_size)
     if small != source.size:
         viewed = source.resized(small)
-        scribbles = blocks_of(scribbles, viewed, source.size, source.size[1] / small[1])
+        steps = (source.size[0] / small[0], source.size[1] / small[1])
+        scribbles = blocks_of(scribbles, viewed, source.size, steps)
     pixels = small[0] * small[1]
     options = {"patch_size": patch_size, "num_landmarks": min(num_landmarks, pixels), "generator": generator}
     ratio = viewed.measured(bandwidth_ratio)

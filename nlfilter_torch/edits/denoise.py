@@ -53,7 +53,7 @@ def denoise(
         noise_level: standard deviation of white noise, in units of the image, a number or a tensor of shape () or (B,);
             for the network also a map (B, 1 or C, H, W). None estimates it, and its growth with brightness.
         strength: factor of the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
-            smooths more.
+            smooths more. For the network, more than 100/255 counts as 100/255 of noise.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
         photometric_bandwidth: h_y; None is the noise level.
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.

@@ -60,10 +60,11 @@ class InMemory:
 
     def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
         """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
-        named = [(mask, name, 1), *([] if colours is None else [(colours, "strokes", 3)])]
-        for tensor, called, channels in named:
-            check_image(tensor, called, channels=channels, batch=self.batch)
-            check_same_size(tensor, self.size, called, "image")
+        check_image(mask, name, channels=1, batch=self.batch)
+        check_same_size(mask, self.size, name, "image")
+        if colours is not None:
+            check_photograph(colours, "strokes", channels=3, batch=self.batch)
+            check_same_size(colours, self.size, "strokes", "image")
         if needed:
             check_painted(mask, name)
         else:
@@ -102,6 +103,7 @@ class InMemory:
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Resize weights."""
+        check_image(weights, name, batch=self.batch)
         check_same_size(weights, self.size, name, "image")
         weights = weights.to(self.image)
         ends = weights.amin((2, 3), keepdim=True), weights.amax((2, 3), keepdim=True)

@@ -164,7 +164,7 @@ class LocalValues:
 
     def _two_nearest(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Indices (count,) of the blocks before and after pixels along an axis, with linear weights (count,)."""
-        position = (torch.arange(first, first + count, device=like.device) + 0.5) / self.step - 0.5
+        position = (torch.arange(first, first + count, dtype=like.dtype, device=like.device) + 0.5) / self.step - 0.5
         before = position.floor()
         share = (position - before).to(like)
         number = before.long()

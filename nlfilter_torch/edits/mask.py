@@ -135,14 +135,14 @@ class Regions:
     """Masks of K regions, as other edits use them.
 
     Attributes:
-        reduced: the reduced picture in which the masks were computed, (B, C, h, w).
-        step: size of a pixel of ``reduced``, in pixels of the picture.
-        functions: linear functions from colours to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
+        reduced: the reduced picture in which the masks were computed, (B, C, h, w) in [0, 1].
+        steps: height and width of a pixel of ``reduced``, in pixels of the picture.
+        functions: linear functions from colours in [0, 1] to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
         scribbles: for each region, weights on the region and on its background.
     """
 
     reduced: Tensor
-    step: float
+    steps: tuple[float, float]
     functions: Tensor
     scribbles: list[Scribbles]
 
@@ -154,11 +154,11 @@ class Regions:
     def rows(self, planes: Tensor, pixels: Any) -> Tensor:
         """Planes of the reduced picture, enlarged to the given pixels, (B, C, h, w)."""
         height, width = pixels.image.shape[-2:]
-        return enlarged(planes, self.step, corner(pixels), (height, width))
+        return enlarged(planes, self.steps, corner(pixels), (height, width))
 
     def masks(self, pixels: Any) -> Tensor:
         """Masks (B, K, h, w) of the given pixels."""
-        image, found = pixels.image - 0.5, []
+        image, found = pixels.image.clamp(0.0, 1.0) - 0.5, []
         for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
             front, back = marked.planes(pixels).split(1, dim=1)
@@ -244,19 +244,21 @@ def fit_regions(
     viewed = source if size == source.size else source.resized(size)
     blocks = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
     small = viewed.blocks(blocks, FLOATS_PER_PIXEL + options["num_landmarks"])
-    step = blocks if viewed is source else blocks * source.size[1] / size[1]
-    marks = [blocks_of(marked, small, source.size, step) for marked in both]
+    # In a long narrow picture, the rounding of the smaller size makes the steps differ.
+    steps = (blocks * source.size[0] / size[0], blocks * source.size[1] / size[1])
+    marks = [blocks_of(marked, small, source.size, steps) for marked in both]
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
         if spatial_bandwidth is not None:
             check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
-            spatial_bandwidth = spatial_bandwidth / step
+            spatial_bandwidth = spatial_bandwidth / math.sqrt(steps[0] * steps[1])
         options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
     operator = small.operator(Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
     places = frame_places(small.size)
     inner = inner_places(small.size)
     at_frame, at_grid = operator.at(places), operator.at(inner)
     colours, inner_colours = small.colours(places), small.colours(inner)
+    image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
     even = small.kept("evenness", [], lambda: evenness(small.image))
     rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
     for number, marked in enumerate(marks):
@@ -277,25 +279,25 @@ def fit_regions(
     masks = [torch.cat(rough, dim=1), front, back]
 
     def borders() -> Tensor:
-        return fit_borders(small.image, small.kept("models", [], lambda: linear_models(small.image)), *masks)
+        return fit_borders(image, small.kept("models", [], lambda: linear_models(image)), *masks)
 
-    return Regions(small.image, step, small.kept("borders", masks, borders), both)
+    return Regions(image, steps, small.kept("borders", masks, borders), both)
 
 
-def blocks_of(marked: Scribbles, small: Source, size: tuple[int, int], step: float) -> Scribbles:
+def blocks_of(marked: Scribbles, small: Source, size: tuple[int, int], steps: tuple[float, float]) -> Scribbles:
     """Scribbles on the reduced picture; weight and colour of a block are the means of its pixels.
 
     Args:
         marked: scribbles on the picture.
         small: the reduced picture.
         size: (H, W) of the picture.
-        step: side of a block, in pixels.
+        steps: height and width of a block, in pixels.
     """
-    if step == 1:
+    if steps == (1, 1):
         return marked
     rows, columns = (
-        ((torch.arange(length, device=marked.places.device) + 0.5) / step).long().clamp(max=count - 1)
-        for length, count in zip(size, small.size, strict=True)
+        ((torch.arange(length, dtype=torch.float64) + 0.5) / step).long().clamp(max=count - 1).to(marked.places)
+        for length, count, step in zip(size, small.size, steps, strict=True)
     )
     pixels = torch.outer(rows.bincount(minlength=small.size[0]), columns.bincount(minlength=small.size[1])).flatten()
     row, column = rows[marked.places // size[1]], columns[marked.places % size[1]]
@@ -378,7 +380,7 @@ def around(likely: Tensor) -> Tensor:
     size = (likely.shape[-2], likely.shape[-1])
     step = max(1, min(size) // AROUND_GRID)
     coarse = block_means(likely, step)
-    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), step, (0, 0), size)
+    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), (step, step), (0, 0), size)
 
 
 def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor) -> Tensor:

@@ -104,13 +104,13 @@ def _shares(length: int, step: float) -> Tensor:
     return inside / inside.sum(1, keepdim=True)
 
 
-def enlarged(blocks: Tensor, step: float, corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
+def enlarged(blocks: Tensor, steps: tuple[float, float], corner: tuple[int, int], size: tuple[int, int]) -> Tensor:
     """Interpolate a part (B, C, h, w) of a picture bilinearly between the centres of blocks (B, C, n, m).
 
-    ``step`` is the side of a block of :func:`block_means`, ``corner`` row and column of the first pixel of the part.
+    ``steps`` are height and width of a block, ``corner`` row and column of the first pixel of the part.
     """
-    above, below, share_below = _nearest_blocks(corner[0], size[0], step, blocks.shape[2])
-    left, right, share_right = _nearest_blocks(corner[1], size[1], step, blocks.shape[3])
+    above, below, share_below = _nearest_blocks(corner[0], size[0], steps[0], blocks.shape[2])
+    left, right, share_right = _nearest_blocks(corner[1], size[1], steps[1], blocks.shape[3])
     first, last = int(above[0]), int(below[-1])
     used = blocks[:, :, first : last + 1]
     columns = _interpolated(used, 3, left, right, share_right)

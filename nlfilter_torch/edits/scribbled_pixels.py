@@ -93,4 +93,5 @@ def sums_in_blocks(values: Tensor, places: Tensor, width: int, step: float, shap
 
 def blocks_at(places: Tensor, width: int, step: float, shape: tuple[int, int]) -> Tensor:
     """Row-major indices (n,) of the blocks of pixels; the arguments are those of :func:`sums_in_blocks`."""
-    return (places // width / step).long() * shape[1] + (places % width / step).long()
+    rows, columns = (part.double() / step for part in (places // width, places % width))
+    return rows.long() * shape[1] + columns.long()

@@ -37,6 +37,7 @@ BANDWIDTHS = (0.15, 12.0)  # initial bandwidths: of the guide, and in pixels
 FAINT = 1 / 255  # noise level below which filtering is reduced in proportion
 LARGEST, AROUND = 3.0, 8  # largest plausible correction, in noise levels, and the radius around others, in pixels
 BRIGHTEST = 2.0  # images of larger magnitude, which do not occur in training, are scaled down to this
+NOISIEST = 100 / 255  # noise levels above this are reduced to it: trained up to 60/255, it would lose contrast
 
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
@@ -124,7 +125,7 @@ class NonlocalDenoiser(nn.Module):
             noisy: (B, C, H, W), in [0, 1] apart from the noise, or one image (C, H, W). Three channels are treated as
                 colours; any other number of channels are denoised one by one.
             noise: standard deviation of the noise in units of the image: a number, (B,), or a map (B, 1 or C, H, W).
-                Where it is 0 in all channels the image is unchanged.
+                More than 100/255 counts as 100/255. Where it is 0 in all channels the image is unchanged.
             turns: 1, 2 or 4: number of results to average, each from the image rotated by a different angle. More take
                 longer and are better by about 0.1 dB.
 
@@ -175,7 +176,7 @@ class NonlocalDenoiser(nn.Module):
             each = (planes.flatten(0, 1).unsqueeze(1) for planes in (noisy, noise.expand_as(noisy)))
             return self.estimate_noise(*each).view_as(noisy)
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
-        planes, levels = split_colours(noisy / scale, noise / scale)
+        planes, levels = split_colours(noisy / scale, (noise / scale).clamp(max=NOISIEST))
         seen = torch.cat([_centred(planes), 10 * levels], dim=1)
         first = self.first(channels_last(seen))
         levels = levels[:, (0, 1, 1)]

@@ -284,7 +284,9 @@ def test_blocks_of_a_fractional_step() -> None:
     twice = row.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
     torch.testing.assert_close(block_means(row, 1.5), block_means(twice, 3))
     blocks = block_means(cat(), 5)
-    torch.testing.assert_close(enlarged(blocks, 5 + 1e-9, (7, 12), (20, 30)), enlarged(blocks, 5, (7, 12), (20, 30)))
+    torch.testing.assert_close(
+        enlarged(blocks, (5 + 1e-9,) * 2, (7, 12), (20, 30)), enlarged(blocks, (5, 5), (7, 12), (20, 30))
+    )
 
 
 @pytest.mark.parametrize("stride", [2, 2.7])
