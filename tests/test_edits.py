@@ -5,7 +5,17 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
+from nlfilter_torch import (
+    abstract,
+    adjust_tone,
+    colorize,
+    defocus,
+    denoise,
+    enhance,
+    recolor,
+    region_mask,
+    sharpen,
+)
 from nlfilter_torch.edits.in_memory import InMemory
 from nlfilter_torch.edits.pixels import Fitted, strips_of
 from nlfilter_torch.edits.source import Guide
@@ -43,6 +53,23 @@ def test_edits_keep_dtype_and_input(name: str, dtype: torch.dtype) -> None:
     assert found.shape == (2, 3, 20, 22)
     assert torch.isfinite(found).all()
     assert torch.equal(given, before)
+
+
+@pytest.mark.parametrize(
+    ("edit", "others"),
+    [
+        (adjust_tone, ()),
+        (sharpen, ()),
+        (abstract, ()),
+        (denoise, ()),
+        (enhance, (torch.ones(3),)),
+        (region_mask, (SPOT,)),
+    ],
+)
+def test_an_unknown_argument_is_named_with_the_edit(edit: Callable[..., torch.Tensor], others: tuple[object]) -> None:
+    for name in ("contrst", "guide", "source"):
+        with pytest.raises(TypeError, match=f"^{edit.__name__} has no argument {name}; "):
+            edit(RGB, *others, **{name: 2})
 
 
 @each_edit

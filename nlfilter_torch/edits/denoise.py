@@ -3,7 +3,6 @@
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
-import inspect
 from typing import Any, Literal
 
 import torch
@@ -19,7 +18,6 @@ from nlfilter_torch.edits.parameters import DENOISE
 from nlfilter_torch.edits.source import Fitted, Guide, Operator, Pixels, Source
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser import STEP, NonlocalDenoiser, noise_map
-from nlfilter_torch.operator.build import nonlocal_operator
 
 Method = Literal["network", "rule"]
 
@@ -77,9 +75,6 @@ def denoise(
     """
     DENOISE.check(source.batch, strength=strength, method=method)
     check_count(num_landmarks, "num_landmarks")
-    unknown = sorted(set(options).difference(inspect.signature(nonlocal_operator).parameters))
-    if unknown:
-        raise TypeError(f"denoise has no argument {unknown[0]}; see its documentation for the valid ones")
     is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
     if not isinstance(noise_level, Noise) and not is_map:  # commands pass the noise that they have estimated
         DENOISE.check(source.batch, noise_level=noise_level)

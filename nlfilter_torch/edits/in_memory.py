@@ -267,10 +267,17 @@ def edit_of(picture: str, *, channels: int | None = None) -> Any:
     source and receive the edited image, in its dtype; the docstring and the annotations are written for them. The
     function of a source remains available as the attribute ``fit``.
 
-    Callers know the image by the name ``picture``; it must have so many ``channels``, if given.
+    Callers know the image by the name ``picture``; it must have so many ``channels``, if given. Further options are
+    those of :func:`nonlocal_operator`.
     """
 
     def decorate(fit: Callable[..., Fitted]) -> Any:
+        signature = inspect.signature(fit)
+        known = [
+            name for each in (signature, inspect.signature(nonlocal_operator)) for name in list(each.parameters)[1:]
+        ]
+        takes_options = any(one.kind is inspect.Parameter.VAR_KEYWORD for one in signature.parameters.values())
+
         @full_precision
         @wraps(fit)
         def edit(*args: Any, **kwargs: Any) -> Tensor:
@@ -279,11 +286,15 @@ def edit_of(picture: str, *, channels: int | None = None) -> Any:
             if picture in kwargs or not args:
                 problem = "got multiple values for argument" if args else "missing 1 required positional argument:"
                 raise TypeError(f"{fit.__name__}() {problem} {picture!r}")
+            unknown = sorted(set(kwargs).difference(known)) if takes_options else []
+            if unknown:
+                raise TypeError(
+                    f"{fit.__name__} has no argument {unknown[0]}; see its documentation for the valid ones"
+                )
             image, *others = args
             check_photograph(image, picture, channels=channels)
             return edited(image, fit, *others, **kwargs)
 
-        signature = inspect.signature(fit)
         image = inspect.Parameter(picture, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Tensor)
         parameters = [image, *list(signature.parameters.values())[1:]]
         function: Any = edit
