@@ -72,6 +72,14 @@ def test_an_unknown_argument_is_named_with_the_edit(edit: Callable[..., torch.Te
             edit(RGB, *others, **{name: 2})
 
 
+def test_lazy_negations_are_images_like_others() -> None:
+    image = torch.complex(RGB, -RGB).conj().imag
+    assert image.is_neg()
+    for name in ("recolor", "defocus", "enhance"):
+        edit = EDITS[name][1]
+        torch.testing.assert_close(edit(image), edit(RGB))
+
+
 @each_edit
 def test_edits_of_a_batch_are_those_of_its_images(name: str) -> None:
     image, edit = EDITS[name]

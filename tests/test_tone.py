@@ -57,6 +57,12 @@ def test_sharpening_raises_edges_and_spares_noise() -> None:
     torch.testing.assert_close(sharpen(shading, amount=8.0), shading, atol=0.5 / 255, rtol=0)
 
 
+def test_small_pictures_have_fewer_landmarks_than_the_default_without_a_warning() -> None:
+    image = colour("astronaut", 8, 9)
+    for edited in (enhance(image, torch.tensor([2.0, 1.0])), adjust_tone(image, contrast=1.2)):
+        assert torch.isfinite(edited).all()
+
+
 @pytest.mark.parametrize("viewing_size", [0.0, 0.001])
 def test_regions_are_checked_at_every_viewing_size(viewing_size: float) -> None:
     image, sliders = colour("astronaut"), torch.tensor([2.0, 1.0])

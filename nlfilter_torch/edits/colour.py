@@ -136,7 +136,7 @@ def colour_guide(image: Tensor) -> Tensor:
         full = F.pad(part, (0, -part.shape[2] % VECTOR_LENGTH)).unsqueeze(2).contiguous()
         parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
     lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
-    return lab / 100 * image.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
+    return lab / 100 * lab.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
 
 
 def hundredths_of_lab(image: Tensor) -> Tensor:

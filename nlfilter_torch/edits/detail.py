@@ -1,5 +1,6 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
+import math
 from typing import Any
 
 import torch
@@ -7,6 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import (
     check_alpha,
+    check_count,
     check_dtype,
     check_finite,
     check_image,
@@ -97,6 +99,7 @@ def enhance(
         torch.Size([1, 3, 24, 24])
     """
     check_alpha(alpha)
+    check_count(num_landmarks, "num_landmarks")
     if regions is not None and source.whole:  # otherwise they are checked when they are read
         check_image(regions, "regions", batch=source.batch)
     DETAIL.check(source.batch, channels=channels, limits=limits, viewing_size=viewing_size, threshold=threshold)
@@ -134,10 +137,9 @@ def enhance(
         filter_options = options | {
             "photometric_bandwidth": photometric_bandwidth,
             "spatial_bandwidth": nearness,
-            "num_landmarks": num_landmarks,
+            "num_landmarks": min(num_landmarks, math.prod(viewed.size)),
         }
-        most = MASK.defaults["num_landmarks"]
-        fewer = min(num_landmarks, most) if isinstance(num_landmarks, int) else num_landmarks
+        fewer = min(num_landmarks, MASK.defaults["num_landmarks"])
         compared: dict[str, Any] = {"photometric_bandwidth": mask_bandwidth, "reach": reach, "num_landmarks": fewer}
         if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
             compared["generator"] = options["generator"].clone_state()

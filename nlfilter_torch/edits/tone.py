@@ -1,11 +1,12 @@
 """Contrast and local contrast around the mean by the last two sliders. Paper: Figs. 6(a), 7(b) to 10(b)."""
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_order
+from nlfilter_torch.core.checks import check_count, check_order
 from nlfilter_torch.edits.in_memory import edit_of
 from nlfilter_torch.edits.limits import Limits
 from nlfilter_torch.edits.parameters import TONE
@@ -64,6 +65,7 @@ def adjust_tone(
         (True, True)
     """
     check_order(order)
+    check_count(num_landmarks, "num_landmarks")
     TONE.check(source.batch, contrast=contrast, limits=limits, viewing_size=viewing_size, clarity=clarity)
 
     def slider(value: float | Tensor) -> Tensor:
@@ -77,7 +79,7 @@ def adjust_tone(
         filter_options = options | {
             "photometric_bandwidth": photometric_bandwidth,
             "spatial_bandwidth": TONE["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size),
-            "num_landmarks": num_landmarks,
+            "num_landmarks": min(num_landmarks, math.prod(viewed.size)),
         }
         operator, mean = viewed.operator(Guide(filter_options)), viewed.mean(luminance)
         changed = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
