@@ -275,7 +275,7 @@ def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     )
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        assert detail(tmp_path / "in.png", tmp_path / "out.png") == 0
+        assert main(["sharpen", str(tmp_path / "in.png"), str(tmp_path / "out.png")]) == 0
     notes = capsys.readouterr().err.splitlines()
     assert len(notes) == 1
     assert notes[0].startswith("nlfilter-torch: note: num_landmarks")

@@ -31,6 +31,7 @@ def defocus(
     background: Tensor | None = None,
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
+    reach: float | Tensor = REACH,
     photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = DEFOCUS.defaults["patch_size"],
@@ -49,6 +50,7 @@ def defocus(
         radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
             variance.
+        reach: that of :func:`region_mask`; larger than there by default, so that more of the subject stays sharp.
         photometric_bandwidth: that of :func:`region_mask`, in hundredths of Lab.
         spatial_bandwidth: that of :func:`region_mask`, in pixels; None is 0.3 of the short side.
         patch_size: width of the compared patches.
@@ -82,11 +84,11 @@ def defocus(
     others = [] if background is None else [source.scribbles(background, None, "background", needed=False)]
     for other in others:
         check_outside(other, scribbles, "background")
-    options = {"reach": REACH} | options
     found = fit_regions(
         source,
         [scribbles],
         others,
+        reach=reach,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
         patch_size=patch_size,

@@ -123,7 +123,7 @@ def build_and_filter(picture: Tensor, **options: Any) -> Tensor:
     return (layer.to("meta") if picture.is_meta else layer)(picture)  # torch converts no fake parameters
 
 
-@pytest.mark.client('device "meta", `FakeTensorMode`', "yes")
+@pytest.mark.client('device "meta", `FakeTensorMode`', "yes; edits with scribbles need values")
 @pytest.mark.parametrize("options", [{}, {"landmarks": "uniform"}, {"completion": "none"}])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) -> None:
