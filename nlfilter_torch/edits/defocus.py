@@ -9,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.edits.in_memory import edit_of
-from nlfilter_torch.edits.mask import check_outside, fit_regions
+from nlfilter_torch.edits.mask import background_of, fit_regions
 from nlfilter_torch.edits.parameters import DEFOCUS
 from nlfilter_torch.edits.source import Fitted, Source
 
@@ -81,13 +81,10 @@ def defocus(
     blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
     check_reach(blur_radius, "radius", source.size)
     scribbles = source.scribbles(focus_region, None, "focus_region")
-    others = [] if background is None else [source.scribbles(background, None, "background", needed=False)]
-    for other in others:
-        check_outside(other, scribbles, "background")
     found = fit_regions(
         source,
         [scribbles],
-        others,
+        background_of(source, background, scribbles, "background"),
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size),

@@ -201,12 +201,15 @@ def select_regions(
     return found
 
 
-def check_outside(background: Scribbles, inside: Scribbles, name: str) -> None:
-    """Refuse background scribbles that lie entirely under those on the objects in any image of the batch.
+def background_of(source: Source, given: Any, inside: Scribbles, name: str) -> list[Scribbles]:
+    """Read scribbles on the background of objects, if any are given, in the form that the source takes.
 
     Raises:
-        ValueError: if they do; the message calls them ``name``.
+        ValueError: if in any image all of them lie under those on the objects; the message calls them ``name``.
     """
+    if given is None:
+        return []
+    background = source.scribbles(given, None, name, needed=False)
     painted = (background.weights > 0).flatten(1).any(1)
     free = (inside.joined(background).weights[:, -1] > 0).any(1)
     if bool((painted & ~free).any()):
@@ -214,6 +217,7 @@ def check_outside(background: Scribbles, inside: Scribbles, name: str) -> None:
             f"{name} must hold a painted pixel outside the scribbles on the object, got only pixels under them; "
             "paint outside them, or omit it"
         )
+    return [background]
 
 
 def fit_regions(

@@ -9,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_tensor
 from nlfilter_torch.edits.colour import dot, group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.edits.in_memory import edit_of
-from nlfilter_torch.edits.mask import check_outside, fit_regions
+from nlfilter_torch.edits.mask import background_of, fit_regions
 from nlfilter_torch.edits.matting import Sides, colours_beside, refine_mask
 from nlfilter_torch.edits.parameters import RECOLOR
 from nlfilter_torch.edits.scribbled_pixels import Scribbles
@@ -75,9 +75,7 @@ def recolor(
         check_tensor(strokes, "strokes")
     RECOLOR.check(source.batch, reach=reach)
     scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
-    kept = [] if keep is None else [source.scribbles(keep, None, "keep", needed=False)]
-    for background in kept:
-        check_outside(background, scribbles, "keep")
+    kept = background_of(source, keep, scribbles, "keep")
 
     colours, regions, valid = _grouped(scribbles)
     brightness, old = (
